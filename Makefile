@@ -5,6 +5,9 @@ STAMP := .venv/.installed-from-lock
 
 PACKAGES ?= yes
 
+# Every process of a run would otherwise compile all modules again, and the tests' assertions.
+unexport PYTHONDONTWRITEBYTECODE
+
 # A file's tests run in one process, in the order of tests/conftest.py: what they share is computed once.
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 

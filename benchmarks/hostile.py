@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.hostiletwin import HostileTwin, TwinFault
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.cosim.driver import Cosimulation
-from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.machine import SimulatedMachine, simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.watch import WatchSettings
 from servotwin.hybrid.automaton import Array
@@ -126,16 +126,16 @@ def endured(seed: int, kind: TwinFault, settings: TwinSettings | None = None, fr
     machine, certified = case(seed, friction), band(settings)
     loop, run = cosimulated(machine, kind, seed, settings)
     error = np.abs(_settled(run, certified.settling)) / certified.error
-    last = max((fallback.sample for fallback in loop.fallbacks), default=0) / RATE
+    last = max((fallback.sample for fallback in loop.edge.fallbacks), default=0) / RATE
     return HostileOutcome(
         kind,
         machine,
         float(error.max()),
         max(map(_longest, error > 1.0)) / RATE,
         bool(np.all(error[math.ceil(2.0 * last / PERIOD) :] <= MARGIN)),
-        sum(receipt.applied for receipt in loop.receipts),
-        tuple(fallback.cause for fallback in loop.fallbacks),
-        Counter(receipt.reason for receipt in loop.receipts if not receipt.applied),
+        sum(receipt.applied for receipt in loop.edge.receipts),
+        tuple(fallback.cause for fallback in loop.edge.fallbacks),
+        Counter(receipt.reason for receipt in loop.edge.receipts if not receipt.applied),
     )
 
 
@@ -161,7 +161,7 @@ def cosimulated(
     """The machine with a twin of a kind."""
     known = scenario(machine, seed, settings)
     twin = HostileTwin.of(kind, known, machine.gap, random.Random(f"{kind} {seed}"))
-    plant = simulation_of(known, machine.servo)
+    plant = SimulatedMachine(known, simulation_of(known, machine.servo))
     loop = Cosimulation(known, plant, twin=twin)
     while not loop.done:
         loop.advance()

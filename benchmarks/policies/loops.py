@@ -14,7 +14,7 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachine, worn_machines
 from servotwin.analysis.maps.pool import shared, workplace
-from servotwin.cosim.driver import Cosimulation
+from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.redesign.certified.margins import scaled_law
 from servotwin.simulation import Run
 
@@ -147,7 +147,7 @@ def _compared(task: _Task) -> dict[str, LoopScores]:
 def with_twin(machine: WornMachine) -> LoopScores:
     """Run a machine with edge, link and twin."""
     simulation = machine.simulation()
-    cosimulation = Cosimulation(machine.scenario, simulation)
+    cosimulation = Cosimulation(machine.scenario, SimulatedMachine(machine.scenario, simulation))
     while not cosimulation.done:
         cosimulation.advance()
     loop = cosimulation.loop(simulation.run())

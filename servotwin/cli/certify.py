@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from servotwin.config.table import Table, did_you_mean, read_toml
+from servotwin.config.toml import attribute
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
@@ -116,10 +117,10 @@ def _models(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
     if "models" in table.values:
         models = models_of(table, file.parent, checked=False)
         return {model.name: (model.servo, model.settings) for model in models}
-    twin = dict(table.values.get("twin") or {})  # type: ignore[call-overload]
-    name = twin.pop("table", None)
-    scenario = Scenario.from_table(Table(table.source, {**table.values, "twin": twin}), file.parent)
-    path = None if name is None else str(file.parent / str(name))
+    twin = table.table("twin")
+    path = attribute(twin, TwinSettings, "table", file.parent)
+    values = {key: value for key, value in twin.values.items() if key != "table"}
+    scenario = Scenario.from_table(Table(table.source, {**table.values, "twin": values}), file.parent)
     return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
 
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Annotated
 
 from servotwin.commissioning.edge_settings import Recording
-from servotwin.config.keys import key
 from servotwin.config.reference import TableSpec, markdown, schema
 from servotwin.control.controller import Controller
 from servotwin.cosim.scenario import Scenario
@@ -25,6 +23,7 @@ from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.servo import Servo
+from servotwin.twin.model_registry import servo_table
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin_service.config import ServiceConfig, mqtt_table, store_password_table
 
@@ -34,19 +33,6 @@ Made by `make reference` from the declarations in the code: do not edit. A file 
 required. Where a key has two names, a file may give either; the unit is the end of the name. Editors that know TOML
 schemas (Even Better TOML, Taplo) check a file against the schema of its kind in `docs/schemas`.
 """
-
-
-def _servo(servo: Annotated[str, key(help="A preset, or the path of a servo's TOML, relative to this file.")]) -> None:
-    """Servo of a file."""
-
-
-def _machine(
-    scenario: Annotated[
-        object, key(help="A packaged scenario, the path of one relative to this file, or a table with its keys.")
-    ],
-    listen: Annotated[str, key(help="unix:PATH, relative to this file, or HOST:PORT.")],
-) -> None:
-    """Keys of a simulated machine."""
 
 
 _GAINS = Gains.__struct_fields__
@@ -86,7 +72,7 @@ FILES = {
     "scenario": (
         "Scenario of a co-simulation: `scenario.toml`",
         TableSpec(
-            (_servo, Scenario),
+            (Scenario,),
             tables={
                 "controller": _CHANGED,
                 "recording": TableSpec((Recording,), "Windows that the edge records and sends."),
@@ -140,14 +126,14 @@ FILES = {
                 ),
                 "models": TableSpec(
                     help="Any number of models, each in a table with its name.",
-                    tables={"NAME": TableSpec((_servo,), tables={"controller": _CHANGED, "twin": _TWIN})},
+                    tables={"NAME": TableSpec((servo_table,), tables={"controller": _CHANGED, "twin": _TWIN})},
                     repeated="NAME",
                 ),
                 "servos": TableSpec(help='Lines `"NAME" = "MODEL"`; a name may hold `*`.', text=True),
             },
         ),
     ),
-    "machine": ("Simulated machine: `machine.toml`", TableSpec((_machine, MachineSettings))),
+    "machine": ("Simulated machine: `machine.toml`", TableSpec((MachineSettings,))),
 }
 """The kinds of files: name of the schema, title, keys."""
 

@@ -93,6 +93,21 @@ def unit_of(name: str) -> Unit:
     return _SUFFIXES.get(max(fitting, key=len, default=""), Unit("", ""))
 
 
+class Form(StrEnum):
+    """Form of an attribute's value in a file."""
+
+    NUMBER = "number"
+    INTEGER = "integer"
+    PAIR = "pair of numbers"
+    NUMBERS = "number or list of numbers"
+    BOOLEAN = "true or false"
+    TEXT = "text"
+    PATH = "path"
+    TABLE = "table"
+    TABLES = "array of tables"
+    OTHER = "value"
+
+
 ANY = Range()
 
 
@@ -112,8 +127,9 @@ class Key:
     required: bool = False
     makers: Mapping[str, Maker] | None = None
     select: Callable[[Table], Maker] | None = None
-    parse: Callable[[Table, str, Any], Any] | None = None
+    parse: Callable[[Table, str, Any, Path], Any] | None = None
     dump: Callable[[Any], dict[str, Any]] | None = None
+    form: Form | None = None
     in_file: bool = True
 
 
@@ -134,8 +150,9 @@ def key(
     required: bool = False,
     makers: Mapping[str, Maker] | None = None,
     select: Callable[[Table], Maker] | None = None,
-    parse: Callable[[Table, str, Any], Any] | None = None,
+    parse: Callable[[Table, str, Any, Path], Any] | None = None,
     dump: Callable[[Any], dict[str, Any]] | None = None,
+    form: Form | None = None,
 ) -> Key:
     """Declare the TOML key of an attribute.
 
@@ -166,14 +183,17 @@ def key(
         Makers of the attribute from an inner table, by kind. The table's key `kind` chooses one, or `select` does; a
         single one needs neither.
     parse : callable
-        Converts (table, key, value) to the attribute; raises `table.invalid`.
+        Converts (table, key, value, folder that paths are relative to) to the attribute; raises `table.invalid`.
     dump : callable
         Keys and values of an attribute that `makers` makes.
+    form : Form
+        Form of the value in a file, where the attribute's type does not say it and `parse` converts.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key(
         names=names, unit=unit, range=allowed, help=help, table=table, choices=choices, prefix=prefix, switch=switch,
         relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump,
+        form=form,
     )  # fmt: skip
 
 
@@ -191,21 +211,6 @@ def value(
     """Declare range and help of an attribute that no file sets."""
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key((), unit, allowed, help, choices=choices, in_file=False)
-
-
-class Form(StrEnum):
-    """Form of an attribute's value in a file."""
-
-    NUMBER = "number"
-    INTEGER = "integer"
-    PAIR = "pair of numbers"
-    NUMBERS = "number or list of numbers"
-    BOOLEAN = "true or false"
-    TEXT = "text"
-    PATH = "path"
-    TABLE = "table"
-    TABLES = "array of tables"
-    OTHER = "value"
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,6 +369,8 @@ _FORMS: dict[Any, Form] = {
 
 
 def _form(bare: Any, declared: Key) -> Form:
+    if declared.form is not None:
+        return declared.form
     arguments = typing.get_args(bare)
     if len(arguments) == 2 and arguments[1] is ... and declared.makers is not None:
         return Form.TABLES

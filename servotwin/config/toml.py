@@ -70,6 +70,18 @@ def _read_items(table: Table, items: list[Item], folder: Path, base: Any, comple
     return values
 
 
+def attribute(table: Table, maker: Any, name: str, folder: Path = Path()) -> Any:
+    """Read one declared attribute, before the others of its table; the default where the table does not give it.
+
+    Raises
+    ------
+    InvalidInput
+        It is missing and required, or its value is not allowed.
+    """
+    item = next(each for each in items_of(maker) if each.name == name)
+    return _read_items(table, [item], folder, None, complete=True).get(name, item.default)
+
+
 def part(table: Table, name: str, maker: Any, folder: Path = Path(), base: object = None, **given: Any) -> Any:
     """Make settings of an inner table, which is read to its last key; an absent one gives the defaults."""
     inner = table.table(name)
@@ -119,7 +131,7 @@ def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> A
         start = base if isinstance(base, type(item.default)) else item.default
         return part(table, name, item.type, folder, start if dataclasses.is_dataclass(start) else None)
     read_value = _plain(table, item, name, folder)
-    return read_value if declared.parse is None else declared.parse(table, name, read_value)
+    return read_value if declared.parse is None else declared.parse(table, name, read_value, folder)
 
 
 def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
@@ -154,6 +166,11 @@ def _of_kind(table: Table, item: Item, folder: Path) -> Any:
         return _whole(table, item.key.select(table), folder)
     if len(makers) == 1:
         return _whole(table, next(iter(makers.values())), folder)
+    return read_kind(table, makers, folder)
+
+
+def read_kind(table: Table, makers: Mapping[str, Maker], folder: Path) -> Any:
+    """Make what a table describes with the maker that its key `kind` names; the table is read to its last key."""
     return _whole(table, makers[table.text("kind", choices=tuple(makers))], folder)
 
 

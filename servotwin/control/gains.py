@@ -24,7 +24,7 @@ def read_gains(table: Table, running: Controller) -> Gains:
     return gains_of(running.replace(**changes(table, Controller, only=Gains.__struct_fields__)))
 
 
-def gains_given(table: Table) -> bool:
+def has_gains(table: Table) -> bool:
     """True when a table gives any gain."""
     return bool(changes(table, Controller, only=Gains.__struct_fields__))
 

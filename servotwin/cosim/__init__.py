@@ -1,8 +1,8 @@
 """Plant, edge, link and twin under one virtual clock."""
 
-from servotwin.cosim.driver import Cosimulation, Machine, cosimulate
+from servotwin.cosim.driver import Cosimulation, cosimulate
 from servotwin.cosim.loop import Loop, Transmission
-from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.machine import Machine, SimulatedMachine, simulation_of
 from servotwin.cosim.quantisation import Quantisation, quantisation
 
 __all__ = [
@@ -10,6 +10,7 @@ __all__ = [
     "Loop",
     "Machine",
     "Quantisation",
+    "SimulatedMachine",
     "Transmission",
     "cosimulate",
     "quantisation",

@@ -16,21 +16,17 @@ from typing import Protocol
 
 import numpy as np
 
-from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
+from servotwin.cosim.edge import SimulatedEdge
 from servotwin.cosim.loop import Loop, Transmission
-from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.machine import Machine, SimulatedMachine
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, ScheduledMessage
-from servotwin.edge.probe import ProbingMove
-from servotwin.edge.recorder import Floats
-from servotwin.link.outbox import MemoryOutbox
+from servotwin.link.outbox import letter_digest
 from servotwin.link.simulated import SimulatedLink
-from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Setting, Update, decode, encode
-from servotwin.plant.signals import PiecewiseCubic, as_pieces
+from servotwin.messages import LetterAcknowledge, Message, Request, Setting, Update, WindowMessage, decode, encode
+from servotwin.plant.signals import as_pieces
 from servotwin.runtime.clock import Event, VirtualClock
 from servotwin.simulation import Run
-from servotwin.simulation.inputs import shifted
 from servotwin.twin.estimating import Estimator
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.model import TwinModel
@@ -39,7 +35,6 @@ from servotwin.twin.twin import Twin
 Progress = Callable[[float], object]
 """Callback with the completed share, 0 .. 1."""
 
-CHANNELS = ("reference", "theta_m", "position", "voltage")
 _ROUNDING = 1e-6  # of a sample: a sum of delays may exceed the sample's time by rounding
 
 
@@ -58,38 +53,13 @@ def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: 
     -------
     Loop
     """
-    machine = simulation_of(scenario)
+    machine = SimulatedMachine(scenario)
     cosimulation = Cosimulation(scenario, machine, estimator)
     while not cosimulation.done:
         cosimulation.advance()
         if progress is not None:
             progress(cosimulation.share)
     return cosimulation.loop(machine.run())
-
-
-class Machine(Protocol):
-    """Controlled machine with its controller: a `Simulation`, or a stub in a test."""
-
-    samples: int
-
-    @property
-    def index(self) -> int:
-        """Number of the present sample."""
-
-    def advance(self, index: int) -> None:
-        """Advance to a sample."""
-
-    def measured(self, name: str, first: int, last: int) -> Floats:
-        """Return a channel at samples first .. last - 1, all before the present one."""
-
-    def set_tolerance(self, tolerance: float) -> None:
-        """Set the dead zone (m) from the present sample on."""
-
-    def set_reference(self, reference: PiecewiseCubic) -> None:
-        """Set the reference (m) from the present sample on."""
-
-    def set_controller(self, controller: Controller, tolerance: float) -> None:
-        """Set controller and dead zone (m) from the present sample on; the voltage does not jump."""
 
 
 class Remote(Protocol):
@@ -124,8 +94,6 @@ class Cosimulation:
         self.scenario = scenario
         self.clock = VirtualClock()
         self.machine = machine
-        self.outbox = MemoryOutbox()
-        self.agent = Agent(scenario.agent_settings(), self.outbox)
         self.store = EvidenceLog()
         start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
         self.twin = twin or Twin(
@@ -135,17 +103,14 @@ class Cosimulation:
             scenario.name,
             self.clock,
             self._at_twin,
-            self._at_edge,
+            lambda data: self.edge.receive(data),
             scenario.uplink,
             scenario.downlink,
             scenario.seed,
         )
-        self.receipts: list[Receipt] = []
-        self.fallbacks: list[Fallback] = []
-        self.answers: list[Answer] = []
-        self._in_force = self.agent.parameters
+        self.edge = SimulatedEdge(scenario.agent_settings(), machine, self.clock, self.link.up)
         self._reference = as_pieces(scenario.reference, scenario.duration)
-        self._probe: ProbingMove | None = None
+        self._letters: set[bytes] = set()
         self._wake: Event | None = None
 
     @property
@@ -160,14 +125,8 @@ class Cosimulation:
 
     def advance(self) -> None:
         """Advance to the next sample at which an event is possible, and process its events."""
-        first, stop = self.machine.index, self._next_stop()
-        self.machine.advance(stop)
-        blocks = (self.machine.measured(name, first, stop) for name in CHANNELS)
-        sent = self.agent.absorb_block(*blocks)
-        self._follow()
-        for outgoing in sent:
-            time = outgoing.sample / self.scenario.recording.sample_rate
-            self.clock.schedule(max(time, self.clock.now), partial(self._send_up, outgoing))
+        stop = self._next_stop()
+        self.edge.advance(stop)
         while (due := self.clock.next_time) is not None and self._sample_at(due) <= stop:
             self.clock.step()
 
@@ -182,24 +141,24 @@ class Cosimulation:
             trends=tuple(self.store.trends.values()),
             redesigns=tuple(self.store.redesigns.values()),
             updates=tuple(self.store.updates),
-            receipts=tuple(self.receipts),
-            fallbacks=tuple(self.fallbacks),
+            receipts=tuple(self.edge.receipts),
+            fallbacks=tuple(self.edge.fallbacks),
             excitations=tuple(self.store.excitations.values()),
             requests=tuple(self.store.requests),
-            answers=tuple(self.answers),
+            answers=tuple(self.edge.answers),
             messages=tuple(sorted(self._transmissions(), key=lambda m: (m.sent, m.direction, m.serial, m.copy))),
             accounts=self._accounts(),
         )
 
     def _next_stop(self) -> int:
         """Sample up to which nothing can happen to the machine (see the module)."""
-        index = self.machine.index
-        stops = [index + self.agent.shortest_wait, self.machine.samples - 1]
+        index, agent = self.machine.index, self.edge.agent
+        stops = [index + agent.shortest_wait, self.machine.samples - 1]
         if self.clock.next_time is not None:
             stops.append(self._sample_at(self.clock.next_time))
-        if self.agent.deadline is not None:
-            stops.append(self.agent.deadline)
-        return max(min(stops) if self._probe is None else self._before_moving(min(stops)), index + 1)
+        if agent.deadline is not None:
+            stops.append(agent.deadline)
+        return max(min(stops) if agent.probe is None else self._before_moving(min(stops)), index + 1)
 
     def _before_moving(self, stop: int) -> int:
         """Sample at which the reference first changes, at most `stop`."""
@@ -212,50 +171,21 @@ class Cosimulation:
         """First sample at or after a time."""
         return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
 
-    def _send_up(self, outgoing: ScheduledMessage) -> None:
-        if isinstance(outgoing.message, Receipt):
-            self.receipts.append(outgoing.message)
-        elif isinstance(outgoing.message, Fallback):
-            self.fallbacks.append(outgoing.message)
-        elif isinstance(outgoing.message, Answer):
-            self.answers.append(outgoing.message)
-        self.link.up.send(encode(outgoing.message))
-
-    def _at_edge(self, data: bytes) -> None:
-        """Receive bytes at the edge."""
-        sent = self.agent.receive(decode(data))
-        self._follow()
-        for outgoing in sent:
-            self._send_up(outgoing)
-
-    def _follow(self) -> None:
-        """Apply the agent's parameters and probing move to the machine."""
-        self._retune()
-        if self.agent.probe is not self._probe:
-            self._probe = self.agent.probe
-            self.machine.set_reference(self._reference if self._probe is None else self._moved(self._probe))
-
-    def _moved(self, move: ProbingMove) -> PiecewiseCubic:
-        """Reference with a probing move added."""
-        changes = [(0, 0.0), *move.changes(), (move.last, 0.0)]
-        times = [sample / self.scenario.recording.sample_rate for sample, _ in changes]
-        return shifted(self._reference, PiecewiseCubic.held(times, [offset for _, offset in changes]))
-
-    def _retune(self) -> None:
-        """Apply the parameters in force to the machine where they have changed."""
-        parameters, controller = self.agent.parameters, self.agent.controller
-        if parameters is self._in_force:
-            return
-        self._in_force = parameters
-        if controller is None:
-            self.machine.set_tolerance(parameters.setting.tolerance)
-        else:
-            self.machine.set_controller(controller, parameters.setting.tolerance)
-
     def _at_twin(self, data: bytes) -> None:
         """Receive bytes at the twin; a twin that is switched off ignores them."""
-        if self.scenario.twin.enabled:
-            self._answer(self.twin.receive(decode(data), self.clock.now))
+        if not self.scenario.twin.enabled:
+            return
+        message = decode(data)
+        if isinstance(message, WindowMessage) or self._is_new_letter(message, data):
+            self._answer(self.twin.receive(message, self.clock.now))
+
+    def _is_new_letter(self, message: Message, data: bytes) -> bool:
+        """Acknowledge a letter, as the deployed twin does once it is stored; False for one that came before."""
+        digest = letter_digest(data)
+        new = digest not in self._letters
+        self._letters.add(digest)
+        self.link.down.send(encode(LetterAcknowledge(message.servo, digest)))
+        return new
 
     def _wake_twin(self) -> None:
         self._wake = None
@@ -278,6 +208,6 @@ class Cosimulation:
 
     def _accounts(self) -> Counter[str]:
         delivered = {(boot, sequence) for _, boot, sequence in self.store.windows}
-        waiting = [key for key in self.outbox.pending() if key not in delivered]
+        waiting = [key for key in self.edge.outbox.pending() if key not in delivered]
         counts = Counter({"delivered": len(delivered), "in flight": len(waiting)})
-        return +(counts + self.agent.dropped)
+        return +(counts + self.edge.agent.dropped)

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from servotwin.commissioning.edge_settings import Commissioning, Recording, check_samples
 from servotwin.config.keys import check, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
-from servotwin.config.toml import read
+from servotwin.config.toml import attribute, read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
 from servotwin.cosim.scenario_file import GAPS, REFERENCES, gap_maker, read_parts
@@ -24,7 +24,7 @@ from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN
 from servotwin.plant.noise import Noise
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import SERVO_KEY, Servo
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings
@@ -65,7 +65,7 @@ class Scenario:
         A value is out of its range, the gap goes below zero, a rate does not divide, a window is too short.
     """
 
-    servo: Servo
+    servo: Annotated[Servo, SERVO_KEY]
     duration: Annotated[float, key("duration_s", above=0.0, help="Simulated time, a whole number of samples.")]
     seed: Annotated[
         int,
@@ -151,7 +151,8 @@ class Scenario:
     def from_table(cls, table: Table, folder: Path) -> Scenario:
         """Read a scenario from a parsed table; a servo's path in it is relative to `folder`."""
         with named(table):
-            scenario: Scenario = read(table, cls, folder, **read_parts(table, folder))
+            servo: Servo = attribute(table, cls, "servo", folder)
+            scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))
             table.done()
             scenario.servo.check_loop(scenario.law)
             scenario.agent_settings()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -19,9 +20,11 @@ from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules
-from servotwin.plant.servo import PRESETS, Servo
+from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.twin.settings import read_twin_settings
+
+_TURN = 2.0 * math.pi
 
 
 def square_wave(
@@ -70,15 +73,15 @@ REFERENCES: Mapping[str, Maker] = {
 
 
 def constant_gap(
-    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap.")],
+    total: Annotated[float, key("total_deg", minimum=0.0, maximum=_TURN, help="Total gap.")],
 ) -> SignalLike:
     """Constant gap."""
     return total
 
 
 def growing_gap(
-    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap.")],
-    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap.")],
+    begin_value: Annotated[float, key("from_deg", minimum=0.0, maximum=_TURN, help="First total gap.")],
+    end_value: Annotated[float, key("to_deg", minimum=0.0, maximum=_TURN, help="Last total gap.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
     begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
 ) -> SignalLike:
@@ -94,7 +97,7 @@ def gap_maker(table: Table) -> Maker:
     return constant_gap if "total_deg" in table.values or not table.values else growing_gap
 
 
-def read_parts(table: Table, folder: Path) -> dict[str, Any]:
+def read_parts(table: Table, folder: Path, servo: Servo) -> dict[str, Any]:
     """Read the values of a `Scenario` that depend on its servo or on one another.
 
     Raises
@@ -102,7 +105,6 @@ def read_parts(table: Table, folder: Path) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    servo = resolve_servo(table, folder)
     controller = read_inner(table, "controller", lambda inner: _changed(inner, servo.controller))
     edge = table.table("edge")
     edge.known("probe")
@@ -116,7 +118,6 @@ def read_parts(table: Table, folder: Path) -> dict[str, Any]:
     link.done()
     table.known("novelty")
     return {
-        "servo": servo,
         "controller": controller,
         "supervision": supervision,
         "recording": replace(part(table, "recording", Recording), probe=probe, novelty=novelty),
@@ -124,16 +125,6 @@ def read_parts(table: Table, folder: Path) -> dict[str, Any]:
         "downlink": downlink,
         "twin": read_inner(table, "twin", lambda inner: read_twin_settings(inner, folder)),
     }
-
-
-def resolve_servo(table: Table, folder: Path) -> Servo:
-    """Load the servo that a file names: a preset, or a TOML file relative to `folder`."""
-    name = table.text("servo")
-    if name not in PRESETS and not (folder / name).is_file():
-        raise table.invalid(
-            "servo", f"one of {', '.join(PRESETS)}, or the path of a servo's TOML, relative to this file"
-        )
-    return Servo.resolve(name, folder)
 
 
 def _changed(table: Table, controller: Controller) -> Controller | None:

@@ -8,10 +8,11 @@ from typing import Annotated, TypeVar
 
 from servotwin.config.keys import key
 from servotwin.config.table import Table
-from servotwin.config.toml import read
+from servotwin.config.toml import read_kind
 from servotwin.edge.drive import ControlDrive, SupervisedDrive
 
 _Drive = TypeVar("_Drive")
+_ADDRESS = "unix:PATH of the machine's socket, relative to this file, or 127.0.0.1:PORT."
 _SILENCE = "Time without an answer, or a new sample, after which the drive counts as lost."
 
 
@@ -32,36 +33,37 @@ def supervised_drive(table: Table, folder: Path) -> SupervisedDrive:
 
 
 def _read(table: Table, folder: Path, kinds: Mapping[str, Callable[..., _Drive]]) -> _Drive:
-    make = kinds[table.text("kind", choices=tuple(kinds))]
-    drive: _Drive = read(table, make, folder, base_folder=folder)
-    table.done()
+    drive: _Drive = read_kind(table, kinds, folder)
     return drive
 
 
+def _socket(_table: Table, _name: str, address: str, folder: Path) -> str:
+    """Resolve the path of a machine's socket."""
+    kind, _, path = address.partition(":")
+    return f"unix:{folder / path}" if kind == "unix" and path else address
+
+
 def _controlled(
-    base_folder: Path,
-    address: Annotated[str, key(help="unix:PATH of the machine's socket, or HOST:PORT.")],
+    address: Annotated[str, key(parse=_socket, help=_ADDRESS)],
     silence_s: Annotated[float, key(minimum=0.0, help=_SILENCE)] = 5.0,
 ) -> ControlDrive:
     """Simulated machine whose voltage the edge sets."""
     from servotwin.drives.simulated.client import SimulatedControl
 
-    return SimulatedControl(_socket(address, base_folder), silence_s)
+    return SimulatedControl(address, silence_s)
 
 
 def _supervised(
-    base_folder: Path,
-    address: Annotated[str, key(help="unix:PATH of the machine's socket, or HOST:PORT.")],
+    address: Annotated[str, key(parse=_socket, help=_ADDRESS)],
     silence_s: Annotated[float, key(minimum=0.0, help=_SILENCE)] = 5.0,
 ) -> SupervisedDrive:
     """Simulated machine with its own controller."""
     from servotwin.drives.simulated.client import SimulatedSupervised
 
-    return SimulatedSupervised(_socket(address, base_folder), silence_s)
+    return SimulatedSupervised(address, silence_s)
 
 
 def _replay(
-    base_folder: Path,  # noqa: ARG001
     log: Annotated[Path, key(help="CSV as `servotwin simulate` writes it.")],
     speed: Annotated[float, key(minimum=0.0, help="Seconds of the log per second; 0: as fast as it is read.")] = 1.0,
     loop: Annotated[bool, key(help="Begin again at the end.")] = False,
@@ -74,13 +76,12 @@ def _replay(
 
 
 def _opcua(
-    base_folder: Path,
     url: Annotated[str, key(help="opc.tcp://HOST:PORT[/PATH].")],
     node: Annotated[
         str | None, key(help="Browse name of the drive's object below Objects; the model's where absent.")
     ] = None,
     user: Annotated[str | None, key(help="User; without certificates on this machine only.")] = None,
-    password_file: Annotated[str | None, key(help="File of mode 0600 with the user's password.")] = None,
+    password_file: Annotated[Path | None, key(help="File of mode 0600 with the user's password.")] = None,
     password_env: Annotated[str | None, key(help="Environment variable with the user's password.")] = None,
     certificate: Annotated[
         Path | None, key(help="The edge's certificate, PEM or DER; all three files or none.")
@@ -102,7 +103,7 @@ def _opcua(
             url=url,
             node=OpcUaSettings.node if node is None else node,
             user=user,
-            password=read_password(password_file, password_env, base_folder),
+            password=read_password(password_file, password_env),
             certificate=certificate,
             private_key=private_key,
             server_certificate=server_certificate,
@@ -110,12 +111,6 @@ def _opcua(
             silence_s=silence_s,
         )
     )
-
-
-def _socket(address: str, folder: Path) -> str:
-    """Resolve the path of a machine's socket relative to the file."""
-    kind, _, path = address.partition(":")
-    return f"unix:{folder / path}" if kind == "unix" and path else address
 
 
 CONTROLLED: Mapping[str, Callable[..., ControlDrive]] = {"simulated": _controlled}

@@ -1,17 +1,18 @@
 """The edge's agent: samples and messages in, messages out; its clock is sample time.
 
-It records, cuts a window after each change of the reference, repeats it until the twin acknowledges it, and lets its
-supervisor decide about parameters. It does not control: the caller ticks the law. Before each sample the caller reads
-`parameters`, or `controller` where updates may set gains, and transfers the law's state by
-`servotwin.control.law.transfer`. It adds `offset` to the reference; the offset is zero except during a probing move
-that the twin has requested and the edge's settings allow. Such a move begins while the reference rests, and ends by
-itself, or at once when the reference moves.
+It records, cuts a window after each change of the reference, hands it to its outlet, and lets its supervisor decide
+about parameters. It returns letters, which its caller sends through the same outbox as the windows.
+
+It does not control: the caller ticks the law. Before each sample the caller reads `parameters`, or `controller` where
+updates may set gains, and transfers the law's state by `servotwin.control.law.transfer`. It adds `offset` to the
+reference; the offset is zero except during a probing move that the twin has requested and the edge's settings allow.
+Such a move begins while the reference rests, and ends by itself, or at once when the reference moves.
 """
 
 from array import array
 from collections import Counter
 from dataclasses import replace
-from math import ceil, inf
+from math import inf
 from typing import NamedTuple
 
 from servotwin.control.controller import Controller
@@ -31,7 +32,7 @@ from servotwin.messages import Acknowledge, Fallback, Hello, LearntResponse, Mes
 
 
 class ScheduledMessage(NamedTuple):
-    """A message, and the sample instant (samples absorbed so far) at which it is sent."""
+    """A letter, and the sample instant (samples absorbed so far) at which it is sent."""
 
     sample: int
     message: Message
@@ -60,7 +61,7 @@ class Agent:
     store : ParameterStore, optional
         Stores the last parameters under which the loop kept its band; without one each boot begins as configured.
     outlet : Outlet, optional
-        Takes the cut windows; by default they are packed here and put into `outbox`.
+        Takes the cut windows; by default they are put into `outbox`.
     """
 
     def __init__(
@@ -131,7 +132,7 @@ class Agent:
         return Counter(self.outlet.dropped)
 
     def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[ScheduledMessage]:
-        """Take one sample (m, rad, m, V); return the messages to be sent now."""
+        """Take one sample (m, rad, m, V); return the letters to be sent now."""
         self._recorder.append(reference, theta_m, position, voltage)
         if reference != self._expected:
             self._reference_changed(reference)
@@ -157,7 +158,7 @@ class Agent:
         return sent
 
     def receive(self, message: Message) -> list[ScheduledMessage]:
-        """Take a message from the twin; return the messages to be sent now. Messages not for an edge are ignored."""
+        """Take a message from the twin; return the letters to be sent now. Messages not for an edge are ignored."""
         if isinstance(message, Update):
             replies = self._supervisor.offer(message)
             self._twin_answered(message.servo)
@@ -167,7 +168,6 @@ class Agent:
         if isinstance(message, LearntResponse) and message.servo == self.settings.servo:
             self.outlet.adopt(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
-            self.outlet.acknowledge(message)
             self._twin_answered(message.servo)
         return []
 
@@ -243,7 +243,7 @@ class Agent:
         self._expected = self._reference
 
     def _act(self) -> list[ScheduledMessage]:
-        """Cut the window that is complete, and return the messages that are due."""
+        """Cut the window that is complete, and return the supervisor's letters."""
         opened = self._open_window
         if opened is not None and self.samples >= opened.last:
             self._cut(opened)
@@ -251,19 +251,18 @@ class Agent:
             self._open_window = None
         elif opened is None and self.samples >= self._timed:
             self._cut(_OpenWindow(self.samples - self._requests.window, self.samples, TIMED))
-        sent = [ScheduledMessage(self.samples, window) for window in self.outlet.due(self.time)]
         messages = self._supervisor.check()
         if any(isinstance(each, Fallback) for each in messages):
             self._abort()
         self._expected = self._reference + self.offset
         self._deadline = self._next_deadline()
-        return sent + [ScheduledMessage(self.samples, each) for each in messages]
+        return [ScheduledMessage(self.samples, each) for each in messages]
 
     def _cut(self, opened: _OpenWindow) -> None:
         """Cut a window and hand it to the outlet."""
         sequence, self.windows_cut = self.windows_cut, self.windows_cut + 1
         self._cut_at = self.samples
-        self.outlet.offer(self._cut_samples(opened, sequence), self.time)
+        self.outlet.offer(self._cut_samples(opened, sequence))
         if self.outlet.unacknowledged:  # not so where the filter kept the window back
             self._supervisor.window_sent(self.time)
 
@@ -289,8 +288,4 @@ class Agent:
         deadline = min(deadline, self._timed if self._open_window is None else self._open_window.last)
         if self.probe is not None:
             deadline = min(deadline, self.probe.next_change(self.samples))
-        due = self.outlet.next_time
-        if due is None:
-            return deadline
-        # At least one sample ahead: what is due now has just been returned.
-        return min(deadline, max(self.samples + 1, ceil(max(due, 0.0) * self.settings.sample_rate)))
+        return deadline

@@ -16,6 +16,7 @@ returns None when the run is over. Nothing else ends a reading loop. All numbers
 from array import array
 from typing import NamedTuple, Protocol
 
+from servotwin.edge.agent import Agent
 from servotwin.edge.parameters import Parameters
 
 
@@ -150,3 +151,55 @@ class SupervisedDrive(Drive, Protocol):
 
     def move(self, offset: float) -> None:
         """Add `offset` (m) to the reference from the next sample on, until the next call. Raises `DriveLost`."""
+
+
+class Adjustable(Protocol):
+    """The part of a supervised drive, or of a simulated machine, that takes parameters and probing moves."""
+
+    def write(self, parameters: Parameters) -> None:
+        """Put parameters in force; see `SupervisedDrive`."""
+
+    def move(self, offset: float) -> None:
+        """Add `offset` (m) to the reference; see `SupervisedDrive`."""
+
+
+class SettingWriter:
+    """Writes an agent's parameters and probing offset to a machine with its own controller, where they have changed.
+
+    Parameters
+    ----------
+    machine : Adjustable
+    written : Parameters, optional
+        Parameters that the machine has; None: not known, so that the first are written.
+
+    Attributes
+    ----------
+    accepted : Parameters or None
+        Last parameters that the machine accepted.
+    """
+
+    def __init__(self, machine: Adjustable, written: Parameters | None = None) -> None:
+        self._machine, self._written, self._offset = machine, written, 0.0
+        self.accepted = written
+
+    @property
+    def moving(self) -> bool:
+        """True during a probing move."""
+        return self._offset != 0.0
+
+    def write(self, agent: Agent) -> None:
+        """Write what has changed; raises `DriveLost`, and `DriveRefused` for parameters, before the offset."""
+        if agent.parameters is not self._written:
+            self._machine.write(agent.parameters)
+            self._written = self.accepted = agent.parameters
+        if agent.offset != self._offset:
+            self._machine.move(agent.offset)
+            self._offset = agent.offset
+
+    def skip(self, parameters: Parameters) -> None:
+        """Do not write these parameters: the machine has refused them, or has them already."""
+        self._written = parameters
+
+    def forget(self) -> None:
+        """Write everything again: the machine was lost."""
+        self._written, self._offset = None, 0.0

@@ -1,7 +1,8 @@
-"""Outlet of the agent's cut windows: the protocol, and the outlet that packs, stores and repeats them in this process.
+"""Outlet of the agent's cut windows: the protocol, and the outlet that puts them into an outbox of this process.
 
 The edge process hands them to a link process instead, so that neither packing nor the disk delays a sample. Both write
-windows into an outbox by a `WindowWriter`, and repeat them by a `servotwin.link.session.Session`.
+windows into an outbox by a `WindowWriter`. Who sends them from there, a `servotwin.link.session.Session` with a
+transport or a simulated link, is no concern of the agent's.
 """
 
 from array import array
@@ -15,9 +16,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge.window_filter import WindowFilter
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, Outbox
-from servotwin.link.session import Session
 from servotwin.messages import (
-    Acknowledge,
     Channel,
     InvalidMessage,
     LearntResponse,
@@ -90,11 +89,7 @@ _FILTER_STATE = "novelty"  # its name in outboxes on disk since the first filter
 
 
 class Outlet(Protocol):
-    """Interface through which the agent sends its windows; times are sample times, s."""
-
-    @property
-    def next_time(self) -> float | None:
-        """Time at which something is due next; None: never, or not known here."""
+    """Interface through which the agent sends its windows."""
 
     @property
     def unacknowledged(self) -> bool:
@@ -104,14 +99,8 @@ class Outlet(Protocol):
     def dropped(self) -> Mapping[str, int]:
         """Number of windows dropped without an acknowledgement, by reason."""
 
-    def offer(self, cut: Cut, now: float) -> None:
+    def offer(self, cut: Cut) -> None:
         """Take over a cut window."""
-
-    def due(self, now: float) -> list[WindowMessage]:
-        """Return the windows that the agent is to send now, oldest first; each counts as sent."""
-
-    def acknowledge(self, message: Acknowledge) -> bool:
-        """Take the twin's acknowledgement of a window; False when the window was not stored any more."""
 
     def adopt(self, response: LearntResponse) -> None:
         """Take a learnt response, for the windows that are cut from now on."""
@@ -180,24 +169,18 @@ class WindowWriter:
 
 
 class LocalOutlet:
-    """Stores windows in an outbox of this process; the agent sends and repeats them until they are acknowledged.
+    """Puts windows into an outbox of this process.
 
     Parameters
     ----------
     settings : AgentSettings
     outbox : Outbox, optional
-        In memory by default; windows that it already holds are due at once.
+        In memory by default.
     """
 
     def __init__(self, settings: AgentSettings, outbox: Outbox | None = None) -> None:
         self.outbox = MemoryOutbox() if outbox is None else outbox
         self._writer = WindowWriter(settings, self.outbox)
-        self._session = Session(self.outbox, settings.retry)
-
-    @property
-    def next_time(self) -> float | None:
-        """Time at which a window is due next, s; None: everything is acknowledged or dropped."""
-        return self._session.next_time
 
     @property
     def unacknowledged(self) -> bool:
@@ -209,20 +192,9 @@ class LocalOutlet:
         """Number of windows dropped without an acknowledgement, by reason."""
         return self.outbox.dropped
 
-    def offer(self, cut: Cut, now: float) -> None:  # noqa: ARG002
-        """Take over a cut window: it is due at once."""
+    def offer(self, cut: Cut) -> None:
+        """Take over a cut window."""
         self._writer.write(cut)
-
-    def due(self, now: float) -> list[WindowMessage]:
-        """Return the windows to send now, oldest first; each counts as sent."""
-        keys = [item for item in self._session.due(now) if not isinstance(item, bytes)]
-        for key in keys:
-            self._session.retry_later(key, now)
-        return [self.outbox.get(key) for key in keys]
-
-    def acknowledge(self, message: Acknowledge) -> bool:
-        """Remove a window that the twin has acknowledged; False when it was not stored any more."""
-        return self._session.acknowledge((message.boot, message.sequence))
 
     def adopt(self, response: LearntResponse) -> None:
         """Have the window filter use a learnt response from the next window on."""

@@ -70,7 +70,7 @@ def decide(
     if outcome.temporary or not _is_for(request, here) or outcome is RequestOutcome.DUPLICATE:
         return RequestDecision(state, answer)
     state = replace(state, answer=Answer(here.servo, here.boot, request.serial, here.sample, outcome, request.serial))
-    state = _grant(request, state, settings, here) if outcome is RequestOutcome.TAKEN else state
+    state = _grant(request, state, settings, here) if outcome is RequestOutcome.ACCEPTED else state
     assert state.answer is not None
     return RequestDecision(state, state.answer)
 
@@ -89,8 +89,8 @@ def _judge(
         (request.serial > state.newest, RequestOutcome.DUPLICATE),
         (here.time < request.not_after, RequestOutcome.EXPIRED),
     )
-    outcome = next((outcome for passed, outcome in checks if not passed), RequestOutcome.TAKEN)
-    if outcome is not RequestOutcome.TAKEN:
+    outcome = next((outcome for passed, outcome in checks if not passed), RequestOutcome.ACCEPTED)
+    if outcome is not RequestOutcome.ACCEPTED:
         return outcome
     if isinstance(request.ask, LongerWindow):
         return _judge_window(request.ask, settings)
@@ -100,7 +100,7 @@ def _judge(
 def _judge_window(ask: LongerWindow, settings: AgentSettings) -> RequestOutcome:
     longest, earliest = settings.longest_samples, settings.longest_pre_trigger_samples
     window, before = (round(seconds * settings.sample_rate) for seconds in (ask.window_s, ask.pre_trigger_s))
-    return RequestOutcome.TAKEN if window <= longest and before <= earliest else RequestOutcome.TOO_LARGE
+    return RequestOutcome.ACCEPTED if window <= longest and before <= earliest else RequestOutcome.TOO_LARGE
 
 
 def _judge_probe(
@@ -116,7 +116,7 @@ def _judge_probe(
         (_rested(state, limits, here), RequestOutcome.TOO_SOON),
         (at_rest and state.probe is None, RequestOutcome.BUSY),
     )
-    return next((outcome for passed, outcome in checks if not passed), RequestOutcome.TAKEN)
+    return next((outcome for passed, outcome in checks if not passed), RequestOutcome.ACCEPTED)
 
 
 def _rested(state: GrantedRequests, limits: ProbeLimits, here: Instant) -> bool:

@@ -10,9 +10,9 @@ from typing import Annotated
 
 from servotwin.config.keys import key
 from servotwin.config.table import Table, named, read_toml
-from servotwin.config.toml import Values, changes, dumps, part, read, values_of
+from servotwin.config.toml import Values, attribute, dumps, part, read, values_of
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_given, read_gains, written_gains
+from servotwin.control.gains import has_gains, read_gains, written_gains
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.settings_file import (
     gains_stay_table,
@@ -61,9 +61,10 @@ def update_gains_table(
 
 def _controller(table: Table) -> Controller:
     """Read the controller; its sample rate is the recording's by default."""
-    rate = changes(table, AgentSettings, only=("sample_rate",)).get("sample_rate")
     controller: Controller = part(table, "controller", Controller)
-    return controller if controller.sample_rate is not None else controller.replace(sample_rate=rate)
+    if controller.sample_rate is not None:
+        return controller
+    return controller.replace(sample_rate=attribute(table, AgentSettings, "sample_rate"))
 
 
 def _agent(table: Table, controller: Controller | None) -> AgentSettings:
@@ -74,7 +75,7 @@ def _agent(table: Table, controller: Controller | None) -> AgentSettings:
         return None if stay or settable is None else read_gains(inner, settable)
 
     def start_gains(inner: Table) -> Gains | None:
-        return read_gains(inner, settable) if gains_given(inner) and settable is not None else None
+        return read_gains(inner, settable) if has_gains(inner) and settable is not None else None
 
     start, supervision = table.table("start"), table.table("supervision")
     agent: AgentSettings = read(

@@ -13,7 +13,7 @@ from servotwin.edge.recorder import Cut
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
 from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame
-from servotwin.messages import Acknowledge, InvalidMessage, LearntResponse, Message, WindowMessage, decode, encode
+from servotwin.messages import InvalidMessage, LearntResponse, Message, decode, encode
 from servotwin.runtime.frames import FrameError, FrameSocket
 
 BEHIND = "link process behind"
@@ -47,8 +47,6 @@ class PipeOutlet:
     has_twin : bool
         False: no acknowledgements are expected.
     """
-
-    next_time: float | None = None
 
     def __init__(self, has_twin: bool) -> None:
         self._has_twin = has_twin
@@ -113,20 +111,12 @@ class PipeOutlet:
             self._pipe.close()
         self._pipe = None
 
-    def offer(self, cut: Cut, now: float) -> None:  # noqa: ARG002
+    def offer(self, cut: Cut) -> None:
         """Take over a cut window."""
         serial = self._send(frames.window_frame(cut, self.boot, self._next_serial()))
         self._windows.add(serial)
         while self._size > MOST:
             self._drop(next(iter(self._unacknowledged)))
-
-    def due(self, now: float) -> list[WindowMessage]:  # noqa: ARG002
-        """Return nothing: the link process sends."""
-        return []
-
-    def acknowledge(self, message: Acknowledge) -> bool:  # noqa: ARG002
-        """Do nothing: the link process knows first, and sends how many windows are pending."""
-        return True
 
     def adopt(self, response: LearntResponse) -> None:
         """Send a learnt response to the window filter, which is in the link process."""

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from math import nan
 
-from servotwin.edge.drive import Block, DriveRefused, SupervisedDrive
-from servotwin.edge.parameters import Parameters
+from servotwin.edge.drive import Block, DriveRefused, SettingWriter, SupervisedDrive
 from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.monitoring import log
 
@@ -27,9 +26,7 @@ class SupervisingRole:
         self._edge, self._drive = edge, drive
         self._most = max(1, round(_LONGEST_BLOCK_S * edge.config.agent.sample_rate))
         self._machine = drive.machine
-        self._written: Parameters | None = None
-        self._accepted: Parameters | None = None
-        self._offset, self._reference = 0.0, edge.config.agent.reference
+        self._writer, self._reference = SettingWriter(drive), edge.config.agent.reference
 
     def step(self) -> bool:
         """Take one block; False: the run is over. Raises `DriveLost`."""
@@ -49,11 +46,11 @@ class SupervisingRole:
 
     def lost(self) -> None:
         """Note that the drive is lost: its parameters after that are not known."""
-        self._written, self._offset = None, 0.0
+        self._writer.forget()
 
     def stop(self) -> None:
         """End a probing move; the drive runs on by itself, on its parameters. Raises `DriveLost`."""
-        if self._offset:
+        if self._writer.moving:
             self._drive.move(0.0)
 
     def _absorb(self, block: Block) -> None:
@@ -72,20 +69,16 @@ class SupervisingRole:
     def _apply(self) -> None:
         """Write the parameters and the offset to the drive where they have changed."""
         agent = self._edge.agent
-        if agent.parameters is not self._written:
-            try:
-                self._drive.write(agent.parameters)
-                self._accepted = agent.parameters
-            except DriveRefused as refusal:
-                self._restore(str(refusal))
-            self._written = agent.parameters
-        if agent.offset != self._offset:
-            self._drive.move(agent.offset)
-            self._offset = agent.offset
+        try:
+            self._writer.write(agent)
+        except DriveRefused as refusal:
+            self._restore(str(refusal))
+            self._writer.skip(agent.parameters)
+            self._writer.write(agent)
 
     def _restore(self, why: str) -> None:
         """Restore the parameters that the drive accepted last, if any, and report that to the twin."""
         self._edge.counts["parameters refused by the drive"] += 1
         log("drive refused", version=self._edge.agent.parameters.version, why=why)
-        if self._accepted is not None:
-            self._edge.send(self._edge.agent.restore(self._accepted))
+        if self._writer.accepted is not None:
+            self._edge.send(self._edge.agent.restore(self._writer.accepted))

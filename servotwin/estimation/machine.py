@@ -24,7 +24,7 @@ from servotwin.plant.signals import Array
 _SIZE = len(FACTORS)
 _DAY_S = 86400.0
 _AGREEMENT = 4.0  # standard deviations, of the distance of two readings with as many degrees of freedom as factors
-_LEAST_SHOWN = 1e-2  # of the prior's variance: along directions that shrink by less, the window shows nothing
+_LEAST_INFORMATION = 1e-2  # of the prior's variance: along directions that shrink by less, the window shows nothing
 _DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above it the model's drift is an alarm
 
 
@@ -134,10 +134,10 @@ class LearntMachine(Struct, frozen=True):
         """True while windows contradict it, or come from two machines: no setting may rest on it."""
         return self.rival is not None or self.mixed > 0
 
-    def prior(self, given: LearningSettings, now: float) -> FactorPrior:
+    def prior(self, settings: LearningSettings, now: float) -> FactorPrior:
         """Prior of a window at a time, s: the factors, widened by their drift since then."""
-        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(given.walk(now - self.time))
-        short = np.maximum(0.0, given.floor - np.diag(covariance))
+        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(settings.walk(now - self.time))
+        short = np.maximum(0.0, settings.floor - np.diag(covariance))
         return FactorPrior(np.array(self.factors), covariance + np.diag(short), self.softness)
 
     def surely(self) -> Array:
@@ -153,15 +153,15 @@ class LearntMachine(Struct, frozen=True):
         return ", ".join(f"{name} {100.0 * math.expm1(f):+.3g} % +- {196.0 * std:.2g} %" for name, f, std in parts)
 
 
-def nameplate(given: LearningSettings, k: float, c: float, m: float) -> FactorPrior:
+def nameplate(settings: LearningSettings, k: float, c: float, m: float) -> FactorPrior:
     """Prior before any window, for half-widths of stiffness, damping and mass within which all values are alike."""
     k_std, c_std, ratio_std = (math.hypot(one, other) / math.sqrt(3.0) for one, other in ((k, m), (c, m), (m, m)))
-    return FactorPrior.of_spreads(k_std, c_std, given.pitch, max(ratio_std, given.ratio_floor))
+    return FactorPrior.of_spreads(k_std, c_std, settings.pitch, max(ratio_std, settings.ratio_floor))
 
 
 def updated(
     before: LearntMachine | None,
-    given: LearningSettings,
+    settings: LearningSettings,
     estimate: GapEstimate,
     counts: bool,
     now: float,
@@ -173,7 +173,7 @@ def updated(
     ----------
     before : LearntMachine, optional
         None: no window has counted yet.
-    given : LearningSettings
+    settings : LearningSettings
     estimate : GapEstimate
         With its reading, if it has one.
     counts : bool
@@ -191,7 +191,7 @@ def updated(
         made = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
         if before is None:
             return replace(made, alarm=_outside(None, made, stated) or _softened((0.0, 0.0), made.softness))
-        alarm = _drift(before.prior(given, now), reading) or _outside(before, made, stated)
+        alarm = _drift(before.prior(settings, now), reading) or _outside(before, made, stated)
         return replace(
             made,
             windows=before.windows + 1,
@@ -199,24 +199,26 @@ def updated(
             other=before.rival or before.other,
             mixed=max(0, before.mixed - estimate.ok),
         )
-    return before and _contradicted(before, given, reading, now)
+    return before and _contradicted(before, settings, reading, now)
 
 
-def _contradicted(before: LearntMachine, given: LearningSettings, reading: MachineReading, now: float) -> LearntMachine:
+def _contradicted(
+    before: LearntMachine, settings: LearningSettings, reading: MachineReading, now: float
+) -> LearntMachine:
     """What is known after a window that only other numbers explain."""
     rival = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
-    if before.rival is not None and _distance(before.rival.prior(given, now), reading) <= _AGREEMENT:
+    if before.rival is not None and _distance(before.rival.prior(settings, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
     alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"
     # A rival that comes back is no new machine: there are two.
-    back = before.other is not None and _distance(before.other.prior(given, now), reading) <= _AGREEMENT
-    mixed = given.restart_after if back or before.mixed > 0 else 0
+    back = before.other is not None and _distance(before.other.prior(settings, now), reading) <= _AGREEMENT
+    mixed = settings.restart_after if back or before.mixed > 0 else 0
     if back:
         alarm = (
             f"windows of two machines come under this name, or of one with two loads: {rival.words()}, and "
             f"{before.words()}; no setting follows until {mixed} windows in a row are of one of them"
         )
-    if rival.windows >= given.restart_after:
+    if rival.windows >= settings.restart_after:
         alarm = f"{alarm}; it is learnt anew from {rival.windows} windows that agree"
         return replace(rival, alarm=alarm, other=replace(before, rival=None, other=None, alarm=""), mixed=mixed)
     return replace(before, alarm=alarm, rival=rival, mixed=mixed)
@@ -266,8 +268,8 @@ def _drift(known: FactorPrior, reading: MachineReading) -> str:
     spread = np.sqrt(np.diag(known.covariance))
     shrunk = (known.covariance - np.array(reading.covariance).reshape(_SIZE, _SIZE)) / np.outer(spread, spread)
     values, vectors = np.linalg.eigh(shrunk)
-    shown = values > _LEAST_SHOWN
-    if float(np.sum(np.square(vectors[:, shown].T @ (moved / spread)) / values[shown])) <= _DRIFT**2:
+    informative = values > _LEAST_INFORMATION
+    if float(np.sum(np.square(vectors[:, informative].T @ (moved / spread)) / values[informative])) <= _DRIFT**2:
         return ""
     index = int(np.argmax(np.abs(moved) / spread))
     change = 100.0 * math.expm1(float(moved[index]))

@@ -35,7 +35,7 @@ _SPACING = 3.0  # standard deviations between two rows, whose noise is then inde
 _MOVING = 0.02  # of the highest speed in the window: below it the friction is not that of sliding
 _ABOVE_NOISE = 20.0  # standard deviations of the speed's noise: slower motion would bias the back EMF
 _FEWEST = 8  # rows
-_LEFT = 0.1  # of the voltage: with more of it unexplained the window is not of this motor
+_MOST_UNEXPLAINED = 0.1  # of the voltage: with more of it unexplained the window is not of this motor
 _EXACT = 1e-3  # of the voltage: no model is more exact than that
 _WIDE = 10.0  # times the window's voltage: nothing is known of friction and bias before the first window
 _SURPRISE = 5.0  # standard deviations, of a window's back EMF and lag from what was learnt
@@ -232,20 +232,20 @@ def _delay_as_lag(servo: Servo, rate: float) -> float:
 def _posterior(rows: MotorRows, mean: Array, covariance: Array) -> tuple[Array, Array] | None:
     """Mean and covariance after a window; None where the motor's equation does not hold in it."""
     ones = np.array([1.0, 1.0, 0.0, 0.0])
-    left = rows.voltage - rows.design @ (ones + mean)
+    remainder = rows.voltage - rows.design @ (ones + mean)
     size = float(np.sqrt(np.mean(rows.voltage**2)))
     # In units of the prior's spreads, which differ by orders of magnitude.
     spread = np.sqrt(np.diag(covariance))
     precision = np.linalg.inv(covariance / np.outer(spread, spread))
     scaled = rows.design * spread
     # The residual of a fit without the prior, as a wrong prior must not look like noise.
-    free = left - scaled @ np.linalg.lstsq(scaled, left, rcond=None)[0]
+    free = remainder - scaled @ np.linalg.lstsq(scaled, remainder, rcond=None)[0]
     noise = float(np.sqrt(free @ free / max(1, free.size - 4)))
-    if noise > _LEFT * size:
+    if noise > _MOST_UNEXPLAINED * size:
         return None
     variance = max(noise, _EXACT * size) ** 2 * _correlated(free)
     after = np.linalg.inv(precision + scaled.T @ scaled / variance)
-    moved = spread * (after @ (scaled.T @ left)) / variance
+    moved = spread * (after @ (scaled.T @ remainder)) / variance
     covariance = after * np.outer(spread, spread)
     return mean + moved, 0.5 * (covariance + covariance.T)
 
@@ -265,8 +265,8 @@ def _surprising(mean: Array, covariance: Array, after: Array, narrowed: Array) -
     moved, spread = (after - mean)[which], np.sqrt(np.diag(covariance)[which])
     shrunk = (covariance - narrowed)[which, which] / np.outer(spread, spread)
     values, vectors = np.linalg.eigh(shrunk)
-    shown = values > 1e-2
-    return float(np.sum(np.square(vectors[:, shown].T @ (moved / spread)) / values[shown])) > _SURPRISE**2
+    informative = values > 1e-2
+    return float(np.sum(np.square(vectors[:, informative].T @ (moved / spread)) / values[informative])) > _SURPRISE**2
 
 
 def _sliding(speed: Array, reach: int, least: float) -> Array:

@@ -12,7 +12,9 @@ from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
-from servotwin.runtime.clock import VirtualClock
+from servotwin.link.session import Item, Session
+from servotwin.messages import encode
+from servotwin.runtime.clock import Event, VirtualClock
 
 
 def outage_table(
@@ -177,6 +179,46 @@ class SimulatedLink:
     ) -> None:
         self.up = LinkDirection(f"{servo}/up", clock, to_twin, up, seed)
         self.down = LinkDirection(f"{servo}/down", clock, to_edge, down, seed)
+
+
+class SimulatedSender:
+    """Sends what is due in a session over one direction of a simulated link, again until it is acknowledged.
+
+    Parameters
+    ----------
+    session : Session
+    clock : VirtualClock
+    line : LinkDirection
+        To the twin.
+    """
+
+    def __init__(self, session: Session, clock: VirtualClock, line: LinkDirection) -> None:
+        self._session, self._clock, self._line = session, clock, line
+        self._wake: Event | None = None
+
+    def send_due(self) -> None:
+        """Send everything that is due at the clock's time."""
+        now = self._clock.now
+        for item in list(self._session.due(now)):
+            self._line.send(self._body(item))
+            self._session.retry_later(item, now)
+        self.plan(now)
+
+    def plan(self, earliest: float) -> None:
+        """Plan the next `send_due`, no earlier than a time (s); call it after each change of the outbox."""
+        if self._wake is not None:
+            self._clock.cancel(self._wake)
+        due = self._session.next_time
+        self._wake = None if due is None else self._clock.schedule(max(due, earliest, self._clock.now), self.send_due)
+
+    def acknowledge(self, item: Item) -> None:
+        """Remove a message that the twin has acknowledged."""
+        self._session.acknowledge(item)
+        self.plan(self._clock.now)
+
+    def _body(self, item: Item) -> bytes:
+        outbox = self._session.outbox
+        return outbox.letter(item).body if isinstance(item, bytes) else encode(outbox.get(item))
 
 
 def derive_seed(root: int, *names: str) -> int:

@@ -78,11 +78,10 @@ def _read_csv(path: Path, requested: Collection[str]) -> LogColumns:
             places = [names.index(name) for name in requested if name in names]
             if not places:
                 header = ", ".join(filter(None, names)) or "empty"
+                shown = header[:80] if header.isprintable() else "not text"
                 first = next(iter(requested))
-                raise InvalidInput(
-                    f"log {path}: line {skipped} must name the columns ({first}, ...); it is: {header:.80}"
-                )
-            text = file.readlines()
+                raise InvalidInput(f"log {path}: line {skipped} must name the columns ({first}, ...); it is: {shown}")
+            text = [line for line in file if not line.isspace()]
         if not metadata and text and names[-1] == _METADATA:
             quoted = text[0].partition(',"')[2].rstrip().removesuffix('"')
             metadata = _parsed(quoted.replace('""', '"'))

@@ -9,12 +9,14 @@ from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.requests import Answer, Request
 from servotwin.messages.responses import LearntResponse
 from servotwin.messages.updates import Fallback, Receipt, Update
-from servotwin.messages.windows import Acknowledge, Hello, WindowMessage, checksum
+from servotwin.messages.windows import Acknowledge, Hello, LetterAcknowledge, WindowMessage, checksum
 
 MAX_BYTES = 4 * 1024 * 1024
 """Largest message that is decoded: 1 s of four channels at 5 kHz takes 40 kB."""
 
-ParameterMessage = Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge | LearntResponse
+ParameterMessage = (
+    Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge | LetterAcknowledge | LearntResponse
+)
 Message = WindowMessage | ParameterMessage
 _Decoded = TypeVar("_Decoded")
 

@@ -92,7 +92,7 @@ class Request(Struct, frozen=True, tag="request/1"):
 class RequestOutcome(StrEnum):
     """Decision of the edge about a request."""
 
-    TAKEN = "taken"
+    ACCEPTED = "taken"  # the word on the wire
     WRONG_SERVO = "wrong servo"
     OTHER_BOOT = "made for another boot"
     DUPLICATE = "a request of this serial or a later one was decided already"
@@ -130,6 +130,6 @@ class Answer(Struct, frozen=True, tag="answer/1"):
     newest: Count
 
     @property
-    def taken(self) -> bool:
+    def accepted(self) -> bool:
         """True where the edge does what was requested."""
-        return self.outcome is RequestOutcome.TAKEN
+        return self.outcome is RequestOutcome.ACCEPTED

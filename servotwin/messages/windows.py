@@ -212,3 +212,10 @@ class Acknowledge(Struct, frozen=True, tag="ack/1"):
     servo: Name
     boot: Name
     sequence: Count
+
+
+class LetterAcknowledge(Struct, frozen=True, tag="letter-ack/1"):
+    """Acknowledgement of a letter, by the digest of its bytes, over a link whose requests have no responses."""
+
+    servo: Name
+    digest: Annotated[bytes, Meta(min_length=16, max_length=16)]

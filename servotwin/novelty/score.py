@@ -219,7 +219,7 @@ class _Window:
             moved = place
             while place.near(moved, close) and fits <= _WHITENED_FITS:
                 fit = columns.fitted(noise)
-                noise = burg(fit.left[None], min(_ORDER, fit.left.size // 8)).at_least(self.floor)
+                noise = burg(fit.residual[None], min(_ORDER, fit.residual.size // 8)).at_least(self.floor)
                 moved, fits = fit.moved(place), fits + 1
             if place.near(moved, close):
                 return columns.score(fit)
@@ -249,7 +249,7 @@ class _Fit(NamedTuple):
 
     solved: LeastSquares
     fixed_place: bool
-    left: Array
+    residual: Array
     spread: float
 
     @property
@@ -283,8 +283,8 @@ class _Columns(NamedTuple):
     def _solved(self, white: Array, fixed: bool) -> _Fit:
         solved = independent_least_squares(white[1:], white[0])
         rest = white[0] - solved.coefficients @ white[1:]
-        left = self.residual - solved.coefficients @ (np.delete(self.rows, -2, axis=0) if fixed else self.rows)
-        return _Fit(solved, fixed, left, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
+        residual = self.residual - solved.coefficients @ (np.delete(self.rows, -2, axis=0) if fixed else self.rows)
+        return _Fit(solved, fixed, residual, sqrt(float(rest @ rest) / (rest.size - len(white) + 1)))
 
     def with_level(self, white: Array, plain: bool) -> Array:
         """Append the known offset to the whitened table as one more sample."""
@@ -316,7 +316,7 @@ class _Columns(NamedTuple):
         level = float(of_level @ solved.coefficients) - gain * self.place.screw
         offset_std = fit.spread * solved.deviation(of_level) / abs(gain)
         offset = EncoderOffset((level + self.window.origin) / gain, offset_std)
-        noise = sqrt(float(fit.left @ fit.left) / fit.left.size)
+        noise = sqrt(float(fit.residual @ fit.residual) / fit.residual.size)
         return Score(self.place.gap + fit.gap, std, offset, self.travel, noise)
 
 

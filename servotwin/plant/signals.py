@@ -69,7 +69,7 @@ class PiecewiseCubic:
         return cls([0.0], [[value, 0.0, 0.0, 0.0]])
 
     @classmethod
-    def held(cls, times: ArrayLike, values: ArrayLike) -> PiecewiseCubic:
+    def zero_order_hold(cls, times: ArrayLike, values: ArrayLike) -> PiecewiseCubic:
         """Each value from its time until the next one."""
         values = np.asarray(values, dtype=float)
         coeffs = np.zeros((values.size, 4))
@@ -209,7 +209,7 @@ class Step:
         """One constant, or two when the step comes later."""
         if self.at <= 0.0:
             return PiecewiseCubic.constant(self.size)
-        return PiecewiseCubic.held([0.0, self.at], [0.0, self.size])
+        return PiecewiseCubic.zero_order_hold([0.0, self.at], [0.0, self.size])
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ class SquareWave:
             raise InvalidInput(f"{shown}; at most {_MOST_PIECES:g} are allowed")
         halves = np.arange(math.floor(2.0 * begin / self.period), math.floor(2.0 * end / self.period) + 1)
         times, values = halves * (0.5 * self.period), self.offset + self.amplitude * (-1.0) ** halves
-        return PiecewiseCubic.held(np.append(0.0, times[1:]), values)
+        return PiecewiseCubic.zero_order_hold(np.append(0.0, times[1:]), values)
 
 
 @dataclass(frozen=True)
@@ -264,7 +264,7 @@ class Samples:
 
     def pieces(self, _duration: float, /) -> PiecewiseCubic:
         """One constant per sample."""
-        return PiecewiseCubic.held([min(self.times[0], 0.0), *self.times[1:]], self.values)
+        return PiecewiseCubic.zero_order_hold([min(self.times[0], 0.0), *self.times[1:]], self.values)
 
 
 SignalLike: TypeAlias = Signal | float

@@ -120,7 +120,7 @@ class Stage(StrEnum):
     # The values are part of the twin's stored state.
     OPEN = "not asked for"
     REQUESTED = "asked for"
-    TAKEN = "taken"
+    ACCEPTED = "taken"
     REFUSED = "refused"
 
 
@@ -177,7 +177,7 @@ class ExcitationState:
         A request that the edge does not allow is not repeated.
         """
         refused = outcome in (RequestOutcome.NOT_ALLOWED, RequestOutcome.TOO_LARGE)
-        stage = Stage.REFUSED if refused else Stage.TAKEN if outcome is RequestOutcome.TAKEN else Stage.OPEN
+        stage = Stage.REFUSED if refused else Stage.ACCEPTED if outcome is RequestOutcome.ACCEPTED else Stage.OPEN
         return replace(self, window=stage) if isinstance(ask, LongerWindow) else replace(self, probing=stage)
 
 

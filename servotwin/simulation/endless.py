@@ -14,7 +14,7 @@ from servotwin.control.law import LawParameters, start
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, SquareWave, as_pieces
-from servotwin.simulation.inputs import recent, spliced
+from servotwin.simulation.inputs import raised, recent, spliced
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.simulate import Simulation
 
@@ -71,7 +71,7 @@ class UnboundedSimulation:
             self._until = self.index + int(STRETCH * self.rate)
         stretch = _between(self._reference_signal, time, time + STRETCH + MARGIN)
         # Without an offset the stretch stays as it is, bit for bit.
-        self._set_reference(stretch if self._offset == 0.0 else _raised(stretch, self._offset))
+        self._set_reference(stretch if self._offset == 0.0 else raised(stretch, self._offset))
 
     def move(self, offset: float) -> None:
         """Offset the reference (m) from the present sample on; replaces an earlier offset."""
@@ -110,10 +110,6 @@ class UnboundedSimulation:
 
 def _between(reference: SignalLike, begin: float, end: float) -> PiecewiseCubic:
     return reference.between(begin, end) if isinstance(reference, SquareWave) else as_pieces(reference, end)
-
-
-def _raised(pieces: PiecewiseCubic, offset: float) -> PiecewiseCubic:
-    return PiecewiseCubic(pieces.times, pieces.coeffs + np.array([offset, 0.0, 0.0, 0.0]))
 
 
 CHUNK = 4096

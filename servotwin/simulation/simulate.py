@@ -14,7 +14,7 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
-from servotwin.simulation.inputs import RunInputs, quantised, spliced
+from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced
 from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.run import Run
@@ -105,6 +105,7 @@ class Simulation:
             float(input_bias),
             float(friction),
         )
+        self._reference = self.inputs.reference
         rng = np.random.default_rng(seed)
         self.keep = keep
         self._check_keep()
@@ -149,9 +150,13 @@ class Simulation:
 
         It replaces the planned reference; its values before the present sample do not matter.
         """
-        horizon = (self.samples - 1) / self.inputs.sample_rate
-        self.inputs.reference = spliced(self.inputs.reference, as_pieces(reference, horizon), self.time)
-        self.engine.set_reference(self.inputs.reference)
+        self._reference = as_pieces(reference, (self.samples - 1) / self.inputs.sample_rate)
+        self._follow(self._reference)
+
+    def move(self, offset: float) -> None:
+        """Add `offset` (m) to the reference from the present sample on; replaces an earlier offset."""
+        # Without an offset the reference stays as it is, bit for bit.
+        self._follow(self._reference if offset == 0.0 else raised(self._reference, offset))
 
     def set_controller(self, controller: Controller, tolerance: float | None = None) -> None:
         """Change the controller from the present sample on, without a jump of the voltage.
@@ -180,6 +185,11 @@ class Simulation:
         self.controller = controller
         if tolerance is not None:
             self.inputs.retune(self.time, tolerance)
+
+    def _follow(self, reference: PiecewiseCubic) -> None:
+        """Follow a reference from the present sample on."""
+        self.inputs.reference = spliced(self.inputs.reference, reference, self.time)
+        self.engine.set_reference(self.inputs.reference)
 
     def _check_keep(self) -> None:
         if self.keep is not None and (self.keep < 1 or self.controller.sample_rate is None):

@@ -17,19 +17,19 @@ _PAGES = 512
 
 
 class RetentionResult(NamedTuple):
-    """Numbers of windows that retention emptied and kept.
+    """Numbers of windows that retention emptied and retained.
 
     Attributes
     ----------
     emptied, bytes : int
         Windows whose bodies were deleted, and the bytes of those bodies.
-    kept : int
+    retained : int
         Old windows that stay: an update is based on them, or they are not yet processed.
     """
 
     emptied: int
     bytes: int
-    kept: int
+    retained: int
 
 
 def delete_old_bodies(

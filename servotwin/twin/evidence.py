@@ -271,37 +271,37 @@ def _row(record: Record) -> EvidenceRecord | None:
     """Make the row of a record, without message and context; None for a trend that does not exist yet."""
     match record:
         case GlanceRecord(window, glance, tail):
-            made = _made("glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std), tail=tail)
+            made = _computed("glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std), tail=tail)
             return made._replace(version=window.parameter_version)
         case GapEstimateRecord(window, estimate, expected, tail):
             body = StoredEstimate(msgspec.Raw(plain(estimate)), StoredExpectation.of(expected), window.boot)
             gap, std = finite(estimate.gap), finite(estimate.std_total)
-            made = _made("estimate", body, estimate.status.value, gap=gap, std=std, tail=tail)
+            made = _computed("estimate", body, estimate.status.value, gap=gap, std=std, tail=tail)
             return made._replace(version=window.parameter_version)
         case DisturbanceRecord(_, disturbance):
-            return _made("disturbance", disturbance, "; ".join(disturbance.reasons))
+            return _computed("disturbance", disturbance, "; ".join(disturbance.reasons))
         case TrendRecord(_, trend):
             if trend is None:
                 return None
             numbers, reasons = TrendState.of(trend), "; ".join(trend.reasons)
-            return _made("trend", numbers, reasons, gap=finite(trend.gap), std=finite(trend.gap_std))
+            return _computed("trend", numbers, reasons, gap=finite(trend.gap), std=finite(trend.gap_std))
         case MachineRecord(_, machine):
-            return _made("alarm" if machine.alarm else "machine", machine, machine.alarm)
+            return _computed("alarm" if machine.alarm else "machine", machine, machine.alarm)
         case MotorRecord(_, motor):
-            return _made("alarm" if motor.alarm else "motor", motor, motor.alarm)
+            return _computed("alarm" if motor.alarm else "motor", motor, motor.alarm)
         case AlarmRecord(_, sentence):
-            return _made("alarm", {"sentence": sentence}, sentence)
+            return _computed("alarm", {"sentence": sentence}, sentence)
         case RedesignRecord(_, redesign):
-            return _made("redesign", _redesign_body(redesign), redesign.reason, gap=finite(redesign.gap))
+            return _computed("redesign", _redesign_body(redesign), redesign.reason, gap=finite(redesign.gap))
         case ExcitationRecord(_, decision):
-            return _made("excitation", decision, decision.reason)
+            return _computed("excitation", decision, decision.reason)
         case VerificationRecord(request, result):
             shown = result if isinstance(result, Certificate) else result.best
             body_of = {"question": request, "certificate": shown and _timeless(shown)}
             reason = "" if isinstance(result, Certificate) else result.reason
-            return _made("proof", body_of, reason, **_of_update(request))
+            return _computed("proof", body_of, reason, **_of_update(request))
         case WithdrawalRecord(request, why):
-            return _made("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
+            return _computed("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
         case Update():
             window_key = "{}/{}".format(*record.window)
             row = _sent("update", record, record.status, record.version)
@@ -322,7 +322,7 @@ def _row(record: Record) -> EvidenceRecord | None:
     raise TypeError(f"{type(record).__name__} is not a record of evidence")
 
 
-def _made(kind: str, body: object, status: str, **values: Any) -> EvidenceRecord:
+def _computed(kind: str, body: object, status: str, **values: Any) -> EvidenceRecord:
     return EvidenceRecord(kind, 0, plain(body), status=short(status), **values)
 
 

@@ -25,14 +25,15 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
+from typing import Annotated
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_inner
-from servotwin.config.toml import changes
+from servotwin.config.toml import changes, read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
-from servotwin.plant.servo import PRESETS, Servo
+from servotwin.plant.servo import SERVO_KEY, Servo
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
@@ -180,7 +181,7 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     """Read one table of [models]."""
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is not a name of a model: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
-    servo = _servo(table, folder)
+    servo: Servo = read(table, servo_table, folder)
     law = read_inner(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
     settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder))
     servo.check_loop(law)
@@ -190,12 +191,9 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     return ServoModel(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
 
 
-def _servo(table: Table, folder: Path) -> Servo:
-    name = table.text("servo")
-    if name not in PRESETS and not (folder / name).is_file():
-        presets = ", ".join(PRESETS)
-        raise table.invalid("servo", f"one of {presets}, or the path of a servo's TOML, relative to this file")
-    return Servo.resolve(name, folder)
+def servo_table(servo: Annotated[Servo, SERVO_KEY]) -> Servo:
+    """Return the servo that a model names."""
+    return servo
 
 
 def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table
-from servotwin.config.toml import part, read
+from servotwin.config.toml import attribute, part, read
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
@@ -238,7 +238,6 @@ class TwinSettings:
 
 def read_twin_settings(table: Table, folder: Path = Path()) -> TwinSettings:
     """Read [twin] with its inner tables; the method declares the keys of [estimator]."""
-    method = table.text("method", whitened.METHOD, choices=tuple(METHODS))
-    estimator = part(table, "estimator", METHODS[method].settings)
-    made: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
-    return made
+    estimator = part(table, "estimator", METHODS[attribute(table, TwinSettings, "method")].settings)
+    settings: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
+    return settings

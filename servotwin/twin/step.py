@@ -199,8 +199,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
     if not stale:
-        state, asked, decided = _ask(model, state, message, estimate, arrived, now)
-        others, records = (*others, *asked), [*records, *decided]
+        state, requested, decided = _ask(model, state, message, estimate, arrived, now)
+        others, records = (*others, *requested), [*records, *decided]
     if redesign.setting is None:
         return StepResult(state, others, tuple(records))
     versions = state.versions.with_update(_draft(message, evidence, redesign, model.settings.validity))

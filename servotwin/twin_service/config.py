@@ -11,7 +11,7 @@ from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table, read_inner
-from servotwin.config.toml import read
+from servotwin.config.toml import attribute, read
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import Broker
 from servotwin.link.url import is_here
@@ -48,7 +48,7 @@ class MqttConfig:
         return is_here(self.broker.address[0])
 
 
-def _group(table: Table, name: str, group: str) -> str:
+def _group(table: Table, name: str, group: str, _folder: Path) -> str:
     if not group or set(group) & set("/+#"):
         raise table.invalid(name, "a name without /, + and #")
     return group
@@ -72,17 +72,29 @@ def mqtt_table(
     return MqttConfig(Broker(url, user, password if user is not None else None, ca_file), group)
 
 
-def _address(table: Table, name: str, address: str) -> str:
+def _address(table: Table, name: str, address: str, _folder: Path) -> str:
     try:
         return str(ipaddress.ip_address("127.0.0.1" if address == "localhost" else address))
     except ValueError:
         raise table.invalid(name, "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
 
 
-def _file(table: Table, name: str, path: Path) -> Path:
+def _file(table: Table, name: str, path: Path, _folder: Path) -> Path:
     if not path.is_file():
         raise table.invalid(name, "the path of a file, relative to this one")
     return path
+
+
+def _store_url(table: Table, name: str, url: str, _folder: Path) -> str:
+    if "://" not in url:
+        raise table.invalid(name, "a URL such as sqlite:///twin.db or postgresql+psycopg://user@host/database")
+    head = url.split("://", 1)[1].split("/", 1)[0]
+    if ":" in head.rpartition("@")[0] or "password=" in url.partition("?")[2]:
+        raise InvalidInput(
+            f"{table.source}: {table.path(name)} holds a password; give it in store_password_file or in the "
+            f"environment variable {PASSWORD}"
+        )
+    return url
 
 
 @settings("service")
@@ -106,9 +118,9 @@ class ServiceConfig:
         ),
     ] = "127.0.0.1"
     port: Annotated[int, key(minimum=0, maximum=65535, help="Port; 0: any free one.")] = 8765
-    store: Annotated[str, key(help="SQLAlchemy URL without a password; a SQLite file is relative to this one.")] = (
-        "sqlite:///twin.db"
-    )
+    store: Annotated[
+        str, key(parse=_store_url, help="SQLAlchemy URL without a password; a SQLite file is relative to this one.")
+    ] = "sqlite:///twin.db"
     store_password: str | None = None
     workers: Annotated[int, key(minimum=1, maximum=256, help="Processes that estimate.")] = 2
     tls_certificate: Annotated[Path | None, key(parse=_file, help="PEM file; both or none.")] = None
@@ -186,7 +198,9 @@ def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os
     if "mqtt" in table.values:
         mqtt = read_inner(table, "mqtt", lambda inner: read(inner, mqtt_table, folder, environment=environment))
     table.known("mqtt")
-    store, password = _store(table, folder, environment)
+    file = read(table, store_password_table, folder)
+    store = _sqlite_in(attribute(table, ServiceConfig, "store", folder), folder)
+    password = environment.get(PASSWORD) if file is None else read_secret(file)
     service: ServiceConfig = read(table, ServiceConfig, folder, store=store, store_password=password, mqtt=mqtt)
     return service
 
@@ -196,22 +210,6 @@ def store_password_table(
 ) -> Path | None:
     """Return the file with the store's password."""
     return store_password_file
-
-
-def _store(table: Table, folder: Path, environment: Mapping[str, str]) -> tuple[str, str | None]:
-    """URL and password of the store; a relative path of SQLite lies in `folder`."""
-    url = table.text("store", ServiceConfig.store)
-    file = read(table, store_password_table, folder)
-    if "://" not in url:
-        raise table.invalid("store", "a URL such as sqlite:///twin.db or postgresql+psycopg://user@host/database")
-    head = url.split("://", 1)[1].split("/", 1)[0]
-    if ":" in head.rpartition("@")[0] or "password=" in url.partition("?")[2]:
-        raise InvalidInput(
-            f"{table.source}: {table.path('store')} holds a password; give it in store_password_file or in the "
-            f"environment variable {PASSWORD}"
-        )
-    password = environment.get(PASSWORD) if file is None else read_secret(file)
-    return _sqlite_in(url, folder), password
 
 
 def _sqlite_in(url: str, folder: Path) -> str:

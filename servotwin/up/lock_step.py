@@ -15,17 +15,15 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of
-from servotwin.cosim.driver import CHANNELS, Cosimulation, Progress, Remote
+from servotwin.cosim.driver import Cosimulation, Progress, Remote
+from servotwin.cosim.edge import CHANNELS
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.drive import Block, DriveLost, SupervisedDrive
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear
-from servotwin.messages import Fallback, Gains, Message, Receipt, Setting, WindowMessage, decode, encode
-from servotwin.plant.signals import PiecewiseCubic
+from servotwin.messages import Fallback, Message, Receipt, WindowMessage, decode, encode
 
 _TIMEOUT_S = 300.0
 """s for one response, which may include a verification."""
@@ -116,7 +114,7 @@ class _DrivenMachine:
 
     def __init__(self, drive: SupervisedDrive, scenario: Scenario) -> None:
         self.samples = scenario.samples
-        self._drive, self._version, self._index = drive, 0, 0
+        self._drive, self._index = drive, 0
         self._signals = {name: array("d") for name in CHANNELS}
 
     @property
@@ -136,15 +134,11 @@ class _DrivenMachine:
         """Samples first to last - 1 of a channel."""
         return self._signals[name][first:last]
 
-    def set_tolerance(self, tolerance: float) -> None:
-        """Set another dead zone (m) from the present sample on."""
-        self._write(tolerance, None)
+    def write(self, parameters: Parameters) -> None:
+        """Put tolerance and gains in force from the present sample on."""
+        self._drive.write(parameters)
 
-    def set_controller(self, controller: Controller, tolerance: float) -> None:
-        """Set other gains and another dead zone (m) from the present sample on."""
-        self._write(tolerance, gains_of(controller))
-
-    def set_reference(self, _reference: PiecewiseCubic) -> None:
+    def move(self, _offset: float) -> None:
         """Refuse: lock-step has no excitation.
 
         Raises
@@ -152,10 +146,6 @@ class _DrivenMachine:
         InvalidInput
         """
         raise InvalidInput("lock-step has no probing moves: leave [twin.excitation] out of the scenario")
-
-    def _write(self, tolerance: float, gains: Gains | None) -> None:
-        self._version += 1
-        self._drive.write(Parameters(self._version, Setting(tolerance, gains)))
 
     def _append(self, block: Block) -> None:
         for name in CHANNELS:
@@ -201,4 +191,4 @@ def lock_step(scenario: Scenario, twin: Remote, drive: SupervisedDrive, progress
     up = {record.serial: decode(record.data) for record in run.link.up.records}
     down = {record.serial: decode(record.data) for record in run.link.down.records}
     windows = {each.identity: each for each in up.values() if isinstance(each, WindowMessage)}
-    return LockStep(tuple(windows.values()), tuple(run.receipts), tuple(run.fallbacks), tuple(down.values()))
+    return LockStep(tuple(windows.values()), tuple(run.edge.receipts), tuple(run.edge.fallbacks), tuple(down.values()))

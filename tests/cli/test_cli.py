@@ -125,6 +125,35 @@ def test_an_interrupt_is_130_and_one_line(scenario, monkeypatch):
     assert result.stderr.count("\n") == 1
 
 
+IN_AN_IMPORT = """
+import builtins, os, signal
+from servotwin.__main__ import main
+load = builtins.__import__
+def loading(name, *rest, **options):
+    if name == "typer":
+        os.kill(os.getpid(), signal.SIGINT)
+    return load(name, *rest, **options)
+builtins.__import__ = loading
+main()
+"""
+WHILE_COMPILING = """
+import sys
+from servotwin.__main__ import main
+import servotwin.cli.simulate
+servotwin.cli.simulate.record = lambda *_: exec("raise KeyboardInterrupt")
+sys.argv = ["servotwin", "simulate", "scenario.toml", "-o", "run.csv"]
+main()
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="signals")
+@pytest.mark.parametrize("program", [IN_AN_IMPORT, WHILE_COMPILING], ids=["in an import", "while compiling"])
+def test_a_process_ends_with_130_and_one_line_wherever_it_is_interrupted(tmp_path, program):
+    ended = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert ended.returncode == 130
+    assert ended.stderr == "interrupted; no partly written file is left\n"
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 def test_a_reproduction_can_be_interrupted(tmp_path):

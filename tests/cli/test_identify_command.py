@@ -174,6 +174,8 @@ BAD = {
     "empty": (lambda lines: lines[:0], "line 1 must name the columns"),
     "no header": (lambda lines: lines[1:], "line 1 must name the columns"),
     "no rows": (lambda lines: lines[:1], "n >= 16 samples"),
+    "blank rows": (lambda lines: [lines[0], "", ""], "n >= 16 samples"),
+    "zeros": (lambda _lines: ["\0" * 100], "it is: not text"),
     "other names": (lambda lines: [lines[0].replace("theta_m_rad", "theta_m_deg"), *lines[1:]], "no theta_m"),
     "no position": (lambda lines: [lines[0].replace("position_m", "position_mm"), *lines[1:]], "mean 'position_mm'"),
     "no time": (lambda lines: [lines[0].replace("time_s", "t"), *lines[1:]], "column 'time_s' is missing"),
@@ -198,6 +200,7 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
     assert result.exit_code == 2, result.output
     assert message in result.stderr
     assert "bad.csv" in result.stderr
+    assert result.stderr.count("\n") == 1
     assert result.stderr.count("\n") == 1
 
 

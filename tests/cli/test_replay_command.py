@@ -116,11 +116,11 @@ def test_windows_that_retention_emptied_are_counted_and_the_rest_is_compared(fol
     finally:
         store.close()
     assert gone.emptied > 0
-    assert gone.kept > 0
+    assert gone.retained > 0
     code, output = replayed(folder)
     assert code == 0
     assert f"{gone.emptied} not repeated: retention deleted the window's body" in output
-    assert f"{gone.kept} the same, bit for bit" in output
+    assert f"{gone.retained} the same, bit for bit" in output
 
 
 @pytest.mark.slow

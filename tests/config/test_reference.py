@@ -1,6 +1,7 @@
 """The reference in docs/ is that of the code, and its schemas accept what the program reads."""
 
 import json
+import re
 import tomllib
 from pathlib import Path
 
@@ -88,3 +89,16 @@ def test_a_twin_s_file_fits_its_schema() -> None:
     jsonschema_rs.validate(schema, values)
     values["service"]["port"] = -1
     assert not jsonschema_rs.is_valid(schema, values)
+
+
+def test_no_key_is_read_by_hand() -> None:
+    """Values of a table come from its declaration; only `config` itself calls the readers of single keys."""
+    by_hand = re.compile(r"\b(?:table|inner|edge|values)\.(?:text|numbers?|integer|boolean)(?:_in)?\(\"")
+    found = [
+        f"{path.relative_to(ROOT)}: {line.strip()}"
+        for path in sorted((ROOT / "servotwin").rglob("*.py"))
+        if path.parent.name != "config"
+        for line in path.read_text(encoding="utf-8").splitlines()
+        if by_hand.search(line)
+    ]
+    assert found == []

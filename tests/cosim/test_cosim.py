@@ -12,7 +12,7 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.guard import Limits
 from servotwin.estimation.estimate import GapStatus
 from servotwin.link.simulated import Fate, LinkSettings
-from servotwin.messages import Acknowledge, Hello, Reason, Receipt, Update, WindowMessage
+from servotwin.messages import Acknowledge, Hello, LetterAcknowledge, Reason, Receipt, Update, WindowMessage
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -168,7 +168,7 @@ def test_an_update_out_of_bounds_is_refused():
 def test_the_twins_processing_delays_the_update_alone():
     loop = cosimulate(short(duration=5.0, twin=TwinSettings(policy="paper", processing=0.5)))
     sent = {type(m.message): m.sent for m in loop.messages if m.direction == "down"}
-    assert sent == {Acknowledge: 2.0, Update: 2.5}
+    assert sent == {Acknowledge: 2.0, Update: 2.5, LetterAcknowledge: 4.5}
     assert loop.receipts[0].sample == 17500
 
 

@@ -40,8 +40,11 @@ class Stub:
         time = np.arange(first, last) / RATE
         return 1e-3 * np.floor(np.minimum(time, DURATION / 2) / STEP) if name == "reference" else np.sin(time)
 
-    def set_tolerance(self, tolerance):
-        self.tolerances.append((self.index, tolerance))
+    def write(self, parameters):
+        self.tolerances.append((self.index, parameters.setting.tolerance))
+
+    def move(self, offset):
+        raise AssertionError(f"nobody asked for a probing move, of {offset} m")
 
 
 def fake(window, _previous):
@@ -89,7 +92,7 @@ def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, s
     loop = run(uplink, downlink, seed, twin, interval_s)
     made = {update.version: update for update in loop.store.updates}
     assert list(made) == sorted(made)
-    applied = {receipt.version: receipt.sample for receipt in loop.receipts if receipt.applied}
+    applied = {receipt.version: receipt.sample for receipt in loop.edge.receipts if receipt.applied}
     assert len(applied) == len(loop.machine.tolerances)
     assert list(applied) == sorted(applied)
     times = [made[version].data_time for version in applied]
@@ -98,7 +101,7 @@ def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, s
     assert all(sample / RATE < made[version].not_after for version, sample in applied.items())
     assert len(loop.store.windows) == len(loop.store.estimates)
     records = loop.loop(None)
-    assert sum(records.accounts.values()) == loop.agent.windows_cut == 10
+    assert sum(records.accounts.values()) == loop.edge.agent.windows_cut == 10
     in_flight = [m for m in records.messages if m.fate is Fate.IN_FLIGHT]
     assert all(m.arrival > DURATION - 2.0 / RATE for m in in_flight)
 
@@ -117,6 +120,10 @@ def test_a_link_that_lives_brings_the_newest_parameters_in_the_end(loss, duplica
     assert newest == 29.8 - 3.0 * (round(29.8 / STEP) % 5 == 0)
     assert loop.machine.tolerances[-1][1] == PAPER.tolerance_for(0.01 * newest)
     assert loop.twin.next_wake() is None
+    assert loop.edge.outbox.pending() == loop.edge.outbox.letters() == []
+    assert len(loop.store.windows) == loop.edge.agent.windows_cut
+    once = list(dict.fromkeys(loop.edge.receipts))  # an update that comes again gets the same receipt
+    assert sorted(loop.store.receipts, key=once.index) == once
 
 
 def fake_ok(start):

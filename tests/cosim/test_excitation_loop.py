@@ -49,7 +49,7 @@ def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(ra
     assert all(status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND) for _, status in kinds(loop)[:2])
     (request,) = loop.requests
     assert request.ask == LongerWindow(2.0, 0.3)
-    assert [answer.outcome for answer in loop.answers] == [RequestOutcome.TAKEN]
+    assert [answer.outcome for answer in loop.answers] == [RequestOutcome.ACCEPTED]
     (found,) = loop.estimates[2:]
     assert (found.status, loop.windows[2].samples) == (GapStatus.OK, 10_000)
     assert error(loop, 2) < 1e-3
@@ -133,7 +133,7 @@ def test_a_move_of_the_reference_ends_the_probing_move_one_sample_later(
 ) -> None:
     loop = cosimulate(calm(MAY_PROBE, rate, recording=PROBED, reference=signal, duration=19.0))
     first, size = loop.answers[0].sample, loop.requests[0].ask.size  # type: ignore[union-attr]
-    assert loop.answers[0].taken
+    assert loop.answers[0].accepted
     moved = loop.run.reference - signal.pieces(19.0).on(loop.run.time)  # type: ignore[union-attr]
     assert np.array_equal(np.flatnonzero(np.abs(moved) > 1e-9), np.arange(first, round(5000.0 * time) + 1))
     assert moved[first] == pytest.approx(size)
@@ -151,7 +151,7 @@ def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
         loop = cosimulate(scenario.replace(downlink=bad, recording=recording, twin=twin, duration=60.0))
         sent = [m.message for m in loop.messages if m.direction == "down" and isinstance(m.message, Request)]
         assert {request.serial for request in sent} == {request.serial for request in loop.requests}
-        assert {answer.outcome for answer in loop.answers} == {RequestOutcome.TAKEN}
+        assert {answer.outcome for answer in loop.answers} == {RequestOutcome.ACCEPTED}
         assert len(set(loop.answers)) == len({answer.serial for answer in loop.answers})
         assert loop.windows[-1].samples == 10_000
     assert loop.digest() == cosimulate(loop.scenario).digest()

@@ -171,6 +171,11 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ("size_mm = 1.0", "size_m = 1.0", "'reference.size_mm' is missing (found 'reference.size_m' instead)"),
         ("size_mm = 1.0", "size_mm = nan", "reference.size_mm = nan is not allowed"),
         ("[gap]", "[gab]", "table [gap] is missing (found 'gab' instead)"),
+        (
+            "total_deg = 10.0",
+            "total_deg = 2000",
+            "gap.total_deg = 2000 is not allowed; give a number, at least 0, at most",
+        ),
         ("total_deg = 10.0", "total_deg = -1", "gap.total_deg = -1 is not allowed; give a number, at least 0"),
         ("total_deg = 10.0", "from_deg = 1\nto_deg = -1\nover_s = 3", "gap.to_deg = -1 is not allowed"),
         ("total_deg = 10.0", "total_deg = 1\nto_deg = 3", "unknown key 'gap.to_deg'"),

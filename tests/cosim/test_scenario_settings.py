@@ -49,7 +49,7 @@ def test_every_key_of_the_default_estimator_is_read(tmp_path):
         passes=3,
         order=40,
         starts=9,
-        kept=2,
+        refined=2,
         skew=False,
         largest_skew=1e-3,
         gap_rate=one,

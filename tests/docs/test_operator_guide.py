@@ -176,7 +176,7 @@ def test_every_field_of_an_edge_s_status_is_explained() -> None:
 
 
 def test_every_kind_of_evidence_is_explained() -> None:
-    kinds = calls("twin", "_made", "_sent")
+    kinds = calls("twin", "_computed", "_sent")
     assert set(NAME.findall("".join(cells[0] for cells in rows("Evidence of a window")))) == kinds | {"failed"}
 
 

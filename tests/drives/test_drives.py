@@ -25,9 +25,7 @@ from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, D
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains, Setting
-from servotwin.plant.signals import PiecewiseCubic, as_pieces
 from servotwin.simulation import Run, Simulation
-from servotwin.simulation.inputs import shifted
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
 SOFTER = {"Kp": 1000.0, "Ki": 9000.0, "leave": 1.4, "feedforward": 0.02}
@@ -91,7 +89,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
     same.advance(changed)
     same.set_controller(controller, 2e-5)
     same.advance(moved)
-    same.set_reference(shifted(as_pieces(scenario.reference, 10.0), PiecewiseCubic.constant(2e-4)))
+    same.move(2e-4)
     run, blocks = whole(same), before + between + after
     assert changed == 2345 + wire.MAX_SAMPLES
     assert [block.version for block in blocks] == [0, 0] + [7] * (len(blocks) - 2)
@@ -275,10 +273,15 @@ supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), 
     ("changes", "message"),
     [
         ({"role": "both"}, "role = 'both' is not allowed"),
-        ({"listen": "0.0.0.0:7000"}, "machine address '0.0.0.0:7000' is not allowed"),
-        ({"listen": "unix:"}, "machine address 'unix:' is not allowed"),
+        (
+            {"listen": "0.0.0.0:7000"},
+            "listen = '0.0.0.0:7000' is not allowed; give unix:PATH, relative to this file, or 127.0.0.1:PORT",
+        ),
+        ({"listen": "unix:"}, "listen = 'unix:' is not allowed"),
         ({"speed": -1.0}, "speed = -1.0 is not allowed"),
         ({"scenario": "other.toml"}, "scenario = 'other.toml' is not allowed"),
+        ({"scenario": "fig15sampled"}, "or a table (did you mean 'fig15-sampled'?)"),
+        ({"scenario": 3}, "scenario = 3 is not allowed; give a text in quotes"),
         ({"scenario": "fig15"}, "scenario controller sample rate: must be a number in Hz"),
         ({"block_s": 10.0}, "block_s = 10.0 s: must hold 1 to 4096 samples"),
         ({"keep_s": 0.01}, "keep_s = 0.01 s: must be at least block_s"),

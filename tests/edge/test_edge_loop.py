@@ -1,7 +1,6 @@
 """An agent and a minimal twin over a hostile link: nothing twice, nothing older, nothing unaccounted for."""
 
 from dataclasses import dataclass, field
-from functools import partial
 
 import pytest
 from exploration import examples
@@ -12,9 +11,21 @@ from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
-from servotwin.link.outbox import MemoryOutbox
-from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink
-from servotwin.messages import Acknowledge, Message, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
+from servotwin.link.outbox import MemoryOutbox, letter_digest
+from servotwin.link.session import Session
+from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink, SimulatedSender
+from servotwin.messages import (
+    Acknowledge,
+    LetterAcknowledge,
+    Message,
+    Reason,
+    Receipt,
+    Setting,
+    Update,
+    WindowMessage,
+    decode,
+    encode,
+)
 from servotwin.runtime.clock import VirtualClock
 from servotwin.runtime.retry import Retry
 
@@ -104,10 +115,12 @@ class Loop:
         self.outbox = MemoryOutbox(capacity)
         self.agent, self.twin = Agent(edge, self.outbox), twin
         self.link = SimulatedLink("axis-1", self.clock, self._at_twin, self._at_edge, link, link, seed)
+        self.sender = SimulatedSender(Session(self.outbox, edge.retry), self.clock, self.link.up)
         self.history: list[Parameters] = []
         self.swaps: list[tuple[int, int]] = []
         self.receipts: list[Receipt] = []
         self.acknowledged: set[int] = set()
+        self.letters: list[bytes] = []
 
     def run(self, until: float) -> None:
         """Sample by sample; what arrives at a sample instant comes before the sample."""
@@ -120,11 +133,22 @@ class Loop:
             self._up(self.agent.absorb(reference, 0.1 * now, 0.01 * now, 0.0))
 
     def _at_twin(self, data: bytes) -> None:
-        self._down(self.twin.receive(decode(data)))
+        message, digest = decode(data), letter_digest(data)
+        if isinstance(message, WindowMessage):
+            self._down(self.twin.receive(message))
+            return
+        self._down([LetterAcknowledge("axis-1", digest)])
+        if digest not in self.letters:
+            self.letters.append(digest)
+            self._down(self.twin.receive(message))
 
     def _at_edge(self, data: bytes) -> None:
         message, before = decode(data), self.agent.parameters
+        if isinstance(message, LetterAcknowledge):
+            self.sender.acknowledge(message.digest)
+            return
         if isinstance(message, Acknowledge):
+            self.sender.acknowledge((message.boot, message.sequence))
             self.acknowledged.add(message.sequence)
         self._up(self.agent.receive(message))
         if self.agent.parameters is not before:
@@ -136,8 +160,8 @@ class Loop:
         for out in sent:
             if isinstance(out.message, Receipt):
                 self.receipts.append(out.message)
-            leaves = max(self.clock.now, out.sample / RATE)
-            self.clock.schedule(leaves, partial(self.link.up.send, encode(out.message)))
+            self.outbox.put_letter(encode(out.message))
+        self.sender.plan(self.agent.time)
 
     def _down(self, sent: list[Message]) -> None:
         for message in sent:
@@ -217,7 +241,8 @@ def test_the_newest_window_wins_once_the_link_recovers(link: LinkSettings, seed:
     loop.run(HOSTILE_S + TAIL_S)
     check_parameters(loop)
     assert loop.twin.seen == set(range(STEPS))
-    assert loop.outbox.pending() == []
+    assert loop.outbox.pending() == loop.outbox.letters() == []
+    assert sorted(loop.letters) == sorted({letter_digest(encode(receipt)) for receipt in loop.receipts})
     assert loop.history[-1].window == ("b0", STEPS - 1)
     assert twin.pending is None
 

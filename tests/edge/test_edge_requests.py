@@ -8,8 +8,9 @@ import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sending_agent import SendingAgent
 
-from servotwin.edge.agent import Agent, ScheduledMessage
+from servotwin.edge.agent import ScheduledMessage
 from servotwin.edge.probe import ProbeLimits, ProbingMove
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.supervisor import Supervisor
@@ -44,7 +45,7 @@ def request(serial: int = 1, ask: Any = MOVE, **changes: Any) -> Request:
     return msgspec.structs.replace(Request("axis-1", "b0", serial, ask, 60.0), **changes)
 
 
-def feed(agent: Agent, targets: list[float]) -> list[Message]:
+def feed(agent: SendingAgent, targets: list[float]) -> list[Message]:
     """As whoever ticks the law does: wanted position plus the agent's offset, one sample after the other."""
     sent = list[ScheduledMessage]()
     for value in targets:
@@ -53,7 +54,7 @@ def feed(agent: Agent, targets: list[float]) -> list[Message]:
     return [out.message for out in sent]
 
 
-def answer(agent: Agent, message: Request) -> Answer:
+def answer(agent: SendingAgent, message: Request) -> Answer:
     (reply,) = agent.receive(message)
     assert isinstance(reply.message, Answer)
     return reply.message
@@ -70,9 +71,11 @@ def windows(sent: list[Message]) -> list[WindowMessage]:
 
 
 def test_a_longer_window_counts_from_the_next_change_on() -> None:
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, [0.0] * 9 + [1e-3])
-    assert answer(agent, request(ask=LongerWindow(1.5, 0.3))) == Answer("axis-1", "b0", 1, 10, RequestOutcome.TAKEN, 1)
+    assert answer(agent, request(ask=LongerWindow(1.5, 0.3))) == Answer(
+        "axis-1", "b0", 1, 10, RequestOutcome.ACCEPTED, 1
+    )
     (short,) = windows(feed(agent, [1e-3] * 20))
     (longer,) = windows(feed(agent, [0.0] * 20))
     assert (short.start, short.samples) == (0.9, 8)
@@ -80,16 +83,16 @@ def test_a_longer_window_counts_from_the_next_change_on() -> None:
 
 
 def test_windows_never_get_shorter_than_configured() -> None:
-    agent = Agent(settings(pre_trigger_s=0.2))
-    assert answer(agent, request(ask=LongerWindow(0.3, 0.1))).taken
+    agent = SendingAgent(settings(pre_trigger_s=0.2))
+    assert answer(agent, request(ask=LongerWindow(0.3, 0.1))).accepted
     (window,) = windows(feed(agent, [0.0] * 5 + [1e-3] * 20))
     assert (window.start, window.samples) == (0.3, 8)
 
 
 def test_a_probing_move_goes_there_and_back_and_has_a_window_of_its_own() -> None:
-    agent = Agent(settings(pre_trigger_s=0.2))
+    agent = SendingAgent(settings(pre_trigger_s=0.2))
     feed(agent, [2e-3] * 30)
-    assert answer(agent, request(ask=Probe(1e-3, 0.4, 2))) == Answer("axis-1", "b0", 1, 30, RequestOutcome.TAKEN, 1)
+    assert answer(agent, request(ask=Probe(1e-3, 0.4, 2))) == Answer("axis-1", "b0", 1, 30, RequestOutcome.ACCEPTED, 1)
     sent = feed(agent, [2e-3] * 40)
     (window,) = windows(sent)
     assert (window.reason, window.start, window.samples) == ("probe", 2.8, 18)
@@ -99,9 +102,9 @@ def test_a_probing_move_goes_there_and_back_and_has_a_window_of_its_own() -> Non
 
 
 def test_the_move_ends_when_the_reference_moves_and_its_window_is_another() -> None:
-    agent = Agent(settings(pre_trigger_s=0.2))
+    agent = SendingAgent(settings(pre_trigger_s=0.2))
     feed(agent, [2e-3] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     (window,) = windows(feed(agent, [2e-3] * 3 + [0.0] * 30))
     assert agent.offset == 0.0
     assert (window.reason, window.start, window.samples) == ("reference", 3.1, 8)
@@ -109,9 +112,9 @@ def test_the_move_ends_when_the_reference_moves_and_its_window_is_another() -> N
 
 
 def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     fallback = Fallback("axis-1", "b0", 34, Cause.ERROR, 1.0, 0.1, 0, 1, Setting(0.0))
     monkeypatch.setattr(Supervisor, "check", lambda self: (fallback,) if self._recorder.samples == 34 else ())
     sent = feed(agent, [0.0] * 40)
@@ -121,16 +124,16 @@ def test_the_move_ends_with_a_fallback(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_law_that_ignores_the_offset_ends_the_move() -> None:
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     for _ in range(3):
         agent.absorb(0.0, 0.0, 0.0, 0.0)
     assert agent.probe is None
 
 
 def test_a_probing_move_without_permission_is_refused() -> None:
-    agent = Agent(settings(probe=None))
+    agent = SendingAgent(settings(probe=None))
     feed(agent, [0.0] * 30)
     assert answer(agent, request()) == Answer("axis-1", "b0", 1, 30, RequestOutcome.NOT_ALLOWED, 1)
     assert agent.offset == 0.0
@@ -148,26 +151,26 @@ def test_a_probing_move_without_permission_is_refused() -> None:
         (request(ask=Probe(1e-3, 0.4, 3)), RequestOutcome.TOO_LARGE),
         (request(ask=LongerWindow(2.1, 0.3)), RequestOutcome.TOO_LARGE),
         (request(ask=LongerWindow(2.0, 0.6)), RequestOutcome.TOO_LARGE),
-        (request(ask=Probe(-1e-3, 1.0)), RequestOutcome.TAKEN),
-        (request(ask=LongerWindow(2.0, 0.5)), RequestOutcome.TAKEN),
+        (request(ask=Probe(-1e-3, 1.0)), RequestOutcome.ACCEPTED),
+        (request(ask=LongerWindow(2.0, 0.5)), RequestOutcome.ACCEPTED),
     ],
 )
 def test_a_refused_request_has_its_reason(message: Request, outcome: RequestOutcome) -> None:
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
     before = agent._requests
     assert answer(agent, message).outcome is outcome
-    assert (replace(agent._requests, answer=None) == before) == (outcome is not RequestOutcome.TAKEN)
+    assert (replace(agent._requests, answer=None) == before) == (outcome is not RequestOutcome.ACCEPTED)
 
 
 def test_a_request_counts_once_and_is_answered_again() -> None:
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
     first = answer(agent, request())
     feed(agent, [0.0] * 90)
     assert answer(agent, request()) == first
     assert agent.probe is None
-    assert answer(agent, request(serial=4, ask=LongerWindow(1.5, 0.3))).taken
+    assert answer(agent, request(serial=4, ask=LongerWindow(1.5, 0.3))).accepted
     late = answer(agent, request(serial=2))
     assert (late.outcome, late.newest) == (RequestOutcome.DUPLICATE, 4)
 
@@ -175,21 +178,21 @@ def test_a_request_counts_once_and_is_answered_again() -> None:
 @pytest.mark.parametrize("fed", [0, 3, 31, 35])
 def test_a_probing_move_begins_only_at_rest(fed: int) -> None:
     """Before anything rested, and while a window is recorded."""
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, ([0.0] * 30 + [1e-3] * 10)[:fed])
     assert answer(agent, request()) == Answer("axis-1", "b0", 1, fed, RequestOutcome.BUSY, 0)
     feed(agent, [1e-3] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
 
 
 def test_moves_keep_their_distance_and_the_same_request_may_come_again() -> None:
-    agent = Agent(settings())
+    agent = SendingAgent(settings())
     feed(agent, [0.0] * 30)
-    assert answer(agent, request()).taken
+    assert answer(agent, request()).accepted
     feed(agent, [0.0] * 49)
     assert answer(agent, request(serial=2)).outcome is RequestOutcome.TOO_SOON
     feed(agent, [0.0])
-    assert answer(agent, request(serial=2)).taken
+    assert answer(agent, request(serial=2)).accepted
 
 
 @given(
@@ -202,7 +205,7 @@ def test_blocks_equal_single_samples(
 ) -> None:
     """Blocks end where requests come and, during a move, with the sample at which the wanted position changes."""
     reference = [value for value, count in targets for _ in range(count)]
-    single, blocks = Agent(settings()), Agent(settings())
+    single, blocks = SendingAgent(settings()), SendingAgent(settings())
     one, other = list[ScheduledMessage](), list[ScheduledMessage]()
     serial, done = 0, 0
     while done < len(reference):

@@ -11,7 +11,7 @@ import pytest
 from benchmarks import hostile
 from benchmarks.hostiletwin import HONEST, HostileTwin, TwinFault
 from servotwin.control.controller import Controller
-from servotwin.cosim import Cosimulation, simulation_of
+from servotwin.cosim import Cosimulation, SimulatedMachine, simulation_of
 from servotwin.messages import Cause, Gains, Reason
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -120,7 +120,7 @@ def cosimulated(
     scenario = hostile.scenario(machine, 3, QUICK).replace(duration=30.0)
     twin = HostileTwin.of(kind, scenario, gap, random.Random(3))
     plant = simulation_of(scenario, machine.servo)
-    loop = Cosimulation(scenario, plant, twin=twin)
+    loop = Cosimulation(scenario, SimulatedMachine(scenario, plant), twin=twin)
     while not loop.done:
         loop.advance()
     return loop, plant, twin
@@ -139,8 +139,8 @@ def test_equal_seeds_give_equal_bytes() -> None:
 def test_the_machine_runs_on_what_the_edge_put_in_force() -> None:
     machine = replace(hostile.case(3), input_bias=0.03, friction=0.0)
     loop, plant, twin = cosimulated(TwinFault.LIES_LOW, 0.3, machine)
-    assert loop.agent.parameters.version > 0
-    assert isinstance(loop.agent.parameters.setting.gains, Gains)
-    assert plant.controller == loop.agent.controller
+    assert loop.edge.agent.parameters.version > 0
+    assert isinstance(loop.edge.agent.parameters.setting.gains, Gains)
+    assert plant.controller == loop.edge.agent.controller
     assert plant.controller.feedforward == twin.sent[-1].setting.gains.feedforward
     assert plant.controller.feedforward == pytest.approx(-0.03, abs=2e-3)

@@ -122,7 +122,7 @@ def test_a_window_with_a_bad_sample_is_not_filtered_and_not_sent(
 def test_an_acknowledged_frame_ends_the_wait_for_the_twin() -> None:
     """The window was delivered before its link process died: the next one only acknowledges the frame."""
     box = PipeOutlet(True)
-    box.offer(cut(0).cut, 0.0)
+    box.offer(cut(0).cut)
     assert box.unacknowledged
     received = box._receive([frames.encode(frames.AckFrame(1))])
     assert received.pending_changed

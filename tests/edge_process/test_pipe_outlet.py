@@ -37,7 +37,7 @@ def test_a_cut_crosses_as_it_is() -> None:
 def test_an_outlet_sends_unacknowledged_frames_to_the_next_link_process(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.boot = "b0"
-    box.offer(cut(0), 0.0)
+    box.offer(cut(0))
     assert box.unacknowledged
     box.connect(far.near)
     box.send_letter(Hello("axis-1", "b0", 0.0, RATE, 0, Setting(0.0), ""))
@@ -87,14 +87,14 @@ def test_an_outlet_is_bounded_and_disconnects_a_link_process_that_acknowledges_n
     box = PipeOutlet(True)
     box.connect(far.near)
     for k in range(20):
-        box.offer(cut(k, 500), 0.0)
+        box.offer(cut(k, 500))
     assert box.dropped[BEHIND] == 20 - 100_000 // len(frames.encode(frames.window_frame(cut(0, 500), "", 1)))
     assert not box.connected
 
 
 def test_without_a_twin_no_answer_is_expected() -> None:
     box = PipeOutlet(False)
-    box.offer(cut(), 0.0)
+    box.offer(cut())
     assert not box.unacknowledged
 
 

@@ -284,7 +284,7 @@ def test_supervising_records_writes_parameters_and_moves_the_reference(far: Link
     exchange_all(box)
     (answer,) = letters(far, Answer)
     assert isinstance(answer, Answer)
-    assert answer.taken
+    assert answer.accepted
     role.stop()
     assert drive.log[-1] == "move 0.0"
 
@@ -337,7 +337,7 @@ def test_the_edge_ends_after_the_link_process_has_taken_all_windows(monkeypatch:
     box = PipeOutlet(True)
     edge = edge_of(box)
     for k in range(50):
-        box.offer(cut(k), 0.0)
+        box.offer(cut(k))
     clock = edge.clock
 
     def pause(seconds: float) -> None:

@@ -21,11 +21,14 @@ from servotwin.runtime.clock import VirtualClock, WallClock
 from servotwin.control import Controller, start, tick
 from servotwin.edge.agent import Agent
 from servotwin.edge.settings import AgentSettings
-from servotwin.link.simulated import LinkSettings, SimulatedLink
+from servotwin.link.outbox import MemoryOutbox
+from servotwin.link.session import Session
+from servotwin.link.simulated import LinkSettings, SimulatedLink, SimulatedSender
 from servotwin.messages import Acknowledge, Setting, Update, decode, encode, unpack_channel
 
 controller = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=100.0)
-clock, agent, at_twin = VirtualClock(), Agent(AgentSettings("axis-1", "b0", 100.0)), []
+clock, outbox, at_twin = VirtualClock(), MemoryOutbox(), []
+agent = Agent(AgentSettings("axis-1", "b0", 100.0), outbox)
 
 def to_twin(data):
     at_twin.append(decode(data))
@@ -33,16 +36,20 @@ def to_twin(data):
     link.down.send(encode(Update("axis-1", 1, 0, ("b0", 0), 0.0, 0.1, None, (0.0, None), "OK", Setting(1e-4), 9.0)))
 
 def to_edge(data):
-    agent.receive(decode(data))
+    message = decode(data)
+    if isinstance(message, Acknowledge):
+        sender.acknowledge((message.boot, message.sequence))
+    agent.receive(message)
 
 link = SimulatedLink("axis-1", clock, to_twin, to_edge, LinkSettings(delay_s=0.5), LinkSettings(delay_s=0.5), 0)
+sender = SimulatedSender(Session(outbox), clock, link.up)
 state, position = start(0.0), 0.0
 for _ in range(250):
     clock.run_until(agent.time)
     state = tick(controller.law(agent.parameters.setting.tolerance), state, 1e-3, position)
     position += 1e-5 * state.voltage
-    for out in agent.absorb(1e-3, position, position, state.voltage):
-        link.up.send(encode(out.message))
+    agent.absorb(1e-3, position, position, state.voltage)
+    sender.plan(agent.time)
 assert len(unpack_channel(at_twin[0].channel("voltage"))) == 100
 assert agent.parameters.setting.tolerance == 1e-4 and agent.deadline is None
 assert not {"numpy", "scipy", "numba"} & set(sys.modules)

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from exploration import examples
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from benchmarks.estimator_windows import random_cases
@@ -36,12 +36,17 @@ def moments(values: np.ndarray, per_sample: int = 1) -> np.ndarray:
 @examples(60, deadline=None)
 @given(st.floats(0.05, 1.5), st.floats(-1.0, 1.0), st.integers(0, 10**6))
 def test_area_and_moment_are_those_of_the_fine_path(gap, place, seed):
-    """To the cubic's error, not the line's."""
+    """To the cubic's error, not the line's.
+
+    In the first interval it is a parabola; its error at a crest there may stay in the screw throughout.
+    """
     coarse, fine = (angle(np.arange(COUNT * finer + 1) / finer, seed) for finer in (1, FINER))
-    at = Gap(gap, 0.5 * gap * place)
+    at, x = Gap(gap, 0.5 * gap * place), np.arange(FINER + 1) / FINER
     true = moments(play(fine, at.gap, at.theta_d0), FINER)
     exact, line = (np.abs(moments(path(coarse, at)[SCREW]) - true) for path in (polygon, contacts))
-    assert np.all(exact <= 6e-4 * np.array([1.0, COUNT]) + 0.1 * line)
+    parabola = coarse[0] + x * (coarse[1] - coarse[0]) + 0.5 * x * (x - 1.0) * np.diff(coarse[:3], 2)
+    first = float(np.abs(fine[: FINER + 1] - parabola).max())
+    assert np.all(exact <= (1e-4 + COUNT * first) * np.array([1.0, COUNT]) + 0.1 * line)
 
 
 def test_a_contact_that_begins_between_two_samples():
@@ -74,8 +79,11 @@ def test_derivatives_are_those_of_the_area(gap, place, seed):
         (BY_GAP, at._replace(gap=gap + step), at._replace(gap=gap - step)),
         (BY_START, at._replace(theta_d0=at.theta_d0 + step), at._replace(theta_d0=at.theta_d0 - step)),
     ):
-        difference = (polygon(theta_m, up)[SCREW] - polygon(theta_m, down)[SCREW]) / (2.0 * step)
-        assert moments(difference) == pytest.approx(moments(rows[row]), abs=2e-2, rel=1e-3)
+        above, below = (moments((polygon(theta_m, side)[SCREW] - rows[SCREW]) / step) for side in (up, down))
+        # A crest that only just touches the screw is a kink: there is no derivative.
+        assume(np.allclose(above, -below, rtol=1e-2, atol=1e-2))
+        difference = 0.5 * (above - below)
+        assert difference == pytest.approx(moments(rows[row]), abs=2e-2, rel=1e-3)
     assert np.abs(rows[BY_RATE]).max() <= 0.5 * COUNT
 
 

@@ -9,8 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.errors import InvalidInput
-from servotwin.link.simulated import Fate, LinkDirection, LinkSettings, SimulatedLink, derive_seed
+from servotwin.link.outbox import MemoryOutbox, letter_digest
+from servotwin.link.session import Session
+from servotwin.link.simulated import Fate, LinkDirection, LinkSettings, SimulatedLink, SimulatedSender, derive_seed
 from servotwin.runtime.clock import VirtualClock
+from servotwin.runtime.retry import Retry
 
 PROBABILITY = st.sampled_from([0.0, 0.1, 0.5, 1.0])
 SETTINGS = st.builds(
@@ -113,3 +116,54 @@ def test_seeds_are_stable_across_machines_and_runs() -> None:
 def test_bad_settings_are_refused(values: dict[str, Any]) -> None:
     with pytest.raises(InvalidInput, match="link"):
         LinkSettings(**values)
+
+
+class Exchange:
+    """Letters over a lossy link: who receives one acknowledges it by its digest, each time."""
+
+    def __init__(self, link: LinkSettings, retry: Retry, seed: int = 1) -> None:
+        self.clock, self.outbox, self.arrived = VirtualClock(), MemoryOutbox(), list[bytes]()
+        self.down = LinkDirection("down", self.clock, lambda digest: self.sender.acknowledge(digest), link, seed)
+        self.up = LinkDirection("up", self.clock, self._receive, link, seed)
+        self.sender = SimulatedSender(Session(self.outbox, retry), self.clock, self.up)
+
+    def post(self, body: bytes) -> None:
+        self.outbox.put_letter(body)
+        self.sender.send_due()
+
+    def _receive(self, body: bytes) -> None:
+        self.arrived.append(body)
+        self.down.send(letter_digest(body))
+
+
+def test_a_sender_repeats_with_growing_pauses_until_the_acknowledgement() -> None:
+    cut = LinkSettings(delay_s=0.25, outages=((0.0, 8.0),))
+    exchange = Exchange(cut, Retry(1.0, 2.0, 4.0))
+    exchange.post(b"receipt")
+    exchange.clock.run_until(60.0)
+    assert [record.sent for record in exchange.up.records] == [0.0, 1.0, 3.0, 7.0, 11.0]
+    assert exchange.arrived == [b"receipt"]
+    assert exchange.outbox.letters() == []
+    assert exchange.clock.next_time is None
+
+
+def test_the_first_send_may_be_planned_for_a_later_sample() -> None:
+    exchange = Exchange(LinkSettings(), Retry(1.0))
+    exchange.outbox.put_letter(b"receipt")
+    exchange.sender.plan(3.5)
+    exchange.clock.run_until(10.0)
+    assert [record.sent for record in exchange.up.records] == [3.5]
+
+
+def test_the_number_of_tries_is_geometric() -> None:
+    """Each try succeeds with probability (1 - loss)^2: mean 1 / p, variance (1 - p) / p^2."""
+    loss, letters = 0.3, 2000
+    exchange = Exchange(LinkSettings(delay_s=0.1, loss=loss), Retry(1.0, 1.0, 1.0))
+    for k in range(letters):
+        exchange.post(b"%d" % k)
+    exchange.clock.run_until(1000.0)
+    assert set(exchange.arrived) == {b"%d" % k for k in range(letters)}
+    assert exchange.outbox.letters() == []
+    success = (1.0 - loss) ** 2
+    spread = ((1.0 - success) / success**2 / letters) ** 0.5
+    assert abs(exchange.up.offered / letters - 1.0 / success) < 4.0 * spread

@@ -18,7 +18,7 @@ import servotwin as st
 from benchmarks.novelty.command import FALSE_ALARMS, QUICK, charted
 from benchmarks.novelty.windows import NoveltyCondition
 from servotwin.cosim.driver import Cosimulation
-from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.machine import SimulatedMachine, simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.agent import Agent
 from servotwin.edge.outlet import FILTERED
@@ -60,17 +60,18 @@ SETTINGS = NoveltySettings(model_of(SERVO, RATE), NoveltyRules(), GAP)
 def looped(factors: tuple[float, ...], learn: bool, novelty: bool = True) -> tuple[Cosimulation, st.Loop]:
     """The calm loop of a machine that is off, whose gap grows by 0.3 deg at 160 s."""
     packaged = Scenario.preset("calm")
-    gap = st.PiecewiseCubic.held([0.0, 160.0], [GAP, GAP + 0.3 * DEG])
+    gap = st.PiecewiseCubic.zero_order_hold([0.0, 160.0], [GAP, GAP + 0.3 * DEG])
     scenario = packaged.replace(
         duration=240.0,
         gap=gap,
         recording=replace(packaged.recording, novelty=NoveltyRules() if novelty else None),
         twin=packaged.twin.replace(learning=LearningSettings(learn=learn)),
     )
-    loop = Cosimulation(scenario, simulation_of(scenario, adapted(SERVO, np.log(factors))))
+    plant = simulation_of(scenario, adapted(SERVO, np.log(factors)))
+    loop = Cosimulation(scenario, SimulatedMachine(scenario, plant))
     while not loop.done:
         loop.advance()
-    return loop, loop.loop(loop.machine.run())
+    return loop, loop.loop(plant.run())
 
 
 @pytest.mark.parametrize("factors", OFF_BY)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sending_agent import SendingAgent
 
 import servotwin as st
 from benchmarks.novelty.command import QUICK, charted, saved
@@ -17,7 +18,7 @@ from benchmarks.novelty.loops import LoopCase, account, summary
 from benchmarks.novelty.windows import CONDITIONS
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.edge.agent import Agent, ScheduledMessage
+from servotwin.edge.agent import ScheduledMessage
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
@@ -113,9 +114,9 @@ def test_a_scenario_says_it_in_toml(tmp_path: Path) -> None:
         Scenario.load(path)
 
 
-def agent(rules: NoveltyRules | None, rate: float = 500.0) -> Agent:
+def agent(rules: NoveltyRules | None, rate: float = 500.0) -> SendingAgent:
     novelty = None if rules is None else NoveltySettings(model_of(Servo.preset("paper"), rate), rules)
-    return Agent(AgentSettings("axis", "b0", rate, window_filter=novelty))
+    return SendingAgent(AgentSettings("axis", "b0", rate, window_filter=novelty))
 
 
 @pytest.mark.parametrize("block", [1, 7, 1000, 5000])

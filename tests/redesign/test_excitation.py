@@ -59,7 +59,7 @@ def test_an_estimate_and_a_model_mismatch_reset_the_count(status: GapStatus) -> 
 
 
 def test_a_probe_comes_only_after_long_windows_have_failed_as_often() -> None:
-    taken = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), RequestOutcome.TAKEN)
+    taken = run(ALLOWED, [SHORT, SHORT])[-1].state.answered(LongerWindow(2.0, 0.3), RequestOutcome.ACCEPTED)
     found = asks(ALLOWED, [SHORT, LONG, LONG], taken)
     assert found[:2] == [None, None]
     assert found[2] == Probe(PITCH * 25.0 * DEG, 0.85, 1)
@@ -116,7 +116,7 @@ def test_an_edge_that_refuses_gets_no_request_before_it_boots(outcome: RequestOu
 
 
 def test_a_boot_forgets_the_windows_and_not_when_the_last_probe_was() -> None:
-    state = ExcitationState(3, Stage.TAKEN, Stage.REFUSED, 12.0)
+    state = ExcitationState(3, Stage.ACCEPTED, Stage.REFUSED, 12.0)
     assert state.rebooted() == ExcitationState(probed=12.0)
 
 

@@ -183,7 +183,7 @@ def test_moves_to_and_fro_are_those_of_one_run(seed: int) -> None:
         servo,
         30.0,
         controller=law,
-        reference=PiecewiseCubic.held([0.0, 10.0, 20.0], [size, 0.0, size]),
+        reference=PiecewiseCubic.zero_order_hold([0.0, 10.0, 20.0], [size, 0.0, size]),
         gap=gap,
         tolerance=tolerance or None,
         theta_d0=0.0,

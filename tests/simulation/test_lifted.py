@@ -60,7 +60,7 @@ def test_a_touch_shorter_than_a_tick_is_not_missed(rate: float, excess: float) -
     """The widest gap that is still crossed: a little narrower, and the contact lasts a small part of a tick."""
     law = PAPER.controller.replace(sample_rate=rate, Ki=0.0)
 
-    reference = PiecewiseCubic.held([0.0, 0.5, 0.53], [1e-3, 0.2e-3, 1.2e-3])  # turns back inside the gap
+    reference = PiecewiseCubic.zero_order_hold([0.0, 0.5, 0.53], [1e-3, 0.2e-3, 1.2e-3])  # turns back inside the gap
 
     def touch(gap: float, block: bool) -> float:
         """How long the other flank is touched, s; 0: not at all."""

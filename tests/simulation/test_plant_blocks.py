@@ -147,7 +147,7 @@ def test_short_runs_and_fast_samples_take_the_ticks() -> None:
 
 
 def test_a_gap_that_changes_inside_a_sample() -> None:
-    gap = PiecewiseCubic.held([0.0, 1.50042, 3.3], np.array([3.0, 6.0, 0.5]) * DEGREE)
+    gap = PiecewiseCubic.zero_order_hold([0.0, 1.50042, 3.3], np.array([3.0, 6.0, 0.5]) * DEGREE)
     controller = PAPER.controller.replace(sample_rate=5e3)
     options = OPTIONS | {"gap": gap, "controller": controller, "noise": Noise(std=1e-5), "sample_rate": 1e3}
     simulation = Simulation(PAPER, 5.0, **options)

@@ -47,7 +47,7 @@ def test_against_an_interpreted_loop(name: str) -> None:
         servo,
         0.7,
         controller=controller,
-        reference=PiecewiseCubic.held([0.0, 0.4], [1e-3, -0.5e-3]),
+        reference=PiecewiseCubic.zero_order_hold([0.0, 0.4], [1e-3, -0.5e-3]),
         gap=PiecewiseCubic([0.0], [[gap, wear, 0.0, 0.0]]),
         tolerance=tolerance,
         sample_rate=rate,
@@ -206,9 +206,9 @@ def knotted() -> dict[str, PiecewiseCubic]:
     return {
         "ramp that ends inside a sample": as_pieces(ramp, 1.0),
         "ramp that ends with one": as_pieces(SCurve(6.0 * DEGREE, 1.0 * DEGREE, 0.3, 0.2), 1.0),
-        "jumps": PiecewiseCubic.held([0.0, 0.15, 0.30042, 0.5], np.array([3.0, 6.0, 0.5, 4.0]) * DEGREE),
-        "closes": PiecewiseCubic.held([0.0, 0.25, 0.6], np.array([3.0, 0.0, 2.0]) * DEGREE),
-        "many in one sample": PiecewiseCubic.held(
+        "jumps": PiecewiseCubic.zero_order_hold([0.0, 0.15, 0.30042, 0.5], np.array([3.0, 6.0, 0.5, 4.0]) * DEGREE),
+        "closes": PiecewiseCubic.zero_order_hold([0.0, 0.25, 0.6], np.array([3.0, 0.0, 2.0]) * DEGREE),
+        "many in one sample": PiecewiseCubic.zero_order_hold(
             [0.0, *(0.4 + np.arange(1, 9) * 1.1e-4)], np.array([3, 1, 2, 1, 2, 1, 2, 1, 2.0]) * DEGREE
         ),
     }
@@ -255,7 +255,7 @@ def test_a_gap_moves_a_screw_at_rest_only_by_closing(controller: Controller) -> 
 
 def test_a_free_structure_only_loses_energy() -> None:
     """Struck by a gap that jumps shut, with the motor at rest: kinetic and elastic energy fall from then on."""
-    gap = PiecewiseCubic.held([0.0, 0.1], [10.0 * DEGREE, 2.0 * DEGREE])
+    gap = PiecewiseCubic.zero_order_hold([0.0, 0.1], [10.0 * DEGREE, 2.0 * DEGREE])
     run = simulate(PAPER, 2.0, gap=gap, tolerance=1.0, theta_d0=5.0 * DEGREE, sample_rate=5e3)
     q, m, k = run.q, PAPER.masses, PAPER.stiffnesses
     speeds = np.gradient(q, 1.0 / 5e3, axis=0)
@@ -270,7 +270,7 @@ def test_a_free_structure_only_loses_energy() -> None:
 def test_setting_the_tolerance_is_planning_it(controller: Controller) -> None:
     first, second = PAPER.tolerance_for(1.0 * DEGREE), PAPER.tolerance_for(8.0 * DEGREE)
     options = {"controller": controller, "reference": SquareWave(1e-3, 1.0), "gap": 5.0 * DEGREE}
-    planned = simulate(PAPER, 2.0, tolerance=PiecewiseCubic.held([0.0, 0.7312], [first, second]), **options)
+    planned = simulate(PAPER, 2.0, tolerance=PiecewiseCubic.zero_order_hold([0.0, 0.7312], [first, second]), **options)
     live = Simulation(PAPER, 2.0, tolerance=first, **options)
     live.advance(3656)
     live.set_tolerance(second)
@@ -290,7 +290,7 @@ def test_the_first_and_the_last_tick_are_taken() -> None:
 
 def test_dead_zone_events_of_the_ticks() -> None:
     """They alternate; what a jump of the reference between two ticks sets off is not the state's doing."""
-    reference = PiecewiseCubic.held([0.0, 0.50037, 3.0], [0.0, 1e-3, -1e-3])
+    reference = PiecewiseCubic.zero_order_hold([0.0, 0.50037, 3.0], [0.0, 1e-3, -1e-3])
     run = sampled(1e3, 4.0, reference=reference, gap=3.0 * DEGREE, tolerance=PAPER.tolerance_for(4.0 * DEGREE))
     zone = run.events[np.isin(run.events.kind, ["enter", "leave"])]
     assert list(zone.kind[:2]) == ["leave", "enter"]

@@ -68,7 +68,7 @@ def test_samples_and_times() -> None:
 
 
 def test_events_are_in_order_and_named() -> None:
-    gap = PiecewiseCubic.held([0.0, 0.8], [3.0 * DEGREE, 5.0 * DEGREE])
+    gap = PiecewiseCubic.zero_order_hold([0.0, 0.8], [3.0 * DEGREE, 5.0 * DEGREE])
     law = PAPER.controller.replace(voltage_limit=1.0)
     options = {"controller": law, "gap": gap, "tolerance": PAPER.tolerance_for(2.0 * DEGREE)}
     events = simulate(PAPER, 4.0, reference=SquareWave(1e-3, 2.0), **options).events

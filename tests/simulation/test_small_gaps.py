@@ -66,8 +66,8 @@ def degenerate(seed: int) -> tuple[Servo, dict[str, object]]:
         size,
         SCurve(0.0, size, 10.0),
         SCurve(size, 0.0, 5.0, half),
-        PiecewiseCubic.held([0.0, half, 2.0 * half], [size, size / 2.0, 2.0 * size]),
-        PiecewiseCubic.held([0.0, half, 2.0 * half], [size, 0.0, size]),
+        PiecewiseCubic.zero_order_hold([0.0, half, 2.0 * half], [size, size / 2.0, 2.0 * size]),
+        PiecewiseCubic.zero_order_hold([0.0, half, 2.0 * half], [size, 0.0, size]),
         PiecewiseCubic([0.0, half], [[size, *zero[1:]], [size, size / 10.0, *zero[2:]]]),
         PiecewiseCubic([0.0, 1.0, 3.0], [[size, *zero[1:]], [size, -size / 4.0, 0, 0], [size / 2.0, size / 4.0, 0, 0]]),
     ]

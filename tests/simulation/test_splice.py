@@ -13,7 +13,7 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SCurve, SignalLike, SquareWave, Step
 from servotwin.simulation import Run, Simulation, simulate
-from servotwin.simulation.inputs import about, shifted, spliced
+from servotwin.simulation.inputs import about, raised, spliced
 
 PAPER = Servo.preset("paper")
 RATES = [None, 1000.0, 200.0]
@@ -99,7 +99,7 @@ def test_what_is_no_signal_is_refused() -> None:
 @given(cubics(), cubics(), st.floats(0.0, 5.0))
 def test_sums_and_splices_have_the_values_they_should(one: PiecewiseCubic, two: PiecewiseCubic, time: float) -> None:
     t = np.linspace(0.0, 6.0, 97)
-    assert np.allclose(shifted(one, two).value(t), one.value(t) + two.value(t), rtol=1e-9, atol=1e-9)
+    assert np.allclose(raised(one, 0.25).value(t), one.value(t) + 0.25, rtol=1e-9, atol=1e-9)
     both = spliced(one, two, time)
     apart = t[np.abs(t - time) > 1e-9]
     assert np.allclose(both.value(apart), np.where(apart < time, one.value(apart), two.value(apart)), atol=1e-9)
@@ -109,7 +109,26 @@ def test_sums_and_splices_have_the_values_they_should(one: PiecewiseCubic, two: 
 
 
 @given(st.floats(-1e-2, 1e-2), st.floats(-1e-3, 1e-3))
-def test_a_constant_shifted_by_a_constant_is_their_floating_sum(value: float, offset: float) -> None:
+def test_a_move_of_a_constant_is_their_floating_sum(value: float, offset: float) -> None:
     """The edge expects its reference to the last bit."""
-    moved = shifted(PiecewiseCubic.constant(value), PiecewiseCubic.held([0.0, 1.0, 2.0], [0.0, offset, 0.0]))
-    assert list(moved.on(np.array([0.5, 1.5, 2.5]))) == [value, value + offset, value]
+    simulation = Simulation(PAPER, 0.3, reference=value, **options_of(1000.0))
+    for index, moved in ((100, offset), (200, 0.0), (300, offset)):
+        simulation.advance(index)
+        simulation.move(moved)
+    expected = [value] * 100 + [value + offset] * 100 + [value] * 100
+    assert simulation.measured("reference", 0, 300).tolist() == expected
+
+
+@pytest.mark.parametrize("rate", [None, 1000.0])
+def test_a_move_adds_to_a_moving_reference_and_ends_without_a_trace(rate: float | None) -> None:
+    planned = SCurve(0.0, 1e-3, duration=0.4)
+    runs = [Simulation(PAPER, 0.5, reference=planned, **options_of(rate)) for _ in range(2)]
+    for index, offset in ((200, 2e-4), (300, 0.0)):
+        runs[0].advance(index)
+        runs[0].move(offset)
+    for run in runs:
+        run.advance(500)
+    moved, plain = (run.measured("reference", 0, 500) for run in runs)
+    np.testing.assert_allclose(moved[200:300] - plain[200:300], 2e-4, rtol=1e-9)
+    assert np.array_equal(moved[:200], plain[:200])
+    np.testing.assert_allclose(moved[300:], plain[300:], rtol=1e-12)

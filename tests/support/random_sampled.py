@@ -112,12 +112,14 @@ def random_case(seed: int) -> SampledCase:
         width,
         width,
         SCurve(0.0, width, duration),
-        PiecewiseCubic.held([0.0, 0.31237 * duration, 0.7 * duration], [width, 0.3 * width, 1.1 * width]),
+        PiecewiseCubic.zero_order_hold([0.0, 0.31237 * duration, 0.7 * duration], [width, 0.3 * width, 1.1 * width]),
     ][int(rng.integers(4))]
     zone = servo.tolerance_for(10.0 ** rng.uniform(-1.0, 1.2) * DEGREE)
-    tolerance = [None, zone, PiecewiseCubic.held([0.0, 0.4 * duration, 0.8 * duration], [zone, 0.0, 2.0 * zone])][
-        int(rng.integers(3))
-    ]
+    tolerance = [
+        None,
+        zone,
+        PiecewiseCubic.zero_order_hold([0.0, 0.4 * duration, 0.8 * duration], [zone, 0.0, 2.0 * zone]),
+    ][int(rng.integers(3))]
     inputs = RunInputs(
         as_pieces(reference, duration),
         as_gap(gap, duration),

@@ -65,7 +65,7 @@ def requests_after(twin: Twin, *windows) -> list[messages.Request]:
     return requests([message for each in windows for message in twin.receive(each, each.start + 3.0)])
 
 
-def answer(request, outcome=RequestOutcome.TAKEN, newest=None) -> Answer:
+def answer(request, outcome=RequestOutcome.ACCEPTED, newest=None) -> Answer:
     return Answer("axis", request.boot, request.serial, 1000, outcome, request.serial if newest is None else newest)
 
 
@@ -182,6 +182,6 @@ def test_without_settings_answers_are_stored_and_nothing_is_requested() -> None:
     twin = Twin("axis", TwinModel.of(SERVO, TwinSettings(policy="paper"), START, Says()))
     store = twin.log
     assert requests_after(twin, window(0), window(1), window(2)) == []
-    late = Answer("axis", "b0", 1, 0, RequestOutcome.TAKEN, 1)
+    late = Answer("axis", "b0", 1, 0, RequestOutcome.ACCEPTED, 1)
     assert twin.receive(late, 50.0) == []
     assert store.answers == [late]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from twin_messages import known_gap, make, window_message
 
 from servotwin.control.gains import gains_of
-from servotwin.cosim import Cosimulation, Loop, simulation_of
+from servotwin.cosim import Cosimulation, Loop, SimulatedMachine
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.agent import Agent
 from servotwin.edge.probe import ProbeLimits
@@ -80,7 +80,7 @@ class Reborn:
 
 
 def run(scenario: Scenario, remote: Reborn | None = None) -> Loop:
-    machine = simulation_of(scenario)
+    machine = SimulatedMachine(scenario)
     loop = Cosimulation(scenario, machine, twin=remote)
     if remote is not None:
         loop.store = remote.store

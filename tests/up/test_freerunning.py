@@ -137,18 +137,19 @@ def reached(folder: Path) -> int:
 
 
 def settled(folder: Path) -> bool:
-    """True once all messages are processed."""
-    return ask(folder, "select count(*) from messages where done is null") == [(0,)]
+    """True once the edge has sent all windows and all messages are processed."""
+    sent = ask(folder / "axis" / "outbox.sqlite", "select count(*) from windows") == [(0,)]
+    return sent and ask(folder / "twin.db", "select count(*) from messages where done is null") == [(0,)]
 
 
 def estimates(folder: Path) -> dict[float, dict]:
     text = "select start, evidence.body from evidence join messages on messages.id = message where evidence.kind = ?"
-    rows = ask(folder, text, "estimate")
+    rows = ask(folder / "twin.db", text, "estimate")
     return {start: msgspec.msgpack.decode(body)["estimate"] for start, body in rows if start < DURATION - PERIOD / 2}
 
 
-def ask(folder: Path, text: str, *values: str) -> list[tuple]:
-    with closing(sqlite3.connect(folder / "twin.db")) as database:
+def ask(file: Path, text: str, *values: str) -> list[tuple]:
+    with closing(sqlite3.connect(file)) as database:
         return database.execute(text, values).fetchall()
 
 

@@ -53,14 +53,14 @@ def check(fleet: Fleet, sufficient: int, killer: Killer, counts: dict[str, int])
 
 @pytest.mark.slow
 def test_kills_and_a_bad_network_lose_no_window(tmp_path: Path) -> None:
-    fleet = Fleet(tmp_path, ["control"] * 3 + ["supervise"] * 9)
+    fleet = Fleet(tmp_path, ["control"] * 2 + ["supervise"] * 6)
     killer = Killer(fleet, SEED, {"twin": 2, "edge": 5, "link": 2})
     bad_link = HttpRelay(fleet.port, BAD, SEED, Weather(cut_s=CUTS_S))
     with bad_link as relay, deployed(fleet, f"http://127.0.0.1:{relay.port}"):
-        strike_until(fleet, killer, 700, SEED)
+        strike_until(fleet, killer, 450, SEED)
         relay.clear()
         finish(fleet)
-    check(fleet, 700, killer, relay.counts)
+    check(fleet, 450, killer, relay.counts)
     assert min(killer.kills[what] for what in ("twin", "edge", "link")) > 0
     assert min(relay.counts[what] for what in ("lost before", "lost after", "twice", "held", "cut")) > 0
 

@@ -59,8 +59,8 @@ class OpcUaSettings:
             )
 
 
-def read_password(file: str | None, variable: str | None, folder: Path) -> str | None:
-    """The password in a file of mode 0600, relative to `folder`, or in an environment variable.
+def read_password(path: Path | None, variable: str | None) -> str | None:
+    """The password in a file of mode 0600, or in an environment variable.
 
     Raises
     ------
@@ -73,14 +73,13 @@ def read_password(file: str | None, variable: str | None, folder: Path) -> str |
                 f"password_env = {variable!r} is not allowed; give the name of an environment variable that is set"
             )
         return os.environ[variable]
-    if file is None:
+    if path is None:
         return None
-    path = folder / file
     try:
         mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
     except (OSError, UnicodeDecodeError):
-        raise InvalidInput(f"password_file = {file!r} is not allowed; give a text file that can be read") from None
+        raise InvalidInput(f"password_file = {str(path)!r} is not allowed; give a text file that can be read") from None
     if mode & 0o077:
         allowed = "give a file of mode 0600: this one is open to others"
-        raise InvalidInput(f"password_file = {file!r} is not allowed; {allowed}")
+        raise InvalidInput(f"password_file = {str(path)!r} is not allowed; {allowed}")
     return text

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable
+from itertools import islice
 from math import isfinite
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.control.gains import with_gains
 from servotwin.cosim import machine
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.messages import Gains
+from servotwin.messages import Gains, Setting
 from servotwin.simulation.endless import OpenLoopPlant
 
 _HISTORY = 1024
@@ -117,13 +119,22 @@ class SupervisedPlant:
             self._blocks.popleft()
 
     def read(self, first: int, most: int) -> SampleBlock | None:
-        """Samples from number `first` on, or from the oldest one retained; None where none is there yet."""
-        block = None
-        for earlier in reversed(self._blocks):
-            if earlier.last <= first:
+        """At most `most` samples from number `first` on, or from the oldest one retained; None where none is there yet.
+
+        A reader that is behind catches up: it receives the samples of many blocks at once.
+        """
+        place = bisect_right(self._blocks, first, key=attrgetter("last"))
+        if place == len(self._blocks):
+            return None
+        block = self._blocks[place]
+        values = [block.part(max(first, block.first), most).values]
+        count = values[0].shape[1]
+        for later in islice(self._blocks, place + 1, None):
+            if count >= most or later.version != block.version:
                 break
-            block = earlier
-        return None if block is None else block.part(max(first, block.first), most)
+            values.append(later.part(later.first, most - count).values)
+            count += values[-1].shape[1]
+        return SampleBlock(max(first, block.first), block.version, np.hstack(values))
 
     def write(self, version: int, tolerance: float, gains: Gains | None) -> None:
         """Put parameters in force from the present sample on.
@@ -133,10 +144,7 @@ class SupervisedPlant:
         InvalidInput
             The controller does not allow them.
         """
-        if gains is None:
-            self._machine.set_tolerance(tolerance)
-        else:
-            self._machine.set_controller(with_gains(self._law, gains), tolerance)
+        machine.put_in_force(self._machine, self._law, Setting(tolerance, gains))
         self.version = version
 
     def move(self, offset: float) -> None:

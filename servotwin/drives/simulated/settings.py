@@ -7,14 +7,35 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-from servotwin.config.keys import check, key, settings
-from servotwin.config.table import Table, named, read_toml
+from servotwin.config.keys import Form, check, key, settings
+from servotwin.config.table import Table, did_you_mean, named, read_toml
 from servotwin.config.toml import read
 from servotwin.cosim.scenario import PRESETS, Scenario
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.machine_state import read_speed, read_state
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import as_pieces
+
+
+def _scenario(table: Table, name: str, scenario: object, folder: Path) -> Scenario:
+    """Read the scenario: a preset's name, a file, or a table."""
+    if isinstance(scenario, dict):
+        return Scenario.from_table(table.table(name), folder)
+    given = table.text(name)
+    if given in PRESETS:
+        return Scenario.preset(given)
+    if not (folder / given).is_file():
+        paths = f"the path of a scenario's TOML, relative to this file, or a table{did_you_mean(given, PRESETS)}"
+        raise table.invalid(name, f"one of {', '.join(PRESETS)}, {paths}")
+    return Scenario.load(folder / given)
+
+
+def _address(table: Table, name: str, text: str, folder: Path) -> wire.Address:
+    try:
+        address = wire.parse_address(text)
+    except InvalidInput:
+        raise table.invalid(name, "unix:PATH, relative to this file, or 127.0.0.1:PORT") from None
+    return address if address.path is None else address._replace(path=str(folder / address.path))
 
 
 @settings("machine")
@@ -24,15 +45,19 @@ class MachineSettings:
 
     Parameters
     ----------
-    scenario : Scenario
-        Its servo, reference, gap, disturbances and noise; in the role supervise also its controller and dead zone at
-        the start.
-    address : wire.Address
     begin : float
         s of machine time before this run.
     """
 
-    scenario: Scenario
+    scenario: Annotated[
+        Scenario,
+        key(
+            form=Form.OTHER,
+            parse=_scenario,
+            help="A packaged scenario, the path of one relative to this file, or a table with its keys: servo, "
+            "reference, gap, disturbances and noise; in the role supervise also controller and dead zone at the start.",
+        ),
+    ]
     role: Annotated[
         str,
         key(
@@ -40,7 +65,10 @@ class MachineSettings:
             help="control: the voltage comes from the edge; supervise: the machine's own controller runs.",
         ),
     ]
-    address: wire.Address
+    address: Annotated[
+        wire.Address,
+        key("listen", form=Form.TEXT, parse=_address, help="unix:PATH, relative to this file, or 127.0.0.1:PORT."),
+    ]
     speed: Annotated[
         float,
         key(
@@ -109,8 +137,7 @@ class MachineSettings:
             The file or its scenario is missing or not allowed.
         """
         table, folder = read_toml(path), Path(path).parent
-        scenario, address = _scenario(table, folder), _address(table, folder)
-        machine: MachineSettings = read(table, cls, folder, scenario=scenario, address=address)
+        machine: MachineSettings = read(table, cls, folder)
         table.done()
         with named(table):
             return machine.resumed()
@@ -158,22 +185,3 @@ class MachineSettings:
     def end(self) -> int | None:
         """Number of samples of the run, without the scenario's last instant; None: endless."""
         return None if self.endless else self.scenario.samples - 1
-
-
-def _scenario(table: Table, folder: Path) -> Scenario:
-    """Read the scenario: a preset's name, a file, or a table."""
-    if isinstance(table.values.get("scenario"), dict):
-        return Scenario.from_table(table.table("scenario"), folder)
-    name = table.text("scenario")
-    if name in PRESETS:
-        return Scenario.preset(name)
-    if not (folder / name).is_file():
-        allowed = f"one of {', '.join(PRESETS)}, the path of a scenario's TOML, relative to this file, or a table"
-        raise table.invalid("scenario", allowed)
-    return Scenario.load(folder / name)
-
-
-def _address(table: Table, folder: Path) -> wire.Address:
-    with named(table):
-        address = wire.parse_address(table.text("listen"))
-    return address if address.path is None else address._replace(path=str(folder / address.path))

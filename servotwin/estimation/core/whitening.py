@@ -63,11 +63,9 @@ class Autoregression:
 
         The noise is the innovations through an all-pole filter; the weights go through it backwards in time.
         """
-        poles = self.predictors[-1]
-        # Here, because scipy.signal takes long to import and many commands never estimate.
-        from scipy.signal import lfilter
-
-        return np.asarray(lfilter([self.spread[-1]], poles, weights[::-1])[::-1])
+        out = np.empty(weights.size)
+        filter_backwards(np.ascontiguousarray(weights), self.predictors[-1], float(self.spread[-1]), out)
+        return out
 
 
 def burg(series: Array, most: int) -> Autoregression:
@@ -82,7 +80,7 @@ def burg(series: Array, most: int) -> Autoregression:
     return Autoregression(predictors[: best + 1, : best + 1].copy(), np.sqrt(power[: best + 1]))
 
 
-def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float = 1.0) -> Array:
+def with_noise_restored(residual: Array, columns: Array, root: Array, scale: float = 1.0) -> Array:
     """(2, n) equally likely series of the noise in a residual (n,), with what the fit may have taken put back.
 
     A fit takes noise away with every parameter, and most where the gap shows, so that the residual looks quieter there
@@ -99,8 +97,8 @@ def with_noise_put_back(left: Array, columns: Array, root: Array, scale: float =
     scale : float
         Standard deviation of the whitened noise.
     """
-    taken = scale * math.sqrt(len(root)) * (root @ columns)
-    return np.vstack([left + taken, left - taken])
+    restored = scale * math.sqrt(len(root)) * (root @ columns)
+    return np.vstack([residual + restored, residual - restored])
 
 
 def _criteria(power: Array, size: int) -> Array:
@@ -184,3 +182,14 @@ def whiten(columns: Array, predictors: Array, spread: Array, out: Array) -> None
                 left[i] += weights[j] * column[i + most - j]
         for i in range(left.size):
             left[i] /= spread[most]
+
+
+@bare
+def filter_backwards(weights: Array, poles: Array, gain: float, out: Array) -> None:
+    """Filter (n,) weights backwards in time, from rest, with a gain over the polynomial `poles`, into `out`."""
+    size, order = weights.size, poles.size - 1
+    for i in range(size - 1, -1, -1):
+        total = gain * weights[i]
+        for j in range(1, min(order, size - 1 - i) + 1):
+            total -= poles[j] * out[i + j]
+        out[i] = total

@@ -104,7 +104,7 @@ class SharedFit:
         known, residuals, blocks = self.known(), [], []
         for fit, place in zip(self.fits, self.places, strict=True):
             count = len(place)
-            evaluation = fit.evaluated(fit.known.vague(np.ones(count, dtype=bool)))(point[place])
+            evaluation = fit.evaluated(fit.known.without_prior(np.ones(count, dtype=bool)))(point[place])
             block = np.zeros((self.size, evaluation.residual.size - count))
             block[place] = evaluation.jacobian[:, :-count]
             residuals.append(evaluation.residual[:-count])
@@ -126,11 +126,11 @@ class SharedFit:
         rivals = tuple(tuple(float(one.point[i]) for one in near if _apart(one.point[i], best.point[i])) for i in gaps)
         return replace(best, evaluations=sum(one.evaluations for one in minima)), rivals
 
-    def _start(self, stands: Sequence[FitPoint]) -> Array:
+    def _start(self, minima: Sequence[FitPoint]) -> Array:
         """Start at each window's own minimum, with the shared parameters of the window whose gap is known best."""
-        leader = min(range(len(stands)), key=lambda i: float(stands[i].deviations()[0]))
-        whole = self.joined([one.point for one in stands])
-        whole[self.places[leader]] = stands[leader].point
+        leader = min(range(len(minima)), key=lambda i: float(minima[i].deviations()[0]))
+        whole = self.joined([one.point for one in minima])
+        whole[self.places[leader]] = minima[leader].point
         return whole
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import Decimation, decimation
 from servotwin.estimation.core.least_squares import least_squares, orthonormal, spread
-from servotwin.estimation.core.whitening import Autoregression, recursion, with_noise_put_back
+from servotwin.estimation.core.whitening import Autoregression, recursion, with_noise_restored
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, Reduce
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
@@ -38,8 +38,8 @@ class ParameterPrior:
     mean: Array
     spread: Array
 
-    def vague(self, free: Flags) -> ParameterPrior:
-        """The bounds alone, and parameters that are not `kept` (P,) held at their means: for a first search."""
+    def without_prior(self, free: Flags) -> ParameterPrior:
+        """The bounds alone, and parameters that are not `free` (P,) fixed at their means: for a first search."""
         lowest, highest = np.where(free, self.lowest, self.mean), np.where(free, self.highest, self.mean)
         return ParameterPrior(lowest, highest, self.mean, np.full_like(self.spread, np.inf))
 
@@ -131,7 +131,7 @@ def scan(model: JointModel, values: Mapping[str, float], gaps: Array, keep: int,
 AnyPrior = float | GapEstimate | Prior | None
 
 
-def _known_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
+def _prior_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> ParameterPrior:
     """Bounds and priors of the model's parameters."""
     rows = {"gap": (0.0, settings.largest_gap_rad, 0.0, math.inf), "place": (-1.0, 1.0, 0.0, math.inf)}
     rows["delay"] = (-settings.delay_limit, settings.delay_limit, 0.0, math.inf)
@@ -183,25 +183,25 @@ _LEAST = 1e-300
 
 
 def estimate_noise(
-    model: JointModel, minimum: FitPoint, reduce: Decimation, before: Autoregression, order: int, put: bool
+    model: JointModel, minimum: FitPoint, reduce: Decimation, before: Autoregression, order: int, restore: bool
 ) -> Autoregression:
     """Estimate the noise from the residual of a fit that was made with a first idea of it.
 
-    With `put`, the noise that the fit may have taken away is put back.
+    With `restore`, the noise that the fit may have taken away is restored.
     """
     table = _without_motor_start(
         model, model.table(dict(zip(model.names, minimum.point.tolist(), strict=True)), reduce.rows)
     )
     rows = before.whiten(table)
     solved = least_squares(rows[1:], rows[0])
-    left = table[0] - solved.coefficients @ table[1:]
-    if not np.any(left):
+    residual = table[0] - solved.coefficients @ table[1:]
+    if not np.any(residual):
         return Autoregression.white(1.0)
-    if not put:
-        return likeliest(left[None], table, order)
+    if not restore:
+        return likeliest(residual[None], table, order)
     rest = rows[0] - solved.coefficients @ rows[1:]
     scale = math.sqrt(float(rest @ rest) / max(1, rest.size - len(solved.root)))
-    return likeliest(with_noise_put_back(left, table[1:], solved.root, scale), table, order)
+    return likeliest(with_noise_restored(residual, table[1:], solved.root, scale), table, order)
 
 
 def likeliest(series: Array, table: Array, most: int) -> Autoregression:
@@ -223,9 +223,9 @@ def _restricted(noise: Autoregression, rows: Array) -> float:
     The level of the noise is free.
     """
     size, white = rows.shape[1], noise.whiten(rows)
-    left = white[0] - least_squares(white[1:], white[0]).coefficients @ white[1:]
+    residual = white[0] - least_squares(white[1:], white[0]).coefficients @ white[1:]
     degrees, count = max(1, size - len(white) + 1), noise.order + 1
-    level = degrees * math.log(max(float(left @ left) / degrees, _LEAST))
+    level = degrees * math.log(max(float(residual @ residual) / degrees, _LEAST))
     spreads = noise.spread[np.minimum(np.arange(size), noise.order)]
     information = float(np.linalg.slogdet(white[1:] @ white[1:].T)[1])
     likelihood = 2.0 * float(np.log(spreads).sum()) + level + information
@@ -286,7 +286,7 @@ class WindowMinima:
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:
     """Make the fit from which a search begins."""
-    known, noise = _known_of(model, prior, settings), Autoregression.white(1.0)
+    known, noise = _prior_of(model, prior, settings), Autoregression.white(1.0)
     reduce = decimation(decimation_factor(model.servo, model.rate))
     here = _evaluate_at(model, start_of(model, prior), known, reduce.rows)
     return WindowMinima(model, known, reduce, noise, (here,), here.evaluations, blocked)
@@ -296,8 +296,8 @@ def searched(model: JointModel, prior: AnyPrior, settings: JointSettings) -> Win
     """Search the minima of a window's cost; noise and parameters are estimated in turn."""
     fit = _unwhitened(unsearched(model, prior, settings), settings)
     for number in range(settings.whitenings):
-        put = number == settings.whitenings - 1
-        noise = estimate_noise(model, fit.best, fit.reduce, fit.noise, settings.noise_order, put)
+        restore = number == settings.whitenings - 1
+        noise = estimate_noise(model, fit.best, fit.reduce, fit.noise, settings.noise_order, restore)
         fit = _descended(replace(fit, noise=noise), fit.known, fit.minima)
     return fit
 
@@ -310,11 +310,15 @@ def _unwhitened(fit: WindowMinima, settings: JointSettings) -> WindowMinima:
     model, fine = fit.model, np.array([name in MOTOR_START or name.startswith(JUMP) for name in fit.model.names])
     values = dict(zip(model.names, fit.best.point.tolist(), strict=True))
     gaps = np.unique(np.append(_GRID[settings.largest_gap_rad >= _GRID], values["gap"]))
-    bounds, tolerance = fit.known.vague(~fine), 30.0 * tolerance_of(model)
+    bounds, tolerance = fit.known.without_prior(~fine), 30.0 * tolerance_of(model)
     starts = scan(model, values, gaps, _STARTS, fit.reduce.rows)
     coarse = [descend(fit.evaluated(bounds), begin, bounds, tolerance) for begin in starts]
     searched_fit = replace(fit, minima=_distinct(coarse), evaluations=sum(one.evaluations for one in coarse))
-    return _descended(searched_fit, fit.known.vague(fine | True), searched_fit.minima) if fine.any() else searched_fit
+    return (
+        _descended(searched_fit, fit.known.without_prior(fine | True), searched_fit.minima)
+        if fine.any()
+        else searched_fit
+    )
 
 
 def _descended(fit: WindowMinima, known: ParameterPrior, starts: Sequence[FitPoint]) -> WindowMinima:
@@ -331,10 +335,10 @@ def decimation_factor(servo: Servo, rate: float) -> int:
     return max(1, int(rate * scales(servo).time / _SAMPLES_HZ + 1e-9))
 
 
-def _distinct(stands: Sequence[FitPoint]) -> tuple[FitPoint, ...]:
+def _distinct(minima: Sequence[FitPoint]) -> tuple[FitPoint, ...]:
     """The lowest of each group with the same gap, the lowest of all first."""
     different: list[FitPoint] = []
-    for one in sorted(stands, key=lambda one: one.cost):
+    for one in sorted(minima, key=lambda one: one.cost):
         if all(abs(one.point[0] - other.point[0]) > APART for other in different):
             different.append(one)
     return tuple(different)

@@ -123,17 +123,17 @@ class JointModel:
         forced = structure.plain(contacts(theta_m, at)[:1])
         shift = values.get("delay", 0.0) * self.rate
         rows = reduce(np.vstack([self.measured - self.delayed(forced, shift), self.nuisances(structure, shift)]))
-        left = project_out(orthonormal(rows[1:]), rows[:1])[0]
-        return float(left @ left)
+        remainder = project_out(orthonormal(rows[1:]), rows[:1])[0]
+        return float(remainder @ remainder)
 
     def slopes(self, values: Mapping[str, float], reduce: Reduce) -> JointSlopes:
         """Residual and derivatives; those of the nuisances by the parameters are included."""
         table = self.table(values, reduce)
         split = table.shape[0] - len(self.names)
         basis, moved = orthonormal(table[1:split]), table[split:]
-        left = project_out(basis, np.vstack([table[:1], -moved]))
-        left[1:][np.linalg.norm(left[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
-        return JointSlopes(left[0], left[1:], float(left[0] @ left[0]))
+        remainder = project_out(basis, np.vstack([table[:1], -moved]))
+        remainder[1:][np.linalg.norm(remainder[1:], axis=1) <= _ROUNDING * np.linalg.norm(moved, axis=1)] = 0.0
+        return JointSlopes(remainder[0], remainder[1:], float(remainder[0] @ remainder[0]))
 
     def table(self, values: Mapping[str, float], reduce: Reduce) -> Array:
         """(1 + N + 1 + P, m) measured less forced position, nuisances, derivatives of the position by `names`."""

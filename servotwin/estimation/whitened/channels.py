@@ -24,7 +24,7 @@ from servotwin.plant.signals import Array
 _FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; share of the fastest motion there
 _JUMP = 50.0  # times the usual fastest motion
 # Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
-_HELD, _ABRUPT, _LEAP = 4, 4.0, 2.0
+_REPEATED, _ABRUPT, _LEAP = 4, 4.0, 2.0
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
 _QUIET, _LOUD = math.radians(0.002), math.radians(0.03)  # noise of the encoder: below, nothing; above, the lowest cut
 _HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3  # of the servo's own seconds
@@ -50,10 +50,10 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
             f"{name} jumps by {factor * steps[index]:.6g} {unit} between samples {index} and {index + 1}: a wrapped "
             "encoder, or samples are missing"
         )
-    return _saturation(name, samples, steps, factor, unit) or _held(name, steps)
+    return _saturation(name, samples, steps, factor, unit) or _repeating(name, steps)
 
 
-def _held(name: str, steps: Array) -> str:
+def _repeating(name: str, steps: Array) -> str:
     """Describe samples that repeat the one before them in full motion; empty without them.
 
     What comes to rest slows down, and what starts is no faster in its first sample than in the next ones, as a motor
@@ -66,14 +66,14 @@ def _held(name: str, steps: Array) -> str:
     moving = np.flatnonzero(steps > 0.0)
     if moving.size < 2 or np.median(np.diff(moving)) > 1.0:
         return ""
-    long = ends - begins >= _HELD - 1
+    long = ends - begins >= _REPEATED - 1
     least = max(_ABRUPT * float(np.min(steps[steps > 0.0])), _STEEP * float(np.max(steps)))
     for begin, end in zip(begins[long], ends[long], strict=True):
         before, after = steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]
         leaps = _abrupt(after, least) and after[0] > _LEAP * float(np.max(after[1:]))
         if leaps or _abrupt(before, least):
-            held = f"{name} repeats one value in full motion, in samples {begin} to {end}"
-            return f"{held}: it was held while samples were missing"
+            repeats = f"{name} repeats one value in full motion, in samples {begin} to {end}"
+            return f"{repeats}: it was held while samples were missing"
     return ""
 
 
@@ -155,7 +155,7 @@ def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: floa
     if unexplained <= _EXPLAINS:
         return ()
     for sentence, angle, position, rate in _candidates(window, theta_m):
-        if _share_left(angle, position, rate, servo, second) < min(_EXPLAINS, _BETTER * unexplained):
+        if _unexplained_share(angle, position, rate, servo, second) < min(_EXPLAINS, _BETTER * unexplained):
             return (sentence,)
     return ()
 
@@ -176,7 +176,7 @@ def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Ar
         yield wrong, theta_m, position, factor * rate
 
 
-def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo, second: float) -> float:
+def _unexplained_share(theta_m: Array, position: Array, rate: float, servo: Servo, second: float) -> float:
     """Slow part of a plain fit's residual over that of the position."""
     reduce = decimation(factor_for(response(servo, rate), theta_m.size))
     angle, reduced = reduce.rows(np.vstack([theta_m - theta_m[0], position - position[0]]))
@@ -184,7 +184,7 @@ def _share_left(theta_m: Array, position: Array, rate: float, servo: Servo, seco
     span = float(np.ptp(angle))
     fit = min(search(reduction.coarse(), gaps_to_try(span, 9), span, 1e-4 * span), key=lambda fit: fit.slopes.cost)
     table = reduction.table(fit.point)
-    left = table[RESIDUAL] - least_squares(table[CONSTANT:], table[RESIDUAL]).coefficients @ table[CONSTANT:]
+    residual = table[RESIDUAL] - least_squares(table[CONSTANT:], table[RESIDUAL]).coefficients @ table[CONSTANT:]
     interval = reduction.response.interval * reduction.decimation.factor / second
     variation = float(np.std(slow(reduction.position, interval)))
-    return float(np.sqrt(np.mean(slow(left, interval) ** 2))) / variation if variation > 0.0 else math.inf
+    return float(np.sqrt(np.mean(slow(residual, interval) ** 2))) / variation if variation > 0.0 else math.inf

@@ -114,7 +114,7 @@ class WindowFit:
 
     def rms(self) -> float:
         """Root mean square of the fit's residual, m."""
-        return math.nan if self.aligned is None else _left(self.aligned.whitened)
+        return math.nan if self.aligned is None else _residual_rms(self.aligned.whitened)
 
     def concluded(self) -> GapEstimate:
         """Judge the fit and make the estimate."""
@@ -243,9 +243,9 @@ def _with_free_model(
     return replace(evidence, std=std, interval=interval)
 
 
-def _left(result: WhitenedFit) -> float:
+def _residual_rms(result: WhitenedFit) -> float:
     """Root mean square of the residual, m."""
-    return float(np.sqrt(np.mean(result.left**2)))
+    return float(np.sqrt(np.mean(result.residual**2)))
 
 
 def _travel(result: WhitenedFit) -> Travel:
@@ -267,7 +267,7 @@ def _one_contact(
 ) -> GapEstimate:
     """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
     fitted = evidence.aligned.whitened
-    blank = replace(blank, reasons=reasons, rms=_left(fitted), evaluations=fitted.evaluations)
+    blank = replace(blank, reasons=reasons, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
     bound = min(least_lead(evidence, contacts, servo, settings), lower_bound(evidence, settings))
     if bound < evidence.smallest:
         return replace(blank, status=GapStatus.UNIDENTIFIABLE)
@@ -289,7 +289,7 @@ def _stated(
         blank,
         status=status,
         reasons=reasons,
-        rms=_left(fitted),
+        rms=_residual_rms(fitted),
         evaluations=fitted.evaluations,
     )
     if status is GapStatus.LOWER_BOUND:

@@ -16,7 +16,7 @@ import numpy as np
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares, spread
 from servotwin.estimation.core.response import response
-from servotwin.estimation.core.whitening import Autoregression, burg, with_noise_put_back
+from servotwin.estimation.core.whitening import Autoregression, burg, with_noise_restored
 from servotwin.estimation.estimate import Interval
 from servotwin.estimation.whitened.free_model import same_way
 from servotwin.estimation.whitened.reduction import (
@@ -87,7 +87,7 @@ class WhitenedFit:
         return least_squares(self.rows[CONSTANT:], self.rows[RESIDUAL]).coefficients
 
     @cached_property
-    def left(self) -> Array:
+    def residual(self) -> Array:
         """(m,) m, residual of the reduced position."""
         return np.asarray(self.table[RESIDUAL] - self.shares @ self.table[CONSTANT:])
 
@@ -175,19 +175,21 @@ def _elsewhere(point: Point) -> list[Point]:
     return [point._replace(place=place) for place in _PLACES]
 
 
-def estimate_noise(reduction: Reduction, table: Array, noise: Autoregression, order: int, put: bool) -> Autoregression:
+def estimate_noise(
+    reduction: Reduction, table: Array, noise: Autoregression, order: int, restore: bool
+) -> Autoregression:
     """Estimate the noise from the residual of a fit, whose table is given, that was made with a first idea of it.
 
-    With `put`, the noise that the fit may have taken away is put back.
+    With `restore`, the noise that the fit may have taken away is restored.
     """
     rows = reduction.prepared(noise, table, CONSTANT)
-    left = table[RESIDUAL] - least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients @ table[CONSTANT:]
-    if not np.any(left):
+    residual = table[RESIDUAL] - least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients @ table[CONSTANT:]
+    if not np.any(residual):
         return Autoregression.white(1.0)
-    if not put:
-        return burg(left[None], order).at_least(reduction.rounding)
+    if not restore:
+        return burg(residual[None], order).at_least(reduction.rounding)
     root = least_squares(rows[GAP:], rows[RESIDUAL]).root
-    return burg(with_noise_put_back(left, table[GAP:], root), order).at_least(reduction.rounding)
+    return burg(with_noise_restored(residual, table[GAP:], root), order).at_least(reduction.rounding)
 
 
 _PRECISION, _SLOW_PRECISION = 1e-9, 1e-5  # of the motor's range: how closely a minimum is approached
@@ -262,7 +264,7 @@ def look_around(
     )
     span = float(np.ptp(angle))
     starts = [*gaps_to_try(span, settings.starts), min(prior, _FREE * span)]
-    return slow, candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.kept)
+    return slow, candidates(slow, starts, _FREE * span, _SLOW_PRECISION * span, settings.refined)
 
 
 def _fit(

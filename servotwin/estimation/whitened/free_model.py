@@ -189,8 +189,8 @@ class FreeProblem:
         if keep:
             last = len(whole)
         basis = orthonormal(np.vstack([whole[CONSTANT : len(table)], whole[last:]]))
-        left = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
-        return left[RESIDUAL], left[GAP:]
+        remainder = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
+        return remainder[RESIDUAL], remainder[GAP:]
 
     def descend(
         self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY, evaluations: int = _EVALUATIONS
@@ -224,8 +224,8 @@ class FreeProblem:
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
     """Squared length of what is left of a residual where all derivatives may have any share of it."""
-    left = project_out(orthonormal(rows[movable]), residual[None])[0]
-    return float(left @ left)
+    remainder = project_out(orthonormal(rows[movable]), residual[None])[0]
+    return float(remainder @ remainder)
 
 
 @dataclass(frozen=True)

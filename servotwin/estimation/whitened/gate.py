@@ -41,9 +41,9 @@ def slow_share(result: WhitenedFit, second: float) -> float:
     """
     interval = result.reduction.response.interval * result.reduction.decimation.factor / second
     variation = float(np.std(slow(result.reduction.position, interval)))
-    left = result.left
-    remains = _rms(slow(left, interval))
-    if remains <= _CHANCE * _averaged_noise(left, interval) and _rms(left) <= _loudest(result):
+    residual = result.residual
+    remains = _rms(slow(residual, interval))
+    if remains <= _CHANCE * _averaged_noise(residual, interval) and _rms(residual) <= _loudest(result):
         return 0.0
     return remains / variation if variation > 0.0 else math.inf
 
@@ -275,8 +275,8 @@ def _growing(result: WhitenedFit) -> str:
     reduction = result.reduction
     if reduction.growth is None:
         return ""
-    left = float(result.shares[len(reduction.fixed())])
-    rate, assumed = reduction.rate + left, _SIGMAS * reduction.growth.std
+    excess = float(result.shares[len(reduction.fixed())])
+    rate, assumed = reduction.rate + excess, _SIGMAS * reduction.growth.std
     if abs(rate) <= assumed:
         return ""
     per_s = 1.0 / reduction.response.interval

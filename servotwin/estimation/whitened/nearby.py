@@ -54,24 +54,24 @@ class Neighbour:
         """Join another response to that of a machine."""
         mine, theirs = model.response.poles, other.poles
         if theirs.size != mine.size:
-            other = settled(other, np.argmin(np.abs(theirs[None, :] - mine[:, None]), axis=1))
+            other = with_modes_at_rest(other, np.argmin(np.abs(theirs[None, :] - mine[:, None]), axis=1))
         return cls(ReducedResponse.of(other, model.decimation), other.poles, step, row)
 
 
-def settled(model: Response, kept: Indices) -> Response:
+def with_modes_at_rest(model: Response, modes: Indices) -> Response:
     """Return a response with some of its modes only; the others have always come to rest.
 
     A soft screw lets the first mass ring. How fast, depends on how soft it is: a difference quotient with this ringing
     is no derivative, and a window seems to contradict any compliance that rings at another pitch.
     """
-    decay, gain = model.decay[kept], model.position.gain[kept]
+    decay, gain = model.decay[modes], model.position.gain[modes]
     still = np.sum((gain[:, 0] + 1j * gain[:, 1]) / (1.0 - decay[:, 0] - 1j * decay[:, 1])).real
     return replace(
         model,
-        poles=model.poles[kept],
+        poles=model.poles[modes],
         decay=decay,
         position=Readout(gain, model.static_gain - float(still)),
-        velocity=Readout(model.velocity.gain[kept], model.velocity.direct),
+        velocity=Readout(model.velocity.gain[modes], model.velocity.direct),
     )
 
 

@@ -66,8 +66,10 @@ class _LearntMinimum:
         rate, factors = 1.0 / reduction.response.interval, tuple(self.machine.mean.tolist())
         near = nearby(self.servo, factors, rate, reduction.decimation, soft=False)
         motions = np.linalg.cholesky(self.machine.covariance).T @ near.motions(screw, answer, shares[1:])
-        left, count = project_out(basis, motions), _freedom(self.misfit)
-        return MachineSpread(float(np.linalg.norm(motions @ self.weights)), float(np.linalg.norm(left)) / count**0.5)
+        remainder, count = project_out(basis, motions), _freedom(self.misfit)
+        return MachineSpread(
+            float(np.linalg.norm(motions @ self.weights)), float(np.linalg.norm(remainder)) / count**0.5
+        )
 
 
 @dataclass(frozen=True)
@@ -172,9 +174,9 @@ def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:
     """
     by_gap, by_place = slopes.jacobian
     known = float(by_place @ by_place) + rms * rms / _ANYWHERE
-    left = by_gap - (float(by_gap @ by_place) / known) * by_place if known > 0.0 else by_gap
-    size = float(left @ by_gap)
-    return left / size if size > _FLAT * float(by_gap @ by_gap) else None
+    remainder = by_gap - (float(by_gap @ by_place) / known) * by_place if known > 0.0 else by_gap
+    size = float(remainder @ by_gap)
+    return remainder / size if size > _FLAT * float(by_gap @ by_gap) else None
 
 
 def _by_offset(reduction: Reduction, misfit: Misfit, weights: Array) -> float:

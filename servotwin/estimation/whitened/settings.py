@@ -31,9 +31,14 @@ class WhitenedSettings:
     starts: Annotated[
         int, key(minimum=1, help="Number of gaps of the first search, from zero to the motor's range.")
     ] = 13
-    kept: Annotated[
+    refined: Annotated[
         int,
-        key(minimum=1, help="Number of minima of the first search, at a low rate, that are refined at the full rate."),
+        key(
+            "refined",
+            "kept",
+            minimum=1,
+            help="Number of minima of the first search, at a low rate, that are refined at the full rate.",
+        ),
     ] = 4
     skew: Annotated[bool, key(help="Estimate a delay between the channels.")] = True
     largest_skew: Annotated[

@@ -122,14 +122,14 @@ def observer_shift(result: WhitenedFit, servo: Servo, second: float) -> tuple[fl
     weight, order = _weight(servo, alpha, interval)
     rows = np.array([weight.respond(row) for row in result.table])
     basis = orthonormal(np.vstack([rows[PLACE:], _transients(order, alpha * interval, rows.shape[1])]))
-    left = project_out(basis, rows[[RESIDUAL, GAP]])
-    information = float(left[1] @ left[1])
+    remainder = project_out(basis, rows[[RESIDUAL, GAP]])
+    information = float(remainder[1] @ remainder[1])
     if not information > 1e-12 * float(rows[GAP] @ rows[GAP]):
         return 0.0, math.inf
-    direction = np.array([weight.respond(left[1][::-1])])[0][::-1] / information
+    direction = np.array([weight.respond(remainder[1][::-1])])[0][::-1] / information
     noise = result.noise.colour_back(direction)
     own = result.std
-    return float(left[0] @ left[1]) / information, math.sqrt(max(0.0, float(noise @ noise) - own**2))
+    return float(remainder[0] @ remainder[1]) / information, math.sqrt(max(0.0, float(noise @ noise) - own**2))
 
 
 @lru_cache(maxsize=32)

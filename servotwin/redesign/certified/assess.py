@@ -146,7 +146,7 @@ def costs_to_and_fro(settings: Sequence[Design], members: SimulatedMachines, tri
         return list(sizes * trial.duration / members.step)
     sampled = SampledCases(*cases, delay=members.delay, resolution=members.model.position_resolution)
     times = trial.duration * np.arange(_MOVES + 1)
-    reference = PiecewiseCubic.held(times, 1.0 - np.arange(_MOVES + 1) % 2)
+    reference = PiecewiseCubic.zero_order_hold(times, 1.0 - np.arange(_MOVES + 1) % 2)
     length = trial.duration * (_MOVES + 1)
     figures = summarise_sampled(
         plants, laws, length, sampled, trial.last, None, ("error",), trial.rate, trial.threads, reference
@@ -198,10 +198,10 @@ def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -
     zone and two counts of the sensor.
     """
     model = members.model
-    return left_over(setting, model, members.input_bias, members.friction, step)
+    return arrival_error(setting, model, members.input_bias, members.friction, step)
 
 
-def left_over(setting: Design, model: Servo, input_bias: Array, friction: Array, step: Array | float) -> Array:
+def arrival_error(setting: Design, model: Servo, input_bias: Array, friction: Array, step: Array | float) -> Array:
     """`nearness` for input biases (V) and frictions (N m)."""
     law = setting.controller
     # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the

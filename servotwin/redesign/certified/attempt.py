@@ -12,7 +12,7 @@ import numpy as np
 from servotwin.control.controller import Controller
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
-from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, assess, joined, left_over
+from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import (
     BeyondResult,
@@ -141,7 +141,7 @@ class Attempt:
             overshoot=float(measures.overshoot.max()),
             settling=float(np.percentile(measures.settling, 95.0)),
             settling_worst=float(measures.settling.max()),
-            within=float(np.max(left_over(setting, question.servo, *ends))),
+            within=float(np.max(arrival_error(setting, question.servo, *ends))),
             Ms=loop.Ms,
             crossover=loop.crossover,
             phase_margin=loop.phase_margin,

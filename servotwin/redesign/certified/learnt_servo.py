@@ -17,7 +17,7 @@ from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 # leaves out does not average away with the windows.
 _LEAST_K, _LEAST_C = 0.002, 0.01
 # Of a stated half-width: a number of the motor that is not known better than that stays as stated.
-_TOLD = 0.5
+_WELL_KNOWN = 0.5
 
 
 def narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
@@ -41,7 +41,7 @@ def learnt_servo(
     if motor is not None:
         for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
             relative = motor.std(index) / (1.0 + motor.mean[index])
-            if math.sqrt(3.0) * relative < _TOLD * width:
+            if math.sqrt(3.0) * relative < _WELL_KNOWN * width:
                 servo = servo.replace(**{name: getattr(servo, name) * (1.0 + motor.mean[index]) ** sign})
                 names.append(name)
                 variances.append(np.array([[relative**2]]))

@@ -123,7 +123,7 @@ class CertifiedPolicy:
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
         estimate = self._estimate(evidence)
-        if estimate is None and not self._tells_more(evidence):
+        if estimate is None and not self._shows_more(evidence):
             return Redesign(None, math.nan, evidence.unusable)
         gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
         best = math.nan if estimate is None else estimate.gap
@@ -206,12 +206,12 @@ class CertifiedPolicy:
     def _input_bias(self, evidence: Evidence) -> tuple[float, Range]:
         """Feedforward (V), and the range of input biases; a bias that is not significantly off the feedforward in force
         leaves it as it is."""
-        bias, std, held = self._rest(evidence)
+        bias, std, friction_voltage = self._rest(evidence)
         gains = evidence.gains
         fed = gains.feedforward if gains is not None else 0.0
         if not math.isfinite(std):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * held)
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * friction_voltage)
         if self._may_be_friction(evidence):
             return fed, (min(bias, -fed) - spread, max(bias, -fed) + spread)
         # Only a significant change: every new feedforward is an update at the edge.
@@ -257,7 +257,7 @@ class CertifiedPolicy:
         """True where a voltage at rest is no small change."""
         return abs(voltage) > _BIAS_MOVED * self.smallest_answer
 
-    def _tells_more(self, evidence: Evidence) -> bool:
+    def _shows_more(self, evidence: Evidence) -> bool:
         """True where a window tells more of machine, bias or friction than the setting in force answers to."""
         gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
         if gains is None or not rested or evidence.estimate.ok:

@@ -15,6 +15,7 @@ from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.sobol import sobol
 
 Range = tuple[float, float]
 LARGEST_DELAY = 64
@@ -319,11 +320,8 @@ def _scaled_plants(servo: Servo, factors: Array) -> tuple[Servo, ...]:
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
     """(count, dimensions) in 0 .. 1."""
-    # Here, because scipy.stats takes long to import and many commands never draw machines.
-    from scipy.stats import qmc
-
     # Sobol points are balanced in powers of two only: draw one and keep the first `count`.
-    return np.asarray(qmc.Sobol(dimensions, seed=seed).random(2 ** math.ceil(math.log2(max(count, 1))))[:count])
+    return sobol(dimensions, math.ceil(math.log2(max(count, 1))), seed)[:count]
 
 
 def _spread(ends: Range, places: Array) -> Array:
