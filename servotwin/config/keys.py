@@ -166,15 +166,13 @@ def key(
     unit : str
         The attribute's unit, where the key's end does not say it.
     help : str
-        One sentence.
     table : str
         Inner table that holds the key; that of the class by default.
     choices : tuple of str
-        Words that are allowed.
     prefix : str
         For an attribute that is a declared class: its keys lie in the same table and begin with this.
     switch : str
-        For an attribute that is a declared class or None: a key that is true or false; false: None.
+        A key that is true or false, for an attribute that may be None; false: None.
     relative : bool
         The text is a path, relative to the file's folder.
     required : bool
@@ -187,13 +185,12 @@ def key(
     dump : callable
         Keys and values of an attribute that `makers` makes.
     form : Form
-        Form of the value in a file, where the attribute's type does not say it and `parse` converts.
+        Form in a file of what `parse` converts.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key(
         names=names, unit=unit, range=allowed, help=help, table=table, choices=choices, prefix=prefix, switch=switch,
-        relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump,
-        form=form,
+        relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump, form=form,
     )  # fmt: skip
 
 
