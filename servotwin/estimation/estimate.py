@@ -58,10 +58,14 @@ class MachineReading:
         Logarithms of the factors on k/m, c/m, pitch and mass ratio.
     covariance : tuple of 16 float
         Of these, row by row.
+    softness : (float, float)
+        The structure's stiffness over the screw's, and one over the variance of that; (0, 0): nothing is known of it.
+        The fitted model has a rigid screw all the same: this says what that leaves out.
     """
 
     factors: tuple[float, ...]
     covariance: tuple[float, ...]
+    softness: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, repr=False)

@@ -17,7 +17,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.config.keys import check, key, settings
-from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.whitened.free_model import FACTORS, FactorPrior
 from servotwin.plant.signals import Array
 
@@ -107,6 +107,12 @@ class LearntMachine(Struct, frozen=True):
         s, on the twin's clock, of the last window that counted.
     windows : int
         Windows that counted.
+    softness : (float, float)
+        Of the screw, as of `MachineReading`.
+    other : LearntMachine or None
+        The last machine that was not this one: a rival whose windows have ended, or the one before this.
+    mixed : int
+        Windows in a row of one machine that are still missing, since windows of two came by turns.
     alarm : str
         Sentence on a machine that is not what was learnt; empty without one.
     rival : LearntMachine or None
@@ -119,12 +125,25 @@ class LearntMachine(Struct, frozen=True):
     windows: int = 1
     alarm: str = ""
     rival: LearntMachine | None = None
+    softness: tuple[float, float] = (0.0, 0.0)
+    other: LearntMachine | None = None
+    mixed: int = 0
+
+    @property
+    def disputed(self) -> bool:
+        """True while windows contradict it, or come from two machines: no setting may rest on it."""
+        return self.rival is not None or self.mixed > 0
 
     def prior(self, settings: LearningSettings, now: float) -> FactorPrior:
         """Prior of a window at a time, s: the factors, widened by their drift since then."""
         covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(settings.walk(now - self.time))
         short = np.maximum(0.0, settings.floor - np.diag(covariance))
-        return FactorPrior(np.array(self.factors), covariance + np.diag(short))
+        return FactorPrior(np.array(self.factors), covariance + np.diag(short), self.softness)
+
+    def surely(self) -> Array:
+        """(4,) least sizes of the factors' logarithms, at 95 %."""
+        spread = np.sqrt(np.diag(np.array(self.covariance).reshape(_SIZE, _SIZE)))
+        return np.abs(self.factors) - NORMAL_95 * spread
 
     def words(self) -> str:
         """The factors in per cent off the model."""
@@ -141,7 +160,12 @@ def nameplate(settings: LearningSettings, k: float, c: float, m: float) -> Facto
 
 
 def updated(
-    before: LearntMachine | None, settings: LearningSettings, estimate: GapEstimate, counts: bool, now: float
+    before: LearntMachine | None,
+    settings: LearningSettings,
+    estimate: GapEstimate,
+    counts: bool,
+    now: float,
+    stated: FactorPrior | None = None,
 ) -> LearntMachine | None:
     """Update what is known of the machine by a window.
 
@@ -149,33 +173,70 @@ def updated(
     ----------
     before : LearntMachine, optional
         None: no window has counted yet.
-    given : LearningSettings
+    settings : LearningSettings
     estimate : GapEstimate
         With its reading, if it has one.
     counts : bool
         True where the trend accepted the estimate.
     now : float
         s, on the twin's clock.
+    stated : FactorPrior, optional
+        The nameplate's (`nameplate`): a machine that turns out to lie outside of it is an alarm.
     """
     reading = estimate.machine
-    if reading is None:
-        return before
-    if estimate.ok and not counts:
+    if reading is None or (estimate.ok and not counts):
         return before
     # A window may show the machine's numbers, and the gap not well enough or not at all.
     if estimate.ok or estimate.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND):
-        windows = 1 if before is None else before.windows + 1
-        alarm = "" if before is None else _drift(before.prior(settings, now), reading)
-        return LearntMachine(reading.factors, reading.covariance, now, windows, alarm)
-    if before is None:
-        return before
-    rival = LearntMachine(reading.factors, reading.covariance, now)
+        made = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
+        if before is None:
+            return replace(made, alarm=_outside(None, made, stated) or _softened((0.0, 0.0), made.softness))
+        alarm = _drift(before.prior(settings, now), reading) or _outside(before, made, stated)
+        return replace(
+            made,
+            windows=before.windows + 1,
+            alarm=alarm or _softened(before.softness, made.softness),
+            other=before.rival or before.other,
+            mixed=max(0, before.mixed - estimate.ok),
+        )
+    return before and _contradicted(before, settings, reading, now)
+
+
+def _contradicted(
+    before: LearntMachine, settings: LearningSettings, reading: MachineReading, now: float
+) -> LearntMachine:
+    """What is known after a window that only other numbers explain."""
+    rival = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
     if before.rival is not None and _distance(before.rival.prior(settings, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)
     alarm = f"the machine is not the one that was learnt: {rival.words()}, and {before.words()} was learnt"
+    # A rival that comes back is no new machine: there are two.
+    back = before.other is not None and _distance(before.other.prior(settings, now), reading) <= _AGREEMENT
+    mixed = settings.restart_after if back or before.mixed > 0 else 0
+    if back:
+        alarm = (
+            f"windows of two machines come under this name, or of one with two loads: {rival.words()}, and "
+            f"{before.words()}; no setting follows until {mixed} windows in a row are of one of them"
+        )
     if rival.windows >= settings.restart_after:
-        return replace(rival, alarm=f"{alarm}; it is learnt anew from {rival.windows} windows that agree")
-    return replace(before, alarm=alarm, rival=rival)
+        alarm = f"{alarm}; it is learnt anew from {rival.windows} windows that agree"
+        return replace(rival, alarm=alarm, other=replace(before, rival=None, other=None, alarm=""), mixed=mixed)
+    return replace(before, alarm=alarm, rival=rival, mixed=mixed)
+
+
+def _outside(before: LearntMachine | None, after: LearntMachine, stated: FactorPrior | None) -> str:
+    """Sentence on a factor that has turned out to be outside of what is stated of it; empty without one."""
+    if stated is None:
+        return ""
+    allowed = math.sqrt(3.0) * np.sqrt(np.diag(stated.covariance))  # half-widths within which all values are alike
+    now, then = after.surely(), None if before is None else before.surely()
+    for name, off, was, most in zip(FACTORS, now, now if then is None else then, allowed, strict=True):
+        if off > most and (then is None or was <= most):
+            return (
+                f"the machine is not what is stated: {name} is at least {100.0 * off:.3g} % (logarithm) off the model, "
+                f"and {100.0 * most:.3g} % are stated; check the nameplate"
+            )
+    return ""
 
 
 def _distance(known: FactorPrior, reading: MachineReading) -> float:
@@ -183,6 +244,17 @@ def _distance(known: FactorPrior, reading: MachineReading) -> float:
     away = np.array(reading.factors) - known.mean
     return math.sqrt(
         float(away @ np.linalg.solve(known.covariance + np.array(reading.covariance).reshape(_SIZE, _SIZE), away))
+    )
+
+
+def _softened(before: tuple[float, float], after: tuple[float, float]) -> str:
+    """Sentence on a screw that has turned out to be soft with this window; empty where it has not."""
+    (was, known), (softness, information) = before, after
+    if softness * math.sqrt(information) <= _DRIFT or was * math.sqrt(known) > _DRIFT:
+        return ""
+    return (
+        f"the screw is not rigid: the windows show one about {1.0 / softness:.2g} times as stiff as the structure, and "
+        "intervals are widened by what that does to the gap"
     )
 
 

@@ -97,6 +97,7 @@ def truncation(margin: float) -> tuple[float, float]:
 
 
 _OUTLIER = "the window did not count, being an outlier"
+_AFRESH = "outliers in a row that agree"
 _MOVED = "the encoder's offset is not what it was: it is read anew from this window"
 _DOUBTED = "the gap rested on the encoder's offset, which is forgotten until a window shows it again"
 
@@ -255,7 +256,7 @@ class Trend:
         rival = self._rival(measurement)
         if rival.updates < self.settings.restart_after:
             return replace(refused, rival=rival)
-        reason = f"outliers in a row that agree: {rival.updates}; the gap starts afresh, as after a crash or a repair"
+        reason = f"{_AFRESH}: {rival.updates}; the gap starts afresh, as after a crash or a repair"
         return replace(rival, updates=self.updates + rival.updates, reasons=(reason,))
 
     def _rival(self, measurement: TrendMeasurement) -> Trend:
@@ -278,6 +279,11 @@ class Trend:
         covariance = _symmetric(self.covariance - np.outer(gain, gain) * cut)
         reason = f"only a lower bound of {math.degrees(estimate.gap):.4g} deg: it counts where the trend lies below it"
         return replace(self, mean=self.mean + gain * pull, covariance=covariance, reasons=(reason,))
+
+    @property
+    def afresh(self) -> bool:
+        """True right after the window with which the gap has started afresh."""
+        return any(reason.startswith(_AFRESH) for reason in self.reasons)
 
     @property
     def gap(self) -> float:

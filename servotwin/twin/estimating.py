@@ -137,6 +137,8 @@ class Wear(Struct, frozen=True):
         None before a window told of the machine's numbers.
     motor : LearntMotor or None
         None before a window told of the motor's numbers.
+    mismatches : int
+        Windows in a row that no model within what is known explains; windows that show too little do not count.
     """
 
     previous: float
@@ -145,6 +147,7 @@ class Wear(Struct, frozen=True):
     state: TrendState | None = None
     machine: LearntMachine | None = None
     motor: LearntMotor | None = None
+    mismatches: int = 0
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
@@ -172,13 +175,25 @@ class Wear(Struct, frozen=True):
         estimate: GapEstimate,
         now: float,
         learning: LearningSettings = NOT_LEARNING,
+        stated: FactorPrior | None = None,
     ) -> tuple[Wear, str]:
-        """Return trend and machine after an estimate, and the reason for which no update may follow; empty: it may."""
+        """Return trend and machine after an estimate, and the reason for which no update may follow; empty: it may.
+
+        `stated`: what the nameplate states of the machine.
+        """
         wear, rejection = self._update_trend(settings, boot, estimate, now)
+        if wear.mismatches != (mismatches := self._mismatches(estimate)):
+            wear = msgspec.structs.replace(wear, mismatches=mismatches)
         if not learning.learn:
             return wear, rejection
-        machine = updated(self.machine, learning, estimate, counts=not rejection, now=now)
+        machine = updated(self.machine, learning, estimate, counts=not rejection, now=now, stated=stated)
         return msgspec.structs.replace(wear, machine=machine), rejection
+
+    def _mismatches(self, estimate: GapEstimate) -> int:
+        """`mismatches` after an estimate."""
+        if estimate.status is GapStatus.MODEL_MISMATCH:
+            return self.mismatches + 1
+        return 0 if estimate.ok else self.mismatches
 
     def _update_trend(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
         """Return the wear after an estimate, and the reason for which no update may follow from it; empty: it may.
@@ -217,6 +232,12 @@ UNUSABLE = "none"
 _TAIL = 10  # the last one of so many parts of a window
 
 
+def stated_machine(settings: TwinSettings) -> FactorPrior:
+    """Make the prior that the nameplate states of the machine."""
+    known = settings.uncertainty
+    return nameplate(settings.learning, known.k, known.c, known.m)
+
+
 def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     """Make the estimator that `settings` name, with a servo as its model.
 
@@ -224,9 +245,8 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
     settings = settings.on(servo)
-    options, known = settings_of(settings.method, settings.estimator), settings.uncertainty
-    learns = settings.learning.learn and servo.rigid
-    new = nameplate(settings.learning, known.k, known.c, known.m) if learns else None
+    options = settings_of(settings.method, settings.estimator)
+    new = stated_machine(settings) if settings.learning.learn and servo.rigid else None
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
         if not isinstance(options, whitened.WhitenedSettings):

@@ -90,6 +90,13 @@ class MotorRecord(NamedTuple):
     motor: LearntMotor
 
 
+class AlarmRecord(NamedTuple):
+    """A sentence for the operator on the machine, after a window."""
+
+    window: WindowMessage
+    sentence: str
+
+
 class RedesignRecord(NamedTuple):
     """A redesign, or the reason why there is none."""
 
@@ -119,8 +126,8 @@ class WithdrawalRecord(NamedTuple):
 
 
 Record = (
-    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | RedesignRecord
-    | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
+    GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | AlarmRecord
+    | RedesignRecord | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
     | Update | Request | LearntResponse | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
 """Evidence of one step; a message is its own record: an update or a request sent, a receipt received."""
@@ -140,6 +147,7 @@ class EvidenceLog:
     trends: dict[WindowId, Trend | None] = field(default_factory=dict)
     machines: dict[WindowId, LearntMachine] = field(default_factory=dict)
     motors: dict[WindowId, LearntMotor] = field(default_factory=dict)
+    alarms: list[tuple[WindowId, str]] = field(default_factory=list)
     redesigns: dict[WindowId, Redesign] = field(default_factory=dict)
     excitations: dict[WindowId, Decision] = field(default_factory=dict)
     updates: list[Update] = field(default_factory=list)
@@ -178,6 +186,8 @@ class EvidenceLog:
                 self.machines[window.identity] = machine
             case MotorRecord(window, motor):
                 self.motors[window.identity] = motor
+            case AlarmRecord(window, sentence):
+                self.alarms.append((window.identity, sentence))
             case RedesignRecord(window, redesign):
                 self.redesigns[window.identity] = redesign
             case ExcitationRecord(window, decision):
@@ -279,6 +289,8 @@ def _row(record: Record) -> EvidenceRecord | None:
             return _computed("alarm" if machine.alarm else "machine", machine, machine.alarm)
         case MotorRecord(_, motor):
             return _computed("alarm" if motor.alarm else "motor", motor, motor.alarm)
+        case AlarmRecord(_, sentence):
+            return _computed("alarm", {"sentence": sentence}, sentence)
         case RedesignRecord(_, redesign):
             return _computed("redesign", _redesign_body(redesign), redesign.reason, gap=finite(redesign.gap))
         case ExcitationRecord(_, decision):

@@ -32,8 +32,10 @@ from servotwin.messages import (
 )
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Wear
+from servotwin.twin.alarms import alarms
+from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Wear, stated_machine
 from servotwin.twin.evidence import (
+    AlarmRecord,
     DisturbanceRecord,
     ExcitationRecord,
     GapEstimateRecord,
@@ -52,6 +54,7 @@ from servotwin.twin.state import TwinState
 from servotwin.twin.triage import Glance
 from servotwin.twin.versions import Attempts, noted_setting
 
+_MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
@@ -167,12 +170,14 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
-        wear, rejection = state.wear.update(trends, message.boot, estimate, arrived, learning)
+        stated = stated_machine(model.settings)
+        wear, rejection = state.wear.update(trends, message.boot, estimate, arrived, learning, stated)
         if model.motor is not None and decoded.window is not None:
             wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
         state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
+    records += [AlarmRecord(message, sentence) for sentence in alarms(model.settings, before, state.wear, estimate)]
     if model.triage is not None and state.triage is not None and not stale:
         known = state.wear.known_machine(learning, arrived)
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
@@ -258,6 +263,9 @@ def _learnt(message: WindowMessage, before: Wear, after: Wear) -> list[Record]:
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
     """Consult the policy; without a setting the result has the reason."""
+    machine = state.wear.machine
+    if machine is not None and machine.disputed and not stale:
+        return state, Redesign(None, math.nan, machine.alarm or _MIXED)
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)

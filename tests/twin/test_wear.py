@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from functools import cache
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -72,7 +73,17 @@ def test_nothing_but_a_good_estimate_moves_it(status):
     wear = worn()
     before = wear.wear
     wear.learn("boot-1", seen(40.0, 120.0, status), 122.0)
-    assert wear.wear is before
+    assert wear.wear == msgspec.structs.replace(before, mismatches=int(status is GapStatus.MODEL_MISMATCH))
+
+
+def test_windows_that_no_machine_explains_are_counted_until_one_does():
+    wear = worn()
+    for number in (1, 2):
+        wear.learn("boot-1", seen(40.0, 120.0, GapStatus.MODEL_MISMATCH), 122.0)
+        wear.learn("boot-1", seen(40.0, 120.0, GapStatus.UNIDENTIFIABLE), 122.0)
+        assert wear.wear.mismatches == number
+    wear.learn("boot-1", seen(13.0, 120.0), 122.0)
+    assert wear.wear.mismatches == 0
 
 
 def test_an_older_window_moves_nothing_and_is_expected_as_things_stand():

@@ -146,6 +146,7 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
 _EXPLAINS, _BETTER = 0.05, 0.2  # share left that counts as a fit; of what the channels as given leave
 _POSITION_UNITS = {"mm": 1e-3, "micrometres": 1e-6, "units of 1000 m": 1e3}
 _ANGLE_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi, "units of 57.3 rad": 180.0 / math.pi}
+_PITCHES = (0.5, 2.0)
 _RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
 
 
@@ -168,6 +169,8 @@ def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Ar
         yield f"position seems to be in {unit}, not in m", theta_m, factor * position, rate
     for unit, factor in _ANGLE_UNITS.items():
         yield f"theta_m seems to be in {unit}, not in rad", factor * theta_m, position, rate
+    for factor in _PITCHES:
+        yield f"the pitch seems to be {factor:g} times the model's", theta_m, position / factor, rate
     for factor in _RATES:
         wrong = f"the sample rate seems to be {factor * rate:.6g} Hz, not {rate:.6g} Hz"
         yield wrong, theta_m, position, factor * rate

@@ -22,6 +22,7 @@ from servotwin.estimation.whitened.gate import (
     FitEvidence,
     contacts_seen,
     judge,
+    least_lead,
     lower_bound,
     misfits,
     one_sided,
@@ -123,17 +124,18 @@ class WindowFit:
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings, self.second)
         status, reasons = judge(evidence, self.settings)
-        if self.learnt is not None and self.learnt.beyond and status is GapStatus.OK:
+        told = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
+        if self.learnt is not None and self.learnt.beyond and told:
             status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
         teaches = self._teaches(evidence, status)
         if teaches or status in (GapStatus.OK, GapStatus.LOWER_BOUND):
             contacts = contacts_seen(self.aligned, self.servo)
             if status is not GapStatus.UNIDENTIFIABLE and not contacts.two:
                 reasons = reasons or (_ONE_CONTACT,)
-                bound = _one_contact(self.blank, evidence, contacts, reasons, self.settings)
+                bound = _one_contact(self.blank, evidence, contacts, reasons, self.servo, self.settings)
                 if self.learnt is None or misfits(evidence, self.settings):
                     return bound
-                either = self.learnt.reading_of_either(contacts.single, self.settings.calibration)
+                either = self.learnt.reading_of_either(contacts.single.point, self.settings.calibration)
                 return replace(bound, machine=either)
             teaches = teaches and contacts.two
         if status is GapStatus.MODEL_MISMATCH:
@@ -260,13 +262,13 @@ def _one_contact(
     evidence: FitEvidence,
     contacts: ContactEvidence,
     reasons: tuple[str, ...],
+    servo: Servo,
     settings: WhitenedSettings,
 ) -> GapEstimate:
     """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
     fitted = evidence.aligned.whitened
     blank = replace(blank, reasons=reasons, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
-    lead = contacts.lead - NORMAL_95 * math.hypot(settings.model_error, contacts.lead_std)
-    bound = min(lead, lower_bound(evidence, settings))
+    bound = min(least_lead(evidence, contacts, servo, settings), lower_bound(evidence, settings))
     if bound < evidence.smallest:
         return replace(blank, status=GapStatus.UNIDENTIFIABLE)
     return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))

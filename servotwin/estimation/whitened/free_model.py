@@ -17,10 +17,10 @@ from functools import cached_property
 
 import numpy as np
 
-from servotwin.estimation.core.contacts import travel
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
+from servotwin.estimation.whitened.lag import lag_motion
 from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
 from servotwin.estimation.whitened.search import PLACES
@@ -46,10 +46,13 @@ class FactorPrior:
     ----------
     mean : (4,) array
     covariance : (4, 4) array
+    softness : (float, float)
+        As of `MachineReading`.
     """
 
     mean: Array
     covariance: Array
+    softness: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
     def of_spreads(cls, k: float, c: float, pitch: float, ratio: float = 0.03) -> FactorPrior:
@@ -59,12 +62,13 @@ class FactorPrior:
     @classmethod
     def of_reading(cls, numbers: MachineReading) -> FactorPrior:
         """Make a prior of plain numbers, bit for bit."""
-        return cls(np.array(numbers.factors), np.array(numbers.covariance).reshape(len(numbers.factors), -1))
+        covariance = np.array(numbers.covariance).reshape(len(numbers.factors), -1)
+        return cls(np.array(numbers.factors), covariance, numbers.softness)
 
     @property
     def reading(self) -> MachineReading:
         """The same as plain numbers."""
-        return MachineReading(tuple(self.mean.tolist()), tuple(self.covariance.ravel().tolist()))
+        return MachineReading(tuple(self.mean.tolist()), tuple(self.covariance.ravel().tolist()), self.softness)
 
     @cached_property
     def root(self) -> Array:
@@ -107,11 +111,14 @@ class FreeFit:
         """(6, 6) of gap (rad), place and factors, for a residual of variance 1; inf on the diagonal: not known."""
         return _covariance(self.rows, self.movable)
 
-    @property
-    def factor_covariance(self) -> Array:
-        """(4, 4) of the factors alone, whether or not gap and place are known, for a residual of variance 1."""
-        remainder = project_out(orthonormal(self.rows[:2]), self.rows[2:])
-        return np.asarray(np.linalg.inv(remainder @ remainder.T))
+    def learnt(self, prior: FactorPrior, variance: float) -> Array:
+        """(4, 4) covariance of the factors for a residual of a variance, that of the gap's and place's whole freedom.
+
+        The prior, which is part of `rows`, has its own variance: a window that shows nothing must leave it as it was.
+        """
+        own = math.sqrt(max(0.0, 1.0 - 1.0 / variance)) * prior.root.T
+        left = project_out(orthonormal(self.rows[:2]), self.rows[2:]) / math.sqrt(variance)
+        return np.asarray(np.linalg.inv(left @ left.T + own @ own.T))
 
 
 def adapted(servo: Servo, factors: Array) -> Servo:
@@ -142,6 +149,8 @@ class FreeProblem:
         rad, of the gap.
     compliance : float
         Usual size of the structure's stiffness over the screw's, a nuisance; 0: the screw is as stiff as the model's.
+    delay : float
+        s, by which the position is late: how much a sensor may lag, a nuisance too; 0: no sensor lags.
     """
 
     reduction: Reduction
@@ -150,9 +159,13 @@ class FreeProblem:
     prior: FactorPrior
     largest: float
     compliance: float = 0.0
+    delay: float = 0.0
 
-    def rows(self, q: Array) -> tuple[Array, Array]:
-        """Residual (M,) and derivatives of the motion (6, M) at a point (6,), nuisances out, prior appended."""
+    def rows(self, q: Array, keep: bool = False) -> tuple[Array, Array]:
+        """Residual (M,) and derivatives of the motion (6, M) at a point (6,), nuisances out, prior appended.
+
+        With `keep` the compliance, in units of its usual size, is the last derivative and not one of the nuisances.
+        """
         point, factors = Point(q[0], q[1]), q[2:]
         rate, soft = 1.0 / self.reduction.response.interval, self.compliance > 0.0
         near = nearby(self.servo, tuple(factors.tolist()), rate, self.reduction.decimation, soft)
@@ -164,6 +177,8 @@ class FreeProblem:
         answer = reduction.position - table[RESIDUAL]
         motions = near.motions(screw[:1], answer, weights[1 : len(reduction.fixed())])
         motions[factors.size :] *= self.compliance
+        if self.delay != 0.0:
+            motions = np.vstack([motions, lag_motion(reduction, point, screw, self.delay)])
         last, seen = len(table) + factors.size, rows.shape[1]
         whole = np.zeros((len(table) + len(motions), seen + len(motions)))
         whole[: len(table), :seen], whole[len(table) :, : answer.size] = rows, self.noise.whiten(motions)
@@ -171,6 +186,8 @@ class FreeProblem:
         whole[len(table) : last, seen : seen + factors.size] = root.T
         whole[RESIDUAL, seen : seen + factors.size] = root @ (self.prior.mean - factors)
         whole[last:, seen + factors.size :] = np.eye(len(motions) - factors.size)
+        if keep:
+            last = len(whole)
         basis = orthonormal(np.vstack([whole[CONSTANT : len(table)], whole[last:]]))
         remainder = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
         return remainder[RESIDUAL], remainder[GAP:]
@@ -219,18 +236,15 @@ class ContactEvidence:
     ----------
     rise : float
         At least, where it is far above what is `BELIEVED`.
-    lead : float
-        rad, range by which the motor leads the screw in the fit of one contact: the gap is at least as wide.
-    lead_std : float
-        rad, its standard deviation with the model free; 0 where the screw did not move.
-    single : Point
+    single : FreeFit
         The fit of one contact.
+    variance : float
+        Of the residual of two contacts in units of the noise, at least 1.
     """
 
     rise: float
-    lead: float
-    lead_std: float
-    single: Point
+    single: FreeFit
+    variance: float
 
     @property
     def two(self) -> bool:
@@ -241,7 +255,7 @@ class ContactEvidence:
 # The square of the contacts' least travel over the largest accepted standard deviation is above that: a second contact
 # that is worth less could not have made an acceptable estimate.
 BELIEVED = 100.0
-_ENOUGH, _HOPELESS = 0.3, 30.0  # times that: clearly too little; so much that no start has come back from there
+_ENOUGH, HOPELESS = 0.3, 30.0  # times that: clearly too little; so much that no start has come back from there
 _STARTS = 3
 
 
@@ -264,7 +278,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
     wide, allowed = problem.largest, BELIEVED * variance
     places = tuple(dict.fromkeys((*same_way(two, wide), *PLACES)))
     order = np.argsort(misfit.costs([Point(wide, place) for place in places]), kind="stable")
-    within = (believed.cost + _ENOUGH * allowed, believed.cost + _HOPELESS * allowed)
+    within = (believed.cost + _ENOUGH * allowed, believed.cost + HOPELESS * allowed)
     fits = []
     for index in order[:_STARTS]:
         start = np.array([wide, places[index], *believed.factors])
@@ -272,12 +286,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
         if fits[-1].cost <= within[0]:
             break
     best = min(fits, key=lambda one: one.cost)
-    theta_m = problem.reduction.theta_m
-    motion = travel(theta_m, best.point.screw(theta_m[0]))
-    # The way to the contact is what the place says: half the gap per unit.
-    moved = motion.forwards + motion.backwards > 0.0
-    std = 0.5 * wide * math.sqrt(variance * best.covariance[1, 1]) if moved else 0.0
-    return ContactEvidence((best.cost - believed.cost) / variance, motion.lead, std, best.point)
+    return ContactEvidence((best.cost - believed.cost) / variance, best, variance)
 
 
 def same_way(point: Point, gap: float) -> tuple[float, float, float]:

@@ -23,6 +23,7 @@ from servotwin.estimation.whitened.free_model import (
     FreeProblem,
     contact_evidence,
 )
+from servotwin.estimation.whitened.lead import possible_leads
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift
 from servotwin.plant.servo import Servo
@@ -193,11 +194,20 @@ def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...
 
 def contacts_seen(aligned: AlignedFit, servo: Servo) -> ContactEvidence:
     """Evidence for a second contact in a window, with the model free within its usual error."""
-    result = aligned.whitened
-    problem = FreeProblem(
-        result.reduction, result.noise, servo, FactorPrior.of_spreads(*FREEDOM), aligned.largest, COMPLIANCE
-    )
-    return contact_evidence(problem, result.misfit, result.point)
+    return contact_evidence(_freed(aligned, servo), aligned.whitened.misfit, aligned.whitened.point)
+
+
+def _freed(aligned: AlignedFit, servo: Servo) -> FreeProblem:
+    """The window in its noise with the model free within its usual error."""
+    result, usual = aligned.whitened, FactorPrior.of_spreads(*FREEDOM)
+    return FreeProblem(result.reduction, result.noise, servo, usual, aligned.largest, COMPLIANCE)
+
+
+def least_lead(evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings) -> float:
+    """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error."""
+    leads = possible_leads(_freed(evidence.aligned, servo), contacts.single, contacts.variance)
+    sigmas = NORMAL_95 * (1.0 + _COLOURED * evidence.colour)
+    return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.count
 
 
 def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:

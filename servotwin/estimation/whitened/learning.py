@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from servotwin.estimation.whitened.free_model import (
     BELIEVED,
     COMPLIANCE,
     FACTORS,
+    FREEDOM,
     LARGEST,
     FactorPrior,
     FreeFit,
@@ -34,8 +37,39 @@ from servotwin.plant.signals import Array
 _TURNS = 5
 _STILL = 0.1  # standard deviations of a factor: a smaller move needs no other turn
 _WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: wider ones are searched before the noise is known
+_TOGETHER = 5.0  # spreads: as unlikely for four factors as LARGEST is for one
 _AT_END = 1e-3  # of the range of a factor
+_SHOWN = 1.0  # information on the softness beyond what is usual of it: below, the window says nothing
+_MOST_KNOWN = 1e7  # of the softness: no number of windows tells it better than to 0.0003
 _VAGUE = 1e-5  # of the position's variation: white noise that small leaves all to the window, nothing to the prior
+
+
+class WindowSoftness(NamedTuple):
+    """The screw's softness as one window shows it, and what it does to the gap that is fitted with a rigid screw.
+
+    Attributes
+    ----------
+    value, information : float
+        The structure's stiffness over the screw's, and one over its variance in noise of variance 1.
+    slope : float
+        rad, change of the gap per softness, the model's factors moving along.
+    """
+
+    value: float
+    information: float
+    slope: float
+
+    def joined(self, known: tuple[float, float], scale: float) -> tuple[float, float]:
+        """Softness and information with those `known` before; `scale`: variance of the residual."""
+        value, before = known
+        own = self.information / scale
+        total = before + own
+        return ((before * value + own * self.value) / total, min(total, _MOST_KNOWN)) if total > 0.0 else known
+
+    def moved(self, known: tuple[float, float], scale: float) -> float:
+        """Root mean square (rad) of what the softness does to the gap, as far as all windows know it."""
+        value, information = self.joined(known, scale)
+        return abs(self.slope) * math.hypot(value, 1.0 / math.sqrt(information + 1.0 / COMPLIANCE**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +95,7 @@ class LearntFit:
 
     @property
     def beyond(self) -> str:
-        """Sentence on a factor that lies at the end of what is allowed; empty where none does."""
+        """Sentence on factors that lie at the end of what is allowed, or beyond it together; empty where none do."""
         low, high = self.problem.prior.limits()
         ends = _AT_END * (high - low)
         for name, factor, least, most in zip(FACTORS, self.free.factors, low + ends, high - ends, strict=True):
@@ -70,29 +104,62 @@ class LearntFit:
                 return (
                     f"{name} would have to be {off:+.3g} % off the model, {LARGEST:g} spreads from what is known of it"
                 )
-        return ""
+        away = self.problem.prior.root @ (self.free.factors - self.problem.prior.mean)
+        if float(away @ away) <= _TOGETHER**2:
+            return ""
+        parts = (f"{name} {100.0 * math.expm1(x):+.3g} %" for name, x in zip(FACTORS, self.free.factors, strict=True))
+        return (
+            f"the machine would have to be {np.linalg.norm(away):.3g} spreads from what is known of it, and "
+            f"{_TOGETHER:g} are allowed: {', '.join(parts)} off the model"
+        )
 
     def gap_std(self, calibration: float) -> float:
         """Standard deviation of the gap with the factors free, rad."""
         return math.sqrt(self._scale(calibration) * self.free.covariance[0, 0])
 
     def doubt(self, ramp: float, calibration: float) -> float:
-        """Root mean square (rad) of what a soft screw and a ramp of the gap can do to it, besides the free factors.
+        """Root mean square (rad) of what a soft screw, a ramp of the gap and a sensor's lag can do to the gap.
 
-        Both are free within wide limits here (`ramp`: rad/s), and cost only where the window does not tell them from
-        the factors.
+        All are free beside the factors within wide limits here (`ramp`: rad/s), and cost only where the window does not
+        tell them from these. A screw that is soft for certain moves the gap whatever the factors have taken up of it.
         """
         reduction = self.problem.reduction
         growth = NuisancePrior(0.0, ramp * reduction.response.interval)
-        wide = replace(self.problem, reduction=replace(reduction, growth=growth), compliance=COMPLIANCE)
+        growing = replace(reduction, growth=growth)
+        wide = replace(self.problem, reduction=growing, compliance=COMPLIANCE, delay=self.aligned.delay)
         residual, rows = wide.rows(np.array([*self.free.point, *self.free.factors]))
         solved = least_squares(rows, residual)
         more = self._scale(calibration) * (float(solved.deviations[0]) ** 2 - self.free.covariance[0, 0])
-        return math.hypot(float(solved.coefficients[0]), math.sqrt(max(0.0, more)))
+        moved = self._softness.moved(self.problem.prior.softness, self._scale(calibration))
+        return math.hypot(float(solved.coefficients[0]), math.sqrt(max(0.0, more)), moved)
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""
-        return _reading(self.free.factors, self._scale(calibration) * self.free.covariance[2:, 2:])
+        scale = self._scale(calibration)
+        softness = self._softness.joined(self.problem.prior.softness, scale)
+        return _reading(self.free.factors, self.free.learnt(self.problem.prior, scale), softness)
+
+    @cached_property
+    def _softness(self) -> WindowSoftness:
+        """The screw's softness as this window alone shows it.
+
+        With what earlier windows told of the factors it would show none: on a rigid screw, these took it up.
+        """
+        usual = FactorPrior.of_spreads(*FREEDOM)
+        problem = replace(self.problem, prior=usual, compliance=COMPLIANCE)
+        residual, rows = problem.rows(np.array([*self.free.point, *self.free.factors]), keep=True)
+        solved = least_squares(rows, residual)
+        covariance = solved.root.T @ solved.root
+        variance = float(covariance[-1, -1])
+        # Without what is usual of it, which is part of the solution and must not count with every window.
+        information = max(0.0, 1.0 / variance - 1.0)
+        shown = float(solved.coefficients[-1]) / variance
+        value = COMPLIANCE * shown / information if information > _SHOWN else 0.0
+        return WindowSoftness(
+            value,
+            information / COMPLIANCE**2 if information > _SHOWN else 0.0,
+            float(covariance[0, -1]) / variance / COMPLIANCE,
+        )
 
     def reading_of_either(self, single: Point, calibration: float) -> MachineReading | None:
         """Factors after a window that a `single` contact explains as well as two.
@@ -107,16 +174,17 @@ class LearntFit:
         if one.cost > self.free.cost + BELIEVED * max(1.0, self.aligned.whitened.variance):
             return None
         away = one.factors - self.free.factors
-        spread = 0.5 * self._scale(calibration) * (self.free.factor_covariance + one.factor_covariance)
-        return _reading(self.free.factors + 0.5 * away, spread + 0.25 * np.outer(away, away))
+        prior, scale = self.problem.prior, self._scale(calibration)
+        spread = 0.5 * (self.free.learnt(prior, scale) + one.learnt(prior, scale))
+        return _reading(self.free.factors + 0.5 * away, spread + 0.25 * np.outer(away, away), prior.softness)
 
     def _scale(self, calibration: float) -> float:
         """Factor on covariances for a residual of variance 1."""
         return calibration**2 * max(1.0, self.aligned.whitened.variance)
 
 
-def _reading(factors: Array, covariance: Array) -> MachineReading:
-    return MachineReading(tuple(factors.tolist()), tuple(covariance.ravel().tolist()))
+def _reading(factors: Array, covariance: Array, softness: tuple[float, float]) -> MachineReading:
+    return MachineReading(tuple(factors.tolist()), tuple(covariance.ravel().tolist()), softness)
 
 
 def learn_and_fit(

@@ -1,0 +1,79 @@
+"""Least lead of the motor over the screw with which a single contact explains a window: what the gap is at least.
+
+The lead is as wide as the motor's way to the contact, which shows in when and how abruptly the load begins to follow.
+A machine that differs from its model moves it, and a soft screw does so most: it delays the load, and takes a part of
+the travel. How soft the screw is enters far from linearly (its first mass rings), so that several softnesses are tried.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.estimation.core.contacts import travel
+from servotwin.estimation.whitened.free_model import BELIEVED, HOPELESS, FreeFit, FreeProblem
+from servotwin.estimation.whitened.nearby import PITCH
+
+# Structure's stiffness over the screw's, beyond that of the model. Below the first the lead moves by little, and a
+# screw softer than the last is no drive.
+_SOFTER = (0.0, 0.02, 0.05, 0.1, 0.2)
+
+
+class Lead(NamedTuple):
+    """Range by which the motor leads the screw, and its standard deviation with the model free; rad."""
+
+    angle: float
+    std: float
+
+    def least(self, sigmas: float, systematic: float) -> float:
+        """Lead (rad) less so many standard deviations, a systematic one (rad) included."""
+        return self.angle - sigmas * math.hypot(systematic, self.std)
+
+
+def possible_leads(problem: FreeProblem, single: FreeFit, variance: float) -> list[Lead]:
+    """Leads in the fits of one contact, one for each softness of the screw that explains the window nearly as well.
+
+    Parameters
+    ----------
+    problem : FreeProblem
+        Of the window; its compliance is not used.
+    single : FreeFit
+        A fit of one contact.
+    variance : float
+        Of the residual in units of the noise, at least 1.
+    """
+    allowed = BELIEVED * variance
+    fits = list(_softer(problem, single, allowed))
+    least = min(fit.cost for fit in fits)
+    return [_lead(problem, fit, variance) for fit in fits if fit.cost <= least + allowed]
+
+
+def _softer(problem: FreeProblem, single: FreeFit, allowed: float) -> Iterator[FreeFit]:
+    """Fits with softer and softer screws, each from the one before, until the cost has risen by what is allowed."""
+    servo, fit, before, least = problem.servo, single, 0.0, math.inf
+    stiffness = float(servo.stiffnesses.max())
+    own = 0.0 if servo.rigid else stiffness / servo.k_d
+    for more in _SOFTER:
+        screw = stiffness / (own + more) if own + more > 0.0 else math.inf
+        softened = replace(problem, servo=servo.replace(k_d=screw), compliance=0.0)
+        start = np.array([*fit.point, *fit.factors])
+        # The structure is held at its other end too: a soft screw takes its share of the travel.
+        start[2 + PITCH] += math.log1p(more) - math.log1p(before)
+        fit = softened.descend(start, (False, True), (0.0, least + HOPELESS * allowed))
+        yield fit
+        before, least = more, min(least, fit.cost)
+        if fit.cost > least + allowed:
+            return
+
+
+def _lead(problem: FreeProblem, fit: FreeFit, variance: float) -> Lead:
+    theta_m = problem.reduction.theta_m
+    motion = travel(theta_m, fit.point.screw(theta_m[0]))
+    # The way to the contact is what the place says: half the gap per unit.
+    moved = motion.forwards + motion.backwards > 0.0
+    std = 0.5 * fit.point.gap * math.sqrt(variance * fit.covariance[1, 1]) if moved else 0.0
+    return Lead(motion.lead, std)

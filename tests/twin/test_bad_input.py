@@ -1,0 +1,156 @@
+"""What must be recognised and said: two machines under one name, a wrong nameplate, another controller, a new screw."""
+
+import math
+
+import numpy as np
+import pytest
+from twin_messages import message_of, window_message
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.simulation import simulate
+from servotwin.twin.evidence import GapEstimateRecord, RedesignRecord, rows
+from servotwin.twin.model import TwinModel
+from servotwin.twin.settings import TwinSettings
+from servotwin.twin.step import WindowArrival, step
+
+MODEL = Servo.preset("paper")
+ONE = MODEL.replace(k=tuple(1.04 * MODEL.stiffnesses), c=tuple(0.8 * MODEL.dampings))
+OTHER = MODEL.replace(k=tuple(0.93 * MODEL.stiffnesses), c=tuple(1.3 * MODEL.dampings))
+
+
+def windows_of(machine, gap_deg, count, seed=0, law=MODEL.controller):
+    """The second after each step of a loop that swings, with 1 um of noise."""
+    gap, rng = math.radians(gap_deg), np.random.default_rng(seed)
+    run = simulate(
+        machine,
+        10.0 * (count + 1),
+        controller=law,
+        reference=SquareWave(1e-3, 20.0),
+        gap=gap,
+        tolerance=MODEL.tolerance_for(gap),
+        theta_d0=0.2 * gap,
+    )
+    for number in range(1, count + 1):
+        window = Window.from_run(run, 10.0 * number, 1.0)
+        yield window.replace(position=window.position + rng.normal(0.0, 1e-6, window.position.size))
+
+
+def stable_law(machine):
+    """The model's law, its gains lowered until the machine's loop is stable without a gap."""
+    law = MODEL.controller
+    while True:
+        try:
+            machine.replace(Kp=law.Kp, Ki=law.Ki, Kd=law.Kd).check_loop()
+            return law
+        except InvalidInput:
+            law = law.replace(Kp=0.8 * law.Kp, Ki=0.6 * law.Ki, Kd=0.8 * law.Kd)
+
+
+class Seen:
+    """Estimates, sentences of alarms and redesigns of a twin that received some windows, one every 10 s."""
+
+    def __init__(self, windows, model=None):
+        self.model = model or TwinModel.of(MODEL, TwinSettings(policy="margin"))
+        state = self.model.initial_state("axis")
+        self.estimates, self.alarms, self.redesigns = [], [], []
+        for number, window in enumerate(windows):
+            time = 10.0 * number
+            message = message_of(window, number, start=time) if isinstance(window, Window) else window
+            result = step(self.model, state, WindowArrival(message, time), time)
+            state = result.state
+            made = rows(result.evidence, 1, "")
+            self.alarms.append(" | ".join(row.status for row in made if row.kind == "alarm"))
+            self.estimates += [record.estimate for record in result.evidence if isinstance(record, GapEstimateRecord)]
+            self.redesigns += [record.redesign for record in result.evidence if isinstance(record, RedesignRecord)]
+        self.machine = state.wear.machine
+
+    def gaps(self):
+        return [math.degrees(estimate.gap) for estimate in self.estimates if estimate.ok]
+
+
+def by_turns(factors):
+    """A twin whose windows show these stiffnesses; those that differ from the first mismatch."""
+    made = iter(factors)
+
+    def estimate(window, _expected):
+        k, middle = next(made), window.start + 0.5 * window.duration
+        status = GapStatus.OK if k == factors[0] else GapStatus.MODEL_MISMATCH
+        reading = MachineReading((k, 0.0, 0.0, 0.0), tuple(np.diag([1e-6] * 4).ravel().tolist()))
+        return GapEstimate(0.1, 1e-3, 1e-3, (0.098, 0.102), status, middle, machine=reading)
+
+    model = TwinModel.of(MODEL, TwinSettings(policy="margin"), estimator=estimate)
+    return Seen([window_message(number, 10.0 * number) for number in range(len(factors))], model)
+
+
+def test_two_machines_under_one_name_get_no_setting_until_three_windows_in_a_row_are_of_one():
+    seen = by_turns([0.01, 0.2, 0.01, 0.2, 0.01, 0.01, 0.01, 0.01])
+    assert "the machine is not the one that was learnt" in seen.alarms[1]
+    assert "windows of two machines come under this name" in seen.alarms[3]
+    assert [redesign.setting is not None for redesign in seen.redesigns] == [
+        True, False, True, False, False, False, True, True,
+    ]  # fmt: skip
+    assert "two machines" in seen.redesigns[4].reason
+
+
+def test_a_machine_that_was_exchanged_for_good_is_learnt_and_gets_its_settings():
+    """Once it is learnt, windows of the old one are those of a second machine."""
+    seen = by_turns([0.01, 0.01, 0.2, 0.2, 0.2])
+    assert "learnt anew from 3 windows" in seen.alarms[-1]
+    assert seen.machine.factors[0] == 0.2
+    assert seen.machine.other.factors[0] == 0.01
+    assert not seen.machine.disputed
+
+
+@pytest.mark.slow
+def test_windows_of_two_machines_by_turns_give_no_wrong_gap_and_soon_no_setting():
+    one, other = windows_of(ONE, 10.0, 5), windows_of(OTHER, 13.0, 5, seed=5)
+    seen = Seen([window for pair in zip(one, other, strict=True) for window in pair])
+    assert seen.gaps() == pytest.approx([10.0] * 5, abs=0.05)
+    assert all(redesign.setting is None for redesign in seen.redesigns[3:])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"k": tuple(2.0 * MODEL.stiffnesses)}, "fit no machine"),
+        ({"k": tuple(0.5 * MODEL.stiffnesses)}, "k/m is at least"),
+        ({"c": tuple(2.0 * MODEL.dampings)}, "c/m is at least"),
+        ({"c": tuple(0.5 * MODEL.dampings)}, "c/m is at least"),
+        ({"p": 2.0 * MODEL.p}, "the pitch seems to be 2 times the model's"),
+        ({"p": 0.5 * MODEL.p}, "the pitch seems to be 0.5 times the model's"),
+    ],
+)
+def test_a_nameplate_wrong_by_a_factor_of_two_is_said_and_gives_no_wrong_gap(changes, said):
+    machine = MODEL.replace(**changes)
+    seen = Seen(windows_of(machine, 10.0, 4, law=stable_law(machine)))
+    assert seen.gaps() == pytest.approx([10.0] * len(seen.gaps()), abs=0.1)
+    assert said in " | ".join([*seen.alarms, *(reason for one in seen.estimates for reason in one.reasons)])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_a_torque_gain_wrong_by_a_factor_of_two_does_not_move_the_gap(factor):
+    seen = Seen(windows_of(MODEL.replace(k_T=factor * MODEL.k_T), 10.0, 3))
+    assert seen.gaps() == pytest.approx([10.0] * 3, abs=0.1)
+
+
+@pytest.mark.slow
+def test_windows_under_another_controller_than_the_models_show_the_gap_and_the_machine():
+    """The fit begins at the motor's angle: which law turned it does not matter."""
+    law = MODEL.controller
+    seen = Seen(windows_of(ONE, 10.0, 3, law=law.replace(Kp=0.5 * law.Kp, Ki=0.3 * law.Ki)))
+    assert seen.gaps() == pytest.approx([10.0] * 3, abs=0.05)
+    assert np.exp(seen.machine.factors[:2]) == pytest.approx([1.04, 0.8], abs=5e-3)
+
+
+@pytest.mark.slow
+def test_a_new_screw_without_a_gap_is_followed_from_its_second_window_and_said():
+    seen = Seen([*windows_of(ONE, 10.0, 4), *windows_of(ONE, 0.0, 3, seed=5)])
+    assert seen.gaps() == pytest.approx([10.0] * 4 + [0.0] * 3, abs=0.05)
+    assert "the gap has jumped from 10 to" in seen.alarms[5]
+    assert [redesign.setting is None for redesign in seen.redesigns[4:6]] == [True, False]
