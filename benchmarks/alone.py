@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from benchmarks import accuracy, endurance, glances, tick
+from benchmarks import accuracy, compensation, endurance, glances, tick
 from benchmarks import windows as from_windows
 from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
@@ -31,6 +31,10 @@ def _policies(date: str, output: Path | None, quick: bool) -> None:
 
 def _loops(date: str, output: Path | None, quick: bool) -> None:
     in_the_loop.loops(date, output, in_the_loop.QUICK if quick else in_the_loop.MACHINES)
+
+
+def _compensation(date: str, output: Path | None, quick: bool) -> None:
+    compensation.compensation(date, output, compensation.QUICK if quick else compensation.MACHINES)
 
 
 def _novelty(date: str, output: Path | None, quick: bool) -> None:
@@ -60,6 +64,7 @@ ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
     glances.NAME: _triage,
     side_by_side.NAME: _policies,
     in_the_loop.NAME: _loops,
+    compensation.NAME: _compensation,
     tick.NAME: _tick,
     from_windows.NAME: _windows,
     worth_sending.NAME: _novelty,

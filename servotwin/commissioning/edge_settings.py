@@ -30,7 +30,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
-from servotwin.redesign.certified.uncertainty import PARAMETERS
+from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors
 from servotwin.redesign.dead_zones import HysteresisPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.runtime.retry import Retry
@@ -167,7 +167,9 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     laws = _candidates(policy, demands)
     ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
     middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
-    factor = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values()) * _ROUNDING
+    kick = max(abs(law.velocity_feedforward) / law.velocity_time for law in laws)
+    widest = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values())
+    factor = max(widest, kick / abs(middle["Kp"]) if kick else 0.0) * _ROUNDING
     leave = max([law.leave for law in laws] + [leave for _, leave in demands.hysteresis])
     limits = Limits(
         maximum=demands.tolerance,
@@ -181,7 +183,9 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
 
 def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[Controller]:
     """Candidates for the stated ranges, and those for a plant that the twin has learnt exactly."""
-    exact = policy.uncertainty.replace(**dict.fromkeys(PARAMETERS, 0.0))
+    exact = policy.uncertainty.replace(
+        **dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors(("k",), (0.0,), ((0.0,),))
+    )
     known = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
     pairs = ((policy.uncertainty, demands), (exact, known))
     return [each.controller for pair in pairs for each in candidates_of(policy.servo, *pair, True, False)]

@@ -29,6 +29,8 @@ class ControllerChanges(TypedDict, total=False):
     feedforward: float
     release_time: float
     integral_only: bool
+    velocity_feedforward: float
+    velocity_time: float
 
 
 @settings("controller")
@@ -103,6 +105,17 @@ class Controller:
             "the loop opens there (the paper's).",
         ),
     ] = False
+    velocity_feedforward: Annotated[
+        float,
+        key(
+            "velocity_feedforward_v_s_per_m",
+            help="Voltage per speed of the reference, through a low-pass filter; a step of the reference gives a "
+            "pulse. The loop's margins do not depend on it.",
+        ),
+    ] = 0.0
+    velocity_time: Annotated[
+        float, key("velocity_time_s", above=0.0, help="Time constant of the velocity feedforward's low-pass filter.")
+    ] = 0.1
 
     def __post_init__(self) -> None:
         check(self)
@@ -189,4 +202,6 @@ class Controller:
             feedforward=float(self.feedforward),
             release_step=-expm1(-step / self.release_time),
             acting_inside=1.0 if self.integral_only else 0.0,
+            velocity_gain=self.velocity_feedforward / self.velocity_time,
+            velocity_step=-expm1(-step / self.velocity_time),
         )

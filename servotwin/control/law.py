@@ -38,6 +38,10 @@ class LawParameters(NamedTuple):
         1 - exp(-Ts / release time), the share of `LawState.offset` that fades per tick.
     acting_inside : float
         1.0: inside the dead zone only the integral stops; 0.0: the loop opens there.
+    velocity_gain : float
+        Velocity feedforward over the time constant of its low-pass filter, V/m.
+    velocity_step : float
+        The exact zero-order-hold step of that filter.
     """
 
     Kp: float
@@ -53,6 +57,8 @@ class LawParameters(NamedTuple):
     feedforward: float = 0.0
     release_step: float = 1.0
     acting_inside: float = 0.0
+    velocity_gain: float = 0.0
+    velocity_step: float = 1.0
 
 
 class LawState(NamedTuple):
@@ -73,6 +79,11 @@ class LawState(NamedTuple):
     offset : float
         Voltage offset after a change of parameters, V: added to the voltage, inside the dead zone too; it fades
         exponentially.
+    reference : float
+        The reference of the last tick, m.
+    ahead : float
+        What the reference was ahead of its low-pass in the velocity feedforward, m: where the reference rests it
+        fades beyond all rounding.
     """
 
     integral: float
@@ -81,11 +92,13 @@ class LawState(NamedTuple):
     voltage: float
     active: float
     offset: float = 0.0
+    reference: float = 0.0
+    ahead: float = 0.0
 
 
 def start(measurement: float) -> LawState:
     """State at rest at `measurement` (m), the loop closed."""
-    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0)
+    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0, measurement, 0.0)
 
 
 def tick(parameters: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
@@ -106,7 +119,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     Notes
     -----
     Inside the dead zone the PIDF's input is zero, so its integral holds and its filter decays, and it gives no voltage
-    (erratum E16): what is left is the feedforward and the offset. A law with `acting_inside` stops its integral there
+    (erratum E16): what is left is feedforward and offset. A law with `acting_inside` stops its integral there
     and nothing else. With limits off the voltage equals the continuous PIDF's driven by the held error. The limits act
     on the sum.
     """
@@ -125,7 +138,8 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     driven = error * acting
     slope = driven - state.derivative
     pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
-    wanted = pidf + (parameters.feedforward + state.offset)
+    ahead = (1.0 - parameters.velocity_step) * state.ahead + (reference - state.reference)
+    wanted = pidf + (parameters.feedforward + state.offset + parameters.velocity_gain * ahead)
     voltage = wanted
     if voltage > parameters.voltage_limit:
         voltage = parameters.voltage_limit
@@ -141,7 +155,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     integral = state.integral + parameters.integral_step * driven * active + correction
     derivative = state.derivative + parameters.filter_step * slope
     offset = state.offset * (1.0 - parameters.release_step)
-    return LawState(integral, derivative, filtered, voltage, active, offset)
+    return LawState(integral, derivative, filtered, voltage, active, offset, reference, ahead)
 
 
 def replaced(integral: float, feedforward: float) -> float:

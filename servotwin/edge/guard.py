@@ -64,7 +64,8 @@ class Limits:
         key(
             minimum=1.0,
             infinite=True,
-            help="Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above.",
+            help="Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above. The "
+            "velocity feedforward answers a step of the reference by at most so many times the answer of the own Kp.",
         ),
     ] = 4.0
     integral_factor: Annotated[
@@ -123,7 +124,9 @@ class Limits:
     def allows_gains(self, gains: Gains, own: Gains) -> bool:
         """True where gains lie in the box around the servo's own."""
         scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
-        return scaled and gains.leave <= self.gain_factor * own.leave and abs(gains.feedforward) <= self.feedforward
+        kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
+        fed = abs(gains.feedforward) <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
+        return scaled and gains.leave <= self.gain_factor * own.leave and fed
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
         """True where gains may change from old to new, `since` seconds after the last change."""

@@ -203,4 +203,5 @@ def _gains(law: Controller | None) -> dict[str, Value]:
         "ki_v_per_m_s": law.Ki,
         "kd_v_s_per_m": law.Kd,
         "feedforward_v": law.feedforward,
+        "velocity_feedforward_v_s_per_m": law.velocity_feedforward,
     }

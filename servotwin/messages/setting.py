@@ -20,6 +20,8 @@ class Gains(Struct, frozen=True):
         V.
     integral_only : bool
         True: inside the dead zone only the integral stops; otherwise the loop opens there.
+    velocity_feedforward, velocity_time : float
+        V s/m, and s of its low-pass filter.
     """
 
     Kp: float
@@ -30,11 +32,14 @@ class Gains(Struct, frozen=True):
     leave: float = 1.0
     feedforward: float = 0.0
     integral_only: bool = False
+    velocity_feedforward: float = 0.0
+    velocity_time: float = 0.1
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             require(isfinite(getattr(self, name)), f"gains {name} {getattr(self, name)} is not finite")
-        require(self.Tf > 0.0, f"gains Tf {self.Tf} s is not positive")
+        for name in ("Tf", "velocity_time"):
+            require(getattr(self, name) > 0.0, f"gains {name} {getattr(self, name)} s is not positive")
         require(0.0 <= self.enter <= self.leave, f"gains enter {self.enter}, leave {self.leave}: not in order")
 
 

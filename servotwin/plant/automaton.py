@@ -189,6 +189,8 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
         if controller.loop_filter_hz is not None:
             rate = 2.0 * np.pi * controller.loop_filter_hz
             flow[..., basis["filtered"], :] = rate * (sensed - basis.row("filtered"))
+        if "lagging" in basis:
+            flow[..., basis["lagging"], :] = (basis.row("reference") - basis.row("lagging")) / controller.velocity_time
         if shape.offset:
             flow[..., basis["offset"], :] = -basis.row("offset") / controller.release_time
         flows.append(flow)
@@ -263,6 +265,9 @@ def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, err
     """
     # The feedforward and the offset act inside the dead zone too.
     always = basis.row("feedforward") + basis.row("offset")
+    if "lagging" in basis:
+        ahead = basis.row("reference") - basis.row("lagging")
+        always = always + controller.velocity_feedforward / controller.velocity_time * ahead
     slope = error - basis.row("derivative")
     unlimited = always + controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
     tolerance = basis.row("tolerance")
@@ -309,6 +314,7 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
         plant_names(servo)
         + ["integral", "derivative"]
         + (["filtered"] if controller.loop_filter_hz is not None else [])
+        + (["lagging"] if np.any(controller.velocity_feedforward) else [])
     )
     names += [name for key in INPUTS for name in input_names(key, getattr(shape, key))]
     names += ["voltage limit"] if controller.voltage_limit is not None else []

@@ -111,6 +111,16 @@ class LawNumbers(Protocol):
         ...
 
     @property
+    def velocity_feedforward(self) -> float | Array:
+        """Voltage per speed of the reference, V s/m."""
+        ...
+
+    @property
+    def velocity_time(self) -> float | Array:
+        """Time constant of its filter, s."""
+        ...
+
+    @property
     def release_time(self) -> float | Array:
         """Time constant of an offset, s."""
         ...

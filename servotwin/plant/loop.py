@@ -104,7 +104,7 @@ def open_loop(plant: LinearSystem, controller: Controller) -> LinearSystem:
 
 
 def closed_loop(plant: LinearSystem, controller: Controller) -> LinearSystem:
-    """Reference to measured position (Eq 15); the loop filter is in the feedback."""
+    """Reference to measured position (Eq 15), without velocity feedforward; the loop filter is in the feedback."""
     return feedback(series(pidf(controller), plant), loop_filter(controller))
 
 

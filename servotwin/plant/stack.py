@@ -76,6 +76,8 @@ class LawStack:
     leave: Array
     tracking: Array
     release_time: Array
+    velocity_feedforward: Array
+    velocity_time: Array
     loop_filter_hz: Array | None
     voltage_limit: Array | None
     integral_only: bool
@@ -83,7 +85,8 @@ class LawStack:
     @classmethod
     def of(cls, laws: Sequence[Controller]) -> LawStack:
         """Numbers of controllers."""
-        names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "tracking", "release_time")
+        names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "tracking", "release_time"]
+        names += ["velocity_feedforward", "velocity_time"]
         optional = ("loop_filter_hz", "voltage_limit")
         columns: dict[str, Any] = {name: _column(laws, name) for name in names}
         columns |= {name: None if getattr(laws[0], name) is None else _column(laws, name) for name in optional}

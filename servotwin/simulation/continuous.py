@@ -45,7 +45,8 @@ class ContinuousEngine:
         set_states(self.loop, state, constants | controller_constants(self.controller))
         if self.noise is not None:
             set_states(self.loop, state, {"noise": self.noise.block(1)[0]})
-        set_states(self.loop, state, {"filtered": self.loop.rows["measured_position"][0] @ state})
+        followers = ("filtered", "lagging")
+        set_states(self.loop, state, dict.fromkeys(followers, self.loop.rows["measured_position"][0] @ state))
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
         mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
@@ -252,8 +253,9 @@ def _with_states(
     common |= {"integral": 0.0} if controller.Ki == 0.0 else {}
     if controller.integral_only:
         common["integral"] -= replaced(common["integral"], controller.feedforward - common.get("feedforward", 0.0))
-    # A loop filter that is new starts at the measurement: at zero it would show a jump of the position.
-    common = {"filtered": now.output("measured_position")} | common | dict(values)
+    # A filter that is new starts at what it filters: at zero it would show a jump of it.
+    new = {"filtered": now.output("measured_position"), "lagging": now.value("reference")}
+    common = new | common | dict(values)
     state = np.array([common.get(name, 0.0) for name in loop.automaton.names])
     zone = now.zone.split()[0]
     if zone != "on":

@@ -337,7 +337,8 @@ def check_constants(constants: dict[str, Array]) -> None:
 
 
 def _structure_of(servo: Servo, law: Controller) -> tuple[object, ...]:
-    return servo.n, servo.rigid, law.voltage_limit is None, law.loop_filter_hz is None, law.integral_only
+    limits = law.voltage_limit is None, law.loop_filter_hz is None
+    return servo.n, servo.rigid, *limits, law.integral_only, law.velocity_feedforward == 0.0
 
 
 def _constants_of(laws: list[Controller]) -> dict[str, Array]:
@@ -359,8 +360,9 @@ def starts_of(loops: LoopStack, which: NDArray[np.int64], constants: dict[str, A
     rest = loops.plants.chain().equilibrium(loops.plants.p)[which]
     states[:, index("theta_d")] = screw
     states[:, first : first + rest.shape[1]] = screw[:, None] * rest
-    if "filtered" in names:
-        states[:, index("filtered")] = np.sum(states * loops.rows["measured_position"][which, 0], axis=1)
+    for follower in ("filtered", "lagging"):
+        if follower in names:
+            states[:, index(follower)] = np.sum(states * loops.rows["measured_position"][which, 0], axis=1)
     return states
 
 

@@ -68,6 +68,8 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         ("filtered", controller.loop_filter_hz is not None),
         ("rate", controller.rate_limit is not None),
         ("feedforward", controller.feedforward != 0.0),
+        ("past", controller.velocity_feedforward != 0.0),
+        ("ahead", controller.velocity_feedforward != 0.0),
     ):
         places[name] = count if exists else -1
         count += exists
@@ -140,8 +142,9 @@ class LiftedEngine:
         set_states(self.plant, start, {"input bias": bias, "friction": friction})
         self.state = np.zeros(self.places.states)
         self.state[: self.places.plant] = start
-        if self.places.filtered >= 0:
-            self.state[self.places.filtered] = start[self.places.position]
+        for follower in (self.places.filtered, self.places.past):
+            if follower >= 0:
+                self.state[follower] = start[self.places.position]
         if self.places.feedforward >= 0:
             self.state[self.places.feedforward] = self.controller.feedforward
         modes, law = len(self.plant.automaton.modes), self.controller.law(None)

@@ -34,6 +34,8 @@ class Places(NamedTuple):
     filtered: int
     rate: int  # the rate limit's change per tick, with the sign of the present one
     feedforward: int
+    past: int  # reference of the last tick
+    ahead: int
     waiting: int  # first of the voltages on their way, the next one to be applied
     delay: int  # how many
     reference: int  # and its derivatives
@@ -107,6 +109,16 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
         wanted[places.derivative] -= p.derivative_gain
     if places.feedforward >= 0:
         wanted[places.feedforward] += 1.0
+    if places.ahead >= 0:
+        past, ahead = places.past, places.ahead
+        wanted[places.reference] += p.velocity_gain
+        wanted[past] -= p.velocity_gain
+        wanted[ahead] += p.velocity_gain * (1.0 - p.velocity_step)
+        m[ahead * n + places.reference] += 1.0
+        m[ahead * n + past] -= 1.0
+        m[ahead * n + ahead] -= p.velocity_step
+        m[past * n + places.reference] += 1.0
+        m[past * n + past] -= 1.0
     last = places.waiting + places.delay - 1 if places.delay > 0 else places.voltage
     # The law's own voltage, in place of the last one.
     for i in range(n):

@@ -25,7 +25,8 @@ from servotwin.hybrid.response import (
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.ticks import Output, Port, TickInputs, measured, tick_between, to_hold
 
-LAW_STATES = 6 * TICKS
+_LAW = 8
+LAW_STATES = _LAW * TICKS
 """Numbers of the law's states after the ticks of a block."""
 _UNNOTED = 64
 """Blocks after which a start is recorded anew: `sample_blocks` makes the states between, up to rounding."""
@@ -71,17 +72,18 @@ def note_block(blocks: PlantBlocks, tick: int, mode: int, x: Array) -> None:
 @inlined
 def store(state: LawState, law_states: Array, j: int) -> None:
     """Keep the law's state after a tick of the block."""
-    at = np.uint64(j) * np.uint64(6)
+    at = np.uint64(j) * np.uint64(_LAW)
     law_states[at], law_states[at + np.uint64(1)] = state.integral, state.derivative
     law_states[at + np.uint64(2)], law_states[at + np.uint64(3)] = state.filtered, state.voltage
     law_states[at + np.uint64(4)], law_states[at + np.uint64(5)] = state.active, state.offset
+    law_states[at + np.uint64(6)], law_states[at + np.uint64(7)] = state.reference, state.ahead
 
 
 @inlined
 def stored(law_states: Array, j: int) -> LawState:
     """The law's state after a tick of the block."""
-    s = law_states[j * 6 : j * 6 + 6]
-    return LawState(s[0], s[1], s[2], s[3], s[4], s[5])
+    s = law_states[j * _LAW : j * _LAW + _LAW]
+    return LawState(s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7])
 
 
 @inlined
@@ -117,7 +119,7 @@ def take_ticks(
         voltage = state.voltage
         if delay > 0:
             early = int(j) < delay
-            voltage = port.delayed[(tick + int(j)) % delay] if early else law_states[(int(j) - delay) * 6 + 3]
+            voltage = port.delayed[(tick + int(j)) % delay] if early else law_states[(int(j) - delay) * _LAW + 3]
         voltages[j], positions[j], measurements[j] = voltage, position, y
         actives[j] = 1 if state.active > 0.5 else 0
         hold_input(r, mode, j, voltage, memory)
@@ -167,7 +169,7 @@ def run_plant_blocks(
             state = stored(law_states, last)
             x[port.voltage] = output.states[0, tick + last - output.first_sample]
         for j in range(last + 1 if port.delayed.size > 0 else 0):
-            to_hold(tick + j, law_states[j * 6 + 3], port)
+            to_hold(tick + j, law_states[j * _LAW + 3], port)
         tick += calm
         fresh = calm < TICKS
         recent = 0.0 if fresh else output.states[0, tick - 1 - output.first_sample]

@@ -91,9 +91,10 @@ def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
 def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
     servo, law = members.servos[member], members.controllers[member]
     here = {name: float(values[member]) for name, values in members.constants.items()}
-    limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None, law.feedforward == 0.0
+    limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None
+    feedforwards = law.feedforward == 0.0, law.velocity_feedforward == 0.0
     switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    return servo.n, servo.rigid, *limits, *switches
+    return servo.n, servo.rigid, *limits, *feedforwards, *switches
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:
@@ -114,8 +115,9 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     places = places_of(loops.first, laws[0], delay, degree(span.shape))
     states = np.zeros((len(which), places.states))
     states[:, : places.plant] = starts_of(loops, plant, constants)
-    if places.filtered >= 0:
-        states[:, places.filtered] = states[:, places.position]
+    for follower in (places.filtered, places.past):
+        if follower >= 0:
+            states[:, follower] = states[:, places.position]
     if places.feedforward >= 0:
         states[:, places.feedforward] = [each.feedforward for each in laws]
     rates = np.array([rate for _, rate in plant_places])

@@ -104,8 +104,9 @@ def run_one(
     plant, law, z = starts.plant[k], starts.law[k], worker.state
     p, rate = family.laws[law], family.rate[law]
     parameters = LawParameters(
-        p[0], p[1], p[2], p[3], starts.enter[k], starts.leave[k], p[6], p[7], p[8], p[9], p[10], p[11], p[12]
-    )
+        p[0], p[1], p[2], p[3], starts.enter[k], starts.leave[k], p[6], p[7], p[8], p[9], p[10], p[11], p[12], p[13],
+        p[14],
+    )  # fmt: skip
     loop = LiftedLoop(
         parameters, family.dead_zone, family.searches[plant], family.step[plant], family.flows[plant], family.modes
     )

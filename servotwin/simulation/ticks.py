@@ -85,6 +85,8 @@ def tick_between(
         parameters.feedforward,
         parameters.release_step,
         parameters.acting_inside,
+        parameters.velocity_gain,
+        parameters.velocity_step,
     )
     return tick(now, state, reference, y)
 

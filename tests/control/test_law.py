@@ -89,6 +89,34 @@ def test_a_dead_zone_that_stops_the_integral_only() -> None:
     assert states[800:] == run(plain, errors[800:], states[799])
 
 
+def test_a_step_of_the_reference_gives_the_pulse_of_the_velocity_feedforward() -> None:
+    """It decays exponentially, and its area is the feedforward times the step; inside the dead zone it acts too."""
+    step, gain, time, rate = 3e-4, 190.0, 0.02, 5000.0
+    law = Controller(0.0, 0.0, 0.0, 0.1, sample_rate=rate, velocity_feedforward=gain, velocity_time=time)
+    for tolerance in (None, 1e-3):
+        voltages = [state.voltage for state in run(law.law(tolerance), [step] * 2000)]
+        exact = [gain / time * step * exp(-k / (rate * time)) for k in range(2000)]
+        assert voltages == pytest.approx(exact, rel=1e-9, abs=1e-13)
+    assert sum(voltages) / rate == pytest.approx(gain * step, rel=6e-3)
+
+
+def test_a_ramp_of_the_reference_is_fed_forward_in_proportion_to_its_speed() -> None:
+    speed, rate = 0.02, 5000.0
+    law = Controller(0.0, 0.0, 0.0, 0.1, sample_rate=rate, velocity_feedforward=190.0, velocity_time=0.02).law()
+    voltages = [state.voltage for state in run(law, [speed * k / rate for k in range(2000)])]
+    assert voltages[-1] == pytest.approx(190.0 * speed, rel=6e-3)
+
+
+def test_the_velocity_feedforward_starts_from_rest_and_ends_in_it() -> None:
+    law = PAPER.replace(Ki=0.0, velocity_feedforward=190.0).law()
+    assert tick(law, start(2e-3), 2e-3, 2e-3).voltage == 0.0
+    state = tick(law, start(2e-3), 3e-3, 3e-3)
+    assert state.voltage == pytest.approx(190.0 / 0.1 * 1e-3, rel=1e-12)
+    for _ in range(400_000):
+        state = tick(law, state, 3e-3, 3e-3)
+    assert abs(state.voltage) < 1e-300
+
+
 def test_outside_its_dead_zone_either_law_is_the_same() -> None:
     errors = [2e-3, -3e-3, 5e-3] * 20
     assert run(LIMITED.replace(integral_only=True).law(1e-3), errors) == run(LIMITED.law(1e-3), errors)
@@ -249,6 +277,7 @@ def _compiled_run(parameters: Any, state: Any, references: Any, measurements: An
         state = _compiled_tick(parameters, state, references[k], measurements[k])
         out[k, 0], out[k, 1], out[k, 2] = state.integral, state.derivative, state.filtered
         out[k, 3], out[k, 4], out[k, 5] = state.voltage, state.active, state.offset
+        out[k, 6], out[k, 7] = state.reference, state.ahead
 
 
 def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -261,18 +290,19 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 STOPPED = LIMITED.replace(integral_only=True, Ki=300.0, voltage_limit=1.0, rate_limit=150.0)
 BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
+FED = LIMITED.replace(velocity_feedforward=190.0, velocity_time=0.03)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "controller",
-    [PAPER, LIMITED, BIASED, STOPPED],
-    ids=["paper", "limits, hysteresis, filter", "offset, feedforward", "integral only"],
+    [PAPER, LIMITED, BIASED, STOPPED, FED],
+    ids=["paper", "limits, hysteresis, filter", "offset, feedforward", "integral only", "velocity feedforward"],
 )
 def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
     law, samples = controller.law(1e-3), 1_000_000
     reference, measurement = _signals(samples)
-    compiled = np.empty((samples, 6))
+    compiled = np.empty((samples, 8))
     first = start(0.0)._replace(offset=2.3)
     numba.njit(_compiled_run)(law, first, reference, measurement, compiled)
     state, interpreted = first, array("d")

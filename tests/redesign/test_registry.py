@@ -13,7 +13,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
@@ -170,7 +170,7 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     scenario = load(tmp_path, "")
     agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)
     limits, own = agent.limits, agent.own
-    exact = policy.uncertainty.replace(k=0.0, c=0.0, k_B=0.0, m=0.0)
+    exact = policy.uncertainty.replace(k=0.0, c=0.0, k_B=0.0, m=0.0, learnt=LearntFactors(("k",), (0.0,), ((0.0,),)))
     sets = ((policy.uncertainty, Demands()), (exact, Demands(beyond=Beyond(k_T=0.0))))
     laws = [s.controller for pair in sets for s in candidates_of(policy.servo, *pair, True, True)]
     for law in laws:

@@ -128,13 +128,14 @@ def test_the_presets_against_exponentials(preset: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_dead_zone_that_stops_the_integral_only_against_exponentials() -> None:
-    """Weak integral action, which the dead zone stops; the rest of the law acts on inside."""
+@pytest.mark.parametrize("changes", [{"integral_only": True}, {"velocity_feedforward": 150.0, "velocity_time": 0.08}])
+def test_what_the_paper_lacks_against_exponentials(changes: dict[str, float]) -> None:
+    """Weak integral action, which the dead zone stops while the rest of the law acts on; or a velocity feedforward."""
     compared = 0
     for seed in range(40, 60):
         drawn = random_case(seed)
         own = drawn.servo.controller
-        law = own.replace(Ki=0.1 * own.Ki, integral_only=True)
+        law = own.replace(Ki=0.1 * own.Ki, **changes)
         case = replace(drawn, servo=drawn.servo.replace(controller=law))
         if not case.tolerance or sensitivity(case) > SENSITIVE:
             continue

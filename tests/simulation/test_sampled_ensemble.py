@@ -21,13 +21,15 @@ LIMITED = PAPER.controller.replace(
 def test_members_are_runs() -> None:
     servos = np.array([PAPER, PAPER.replace(k=8e3, c=50.0)])[:, None, None]
     stopped = LIMITED.replace(sample_rate=1e3, integral_only=True, Ki=500.0)
-    laws = np.array([PAPER.controller.replace(sample_rate=5e3), LIMITED.replace(sample_rate=1e3), stopped])[:, None]
+    fed = LIMITED.replace(sample_rate=1e3, velocity_feedforward=150.0)
+    others = [PAPER.controller.replace(sample_rate=5e3), LIMITED.replace(sample_rate=1e3)]
+    laws = np.array([*others, stopped, fed])[:, None]
     tolerances = np.array([0.0, PAPER.tolerance_for(2.0 * DEGREE)])
     cases = SampledCases(1e-3, 3.0 * DEGREE, tolerances, 0.01, 0.05)
     wave = SquareWave(1.0, 1.0)
     members = simulate_sampled(servos, laws, 2.0, cases, ("error", "voltage", "theta_m"), shape=wave)
-    assert members["error"].shape == (2, 3, 2, 201)
-    for i, j, k in np.ndindex(2, 3, 2):
+    assert members["error"].shape == (2, 4, 2, 201)
+    for i, j, k in np.ndindex(2, 4, 2):
         alone = simulate(
             servos[i, 0, 0],
             2.0,

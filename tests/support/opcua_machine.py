@@ -61,12 +61,12 @@ class Machine:
     async def offer(self, server: Server) -> None:
         place = await server.register_namespace(model.NAMESPACE)
         drive = await server.nodes.objects.add_object(place, self.options.get("node", model.OBJECT))
-        every = (*model.EVERY, *([model.INTEGRAL_ONLY] if self.options.get("integral_only", True) else []))
+        every = (*model.EVERY, *(model.OPTIONAL if self.options.get("optional", True) else ()))
         for name in every:
             value, kind = STARTS.get(name, (0.0, ua.VariantType.Double))
             start = self.rings[0].tolist() if name in model.SIGNALS else value
             self.variables[name] = await drive.add_variable(place, name, start, kind)
-            if name in (*model.PARAMETERS, model.COMMIT, model.INTEGRAL_ONLY):
+            if name in (*model.PARAMETERS, model.COMMIT, *model.OPTIONAL):
                 await self.variables[name].set_writable()
         await self.set("Rate", 5000.0)
         await self.set("Block", self.plant.block)
@@ -92,8 +92,8 @@ class Machine:
             return
         self.committed = commit
         version, tolerance, with_gains, *gains = [await self.variables[name].read_value() for name in model.PARAMETERS]
-        if model.INTEGRAL_ONLY in self.variables:
-            gains.append(await self.variables[model.INTEGRAL_ONLY].read_value())
+        optional = [name for name in model.OPTIONAL if name in self.variables]
+        gains += [await self.variables[name].read_value() for name in optional]
         refused = ""
         try:
             self.plant.write(version, tolerance, Gains(*gains) if with_gains else None)

@@ -55,7 +55,7 @@ class Case:
 
 @dataclass
 class Loop:
-    """States: current, speed, motor angle, screw angle, positions, velocities, integral, filtered error.
+    """States: current, speed, motor angle, screw angle, positions, velocities, integral, filtered error and reference.
 
     A rigid screw carries the first mass with it (Eq 10), so that the positions start with the second; an elastic one
     pulls the first mass through k_d, and the load pulls the motor as long as there is contact.
@@ -70,7 +70,7 @@ class Loop:
         self.moving = range(1 if self.elastic else 2, servo.n + 1)
         self.last = self.position(servo.n)
         self.integral = SCREW + 1 + 2 * len(self.moving)
-        self.filtered, self.size = self.integral + 1, self.integral + 2
+        self.filtered, self.lagging, self.size = self.integral + 1, self.integral + 2, self.integral + 3
 
     def position(self, mass: int) -> int:
         return SCREW + 1 + mass - self.moving[0]
@@ -118,9 +118,12 @@ class Loop:
     def _law(self, A: Array, a: Array, zone: int) -> None:
         s, law = self.case.servo, self.case.servo.controller
         A[self.filtered, self.filtered] = -1.0 / law.Tf
+        A[self.lagging, self.lagging], a[self.lagging] = -1.0 / law.velocity_time, 1.0 / law.velocity_time
+        kick = law.velocity_feedforward / law.velocity_time / s.L
+        A[CURRENT, self.lagging], a[CURRENT] = -kick, kick
         if zone or law.integral_only:
             direct = law.Kp + law.Kd / law.Tf
-            A[CURRENT, self.last], a[CURRENT] = -direct / s.L, direct / s.L
+            A[CURRENT, self.last], a[CURRENT] = -direct / s.L, direct / s.L + kick
             A[CURRENT, self.integral] = 1.0 / s.L
             A[CURRENT, self.filtered] = -law.Kd / law.Tf / s.L
             A[self.filtered, self.last], a[self.filtered] = -1.0 / law.Tf, 1.0 / law.Tf
@@ -202,7 +205,7 @@ def by_solve_ivp(case: Case, times: Array, rtol: float = 1e-12) -> tuple[Array, 
     loop = Loop(case)
     x, side, count = np.zeros(loop.size), 0, 0
     result = np.full(len(times), np.nan)
-    scale = np.abs([1e-2, 1.0, 1.0, 1.0, *[1e-3] * len(loop.moving), *[1e-2] * len(loop.moving), 1.0, 1e-3])
+    scale = np.abs([1e-2, 1.0, 1.0, 1.0, *[1e-3] * len(loop.moving), *[1e-2] * len(loop.moving), 1.0, 1e-3, 1e-3])
     for begin, end, reference in case.stretches():
         zone, t = (zone_of(case, reference - x[loop.last]) if case.tolerance else 1), begin
         while t < end:

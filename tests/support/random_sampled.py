@@ -131,6 +131,8 @@ def random_case(seed: int) -> SampledCase:
     delay = int(rng.choice([0, 0, 1, 2, 3]))
     theta_d0 = rng.uniform(-0.05, 0.05)
     law = law.replace(integral_only=chance(0.4))
+    if chance(0.4):
+        law = law.replace(velocity_feedforward=rng.uniform(0.2, 0.8) * servo.k_B / servo.p, velocity_time=0.08)
     return SampledCase(servo, law, inputs, theta_d0, int(duration * rate / every) + 1, delay)
 
 

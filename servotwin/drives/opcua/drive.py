@@ -88,13 +88,15 @@ class OpcUaDrive:
         """Write all, commit, and wait for the drive's decision."""
         session = self._connected
         gains = parameters.setting.gains or Gains(0.0, 0.0, 0.0, 1.0)
-        if gains.integral_only and not session.has(model.INTEGRAL_ONLY):
-            raise DriveRefused(f"drive {self._settings.url}: has no variable {model.INTEGRAL_ONLY}")
+        needed = [model.INTEGRAL_ONLY] if gains.integral_only else []
+        needed += model.VELOCITY if gains.velocity_feedforward else ()
+        for name in needed:
+            if not session.has(name):
+                raise DriveRefused(f"drive {self._settings.url}: has no variable {name}")
         before, committed = session.read((model.COMMIT, model.DECISION[0]))
         values = (parameters.version, parameters.setting.tolerance, parameters.setting.gains is not None)
-        *numbers, integral_only = msgspec.structs.astuple(gains)
-        written = dict(zip(model.PARAMETERS, (*values, *numbers), strict=True))
-        session.write(written | ({model.INTEGRAL_ONLY: integral_only} if session.has(model.INTEGRAL_ONLY) else {}))
+        written = zip((*model.PARAMETERS, *model.OPTIONAL), (*values, *msgspec.structs.astuple(gains)), strict=True)
+        session.write({name: value for name, value in written if name in model.PARAMETERS or session.has(name)})
         commit = (max(before, committed) + 1) % 2**32
         session.write({model.COMMIT: commit})
         self._wait_for(session, commit)

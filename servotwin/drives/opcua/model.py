@@ -28,6 +28,12 @@ PARAMETERS = ("NewVersion", "Tolerance", "SetGains", *GAINS)
 INTEGRAL_ONLY = "IntegralOnly"
 """Boolean, whether the dead zone stops the integral only; a drive that lacks it cannot do that."""
 
+VELOCITY = ("VelocityFeedforward", "VelocityTime")
+"""Double: V s/m, s; a drive that lacks them has no velocity feedforward."""
+
+OPTIONAL = (INTEGRAL_ONLY, *VELOCITY)
+"""Gains that not every drive has."""
+
 COMMIT = "Commit"
 """UInt32, another number each time."""
 

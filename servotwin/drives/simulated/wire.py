@@ -15,14 +15,14 @@ from msgspec import convert
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 
-MAGIC, VERSION = b"STDR", 2
+MAGIC, VERSION = b"STDR", 3
 CONTROL, SUPERVISE = 1, 2
 ROLES = {"control": CONTROL, "supervise": SUPERVISE}
 HELLO = struct.Struct("<4sHBx")  # magic, version, role
 WELCOME = struct.Struct("<4sHB x8sd")  # magic, version, role; the machine's run, rate in Hz
 SAMPLE = struct.Struct("<qdddd")  # number, reference, theta_m, position, lag in s
 VOLTAGE = struct.Struct("<d")  # V; where it is not finite the last one holds
-REQUEST = struct.Struct("<BB2xIq9d")  # kind, with gains, most; number or version; tolerance or offset, gains
+REQUEST = struct.Struct("<BB2xIq11d")  # kind, with gains, most; number or version; tolerance or offset, gains
 REPLY = struct.Struct("<B3xIqqd")  # kind, count; first, version, lag in s
 READ, WRITE, MOVE = 1, 2, 3
 DONE, REFUSED, OVER = 0, 1, 2
@@ -48,9 +48,8 @@ class Address(NamedTuple):
 
 def gains_of(numbers: tuple[float, ...]) -> Gains:
     """Gains of the numbers of a request, which are doubles all of them."""
-    *floats, integral_only = numbers
-    named = dict(zip(Gains.__struct_fields__, floats, strict=False))
-    return convert({**named, "integral_only": integral_only > 0.5}, Gains)
+    named = dict(zip(Gains.__struct_fields__, numbers, strict=True))
+    return convert({**named, "integral_only": named["integral_only"] > 0.5}, Gains)
 
 
 def parse_address(text: str) -> Address:

@@ -156,7 +156,7 @@ class Attempt:
             rate=law.sample_rate,
             delay=0 if law.sample_rate is None else known.delay,
             error_per_volt=0.0 if law.Ki else 1.0 / abs(law.Kp),
-            lag=_lag(question.servo, law),
+            lag=_lag(question.servo, setting.controller),
         )
 
     @cached_property
@@ -235,7 +235,8 @@ def _lag(servo: Servo, law: Controller) -> float:
     plant = servo.plant()
     corners = np.abs(plant.poles())
     slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
-    return 1.0 / (abs(law.Kp) * slow * float(np.abs(plant.response(slow))))
+    needed = 1.0 / (slow * float(np.abs(plant.response(slow))))
+    return abs(needed - law.velocity_feedforward) / abs(law.Kp)
 
 
 def _seed(servo: Servo, uncertainty: Uncertainty, setting: Design, seed: int) -> int:

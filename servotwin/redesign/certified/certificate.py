@@ -63,10 +63,14 @@ class Demands:
         Factors on Kp and Kd.
     shapes : tuple of (float, float)
         Factors on Kd / (Kp Tf) and on Tf, tried with every scale: they move the derivative action.
+    learnt_shapes : tuple of (float, float)
+        Further ones, tried on a machine that was learnt.
     integral : tuple of float
         Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
     known : float
         Share of the smallest step: a bias that leaves a smaller error under the servo's own Kp counts as known.
+    velocity : tuple of float
+        Velocity feedforwards, relative to the back EMF of that speed, tried beside none.
     stops : tuple of (float, float)
         Dead zones that stop the integral only, tried beside none wherever integral action is: half-width as a share of
         the smallest step, two counts of the sensor on top, and `leave`. The integral of a loop with friction hunts less
@@ -122,12 +126,21 @@ class Demands:
     beyond: Annotated[Beyond, key(help="Ranges that nobody stated, in which a setting must settle too.")] = field(
         default_factory=Beyond
     )
+    velocity_feedforward: Annotated[
+        bool,
+        key(
+            help="Candidates with a velocity feedforward are tried too; false for machines whose own controller has "
+            "none."
+        ),
+    ] = True
     tail: float = math.inf
     tolerance: float = math.inf
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
+    learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))
     integral: tuple[float, ...] = (0.0, 0.01, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
+    velocity: tuple[float, ...] = (0.3, 0.5)
     known: float = 0.0726
     hysteresis: tuple[tuple[float, float], ...] = ((0.5, 1.5),)
     effort_weight: float = 14.0

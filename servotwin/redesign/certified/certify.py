@@ -27,8 +27,10 @@ from servotwin.redesign.design import Design
 
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
+# Time constant of a velocity feedforward's filter, in units of 1 / crossover of a motor that Kp alone moves.
+_VELOCITY_TIME = 0.5
 # Candidates that are compared on a machine that was observed.
-_MOVED = 8
+_MOVED = 12
 # Cost of the running setting over that of the cheapest one, up to which the running one stays.
 _WORTH = 1.03
 
@@ -154,7 +156,7 @@ def _for_disturbance(demands: Demands, disturbed: bool) -> Demands:
 def candidates_of(
     servo: Servo, uncertainty: Uncertainty, demands: Demands, disturbed: bool, noisy: bool
 ) -> list[Design]:
-    """Every combination of scales, shapes, integral action and dead zone within the bounds on Ms.
+    """Every combination of scales, shapes, velocity feedforward, integral action and dead zone within the bounds on Ms.
 
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
     candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
@@ -166,7 +168,8 @@ def candidates_of(
         No scaled controller is within the bounds on Ms.
     """
     integral = demands.integral if disturbed else (0.0,)
-    laws = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
+    within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
+    laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
     plain = [Design(law) for law in laws]
     plain += [stopped for law in laws if law.Ki for stopped in _stopped(servo, law, uncertainty.step[0], demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
@@ -174,6 +177,14 @@ def candidates_of(
         Design(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
     ]
     return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
+
+
+def _with_velocity(servo: Servo, law: Controller, demands: Demands) -> list[Controller]:
+    """A law as it is, and with velocity feedforwards."""
+    needed, own = servo.k_B / servo.p, abs(servo.controller.Kp)
+    shares = demands.velocity if demands.velocity_feedforward and own > 0.0 else ()
+    time = _VELOCITY_TIME * needed / own if shares else law.velocity_time
+    return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
 
 
 def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:
@@ -192,7 +203,7 @@ def _gains(law: Controller) -> tuple[float, float, float]:
 
 
 def _ranked_in_stages(question: Question, candidates: list[Design], running: Design | None) -> Iterator[Design]:
-    """Candidates in the order of their costs: integral action is tried with the best gains without it, and the own.
+    """Candidates in the order of their costs: integral action is tried with the own gains and the best laws without it.
 
     The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
     would otherwise take turns, whenever the evidence moves a little.
@@ -200,13 +211,29 @@ def _ranked_in_stages(question: Question, candidates: list[Design], running: Des
     screening, own = Screening(question), _gains(question.servo.controller)
     plain = [setting for setting in candidates if not setting.controller.Ki]
     if plain and len(plain) < len(candidates):
-        best = islice(screening.ranked(plain), _GAINS_WITH_INTEGRAL)
-        gains = {own, *(_gains(setting.controller) for setting in best)}
-        candidates = plain + [each for each in candidates if each.controller.Ki and _gains(each.controller) in gains]
+        fed = _velocities(screening.ranked(plain), own)
+        candidates = plain + [
+            each
+            for each in candidates
+            if each.controller.Ki and fed.get(_gains(each.controller)) == each.controller.velocity_feedforward
+        ]
     if question.uncertainty.usual_step is None:
         return _with_running(screening, candidates, running)
     always = [each for each in candidates if _gains(each.controller) == own]
     return _by_moves(screening, candidates, [*always, running] if running is not None else always, running)
+
+
+def _velocities(ranked: Iterator[Design], own: tuple[float, float, float]) -> dict[tuple[float, float, float], float]:
+    """Velocity feedforwards with which integral action is tried, by gains: the best for each of the best gains; for the
+    own gains that of the best of all."""
+    fed, best = dict[tuple[float, float, float], float](), math.nan
+    for setting in ranked:
+        law = setting.controller
+        best = law.velocity_feedforward if math.isnan(best) else best
+        fed.setdefault(_gains(law), law.velocity_feedforward)
+        if len(fed) == _GAINS_WITH_INTEGRAL:
+            break
+    return {own: best} | fed
 
 
 def _with_running(screening: Screening, candidates: list[Design], running: Design | None) -> Iterator[Design]:

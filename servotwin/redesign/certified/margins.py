@@ -109,10 +109,11 @@ def laws_within(
     """
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     delays = delays_of(servo.controller, uncertainty)
+    shapes = demands.shapes + (demands.learnt_shapes if uncertainty.learnt is not None else ())
     scaled = [
         scaled_law(servo.controller, scale, shape, share)
         for share in integral
-        for shape in demands.shapes
+        for shape in shapes
         for scale in demands.scales
     ]
     laws = list(dict.fromkeys(scaled))
@@ -174,8 +175,9 @@ def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share:
 
 
 def unfed(law: Controller) -> Controller:
-    """The law without feedforward and thresholds, on which margins do not depend: equal ones share a stored result."""
-    return law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
+    """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
+    plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
+    return plain.replace(velocity_feedforward=0.0, velocity_time=1.0)
 
 
 def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
@@ -193,5 +195,5 @@ def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controlle
 def with_margins(demands: Demands) -> Demands:
     """The part of the demands that the candidates depend on."""
     known = Demands()
-    names = ("Ms", "Ms_worst", "scales", "shapes", "integral", "beyond")
+    names = ("Ms", "Ms_worst", "scales", "shapes", "learnt_shapes", "integral", "beyond")
     return replace(known, **{name: getattr(demands, name) for name in names})
