@@ -17,6 +17,7 @@ from benchmarks.workloads import UNIT, NoisyWorkload, SweepWorkload, WearWorkloa
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
+from servotwin.redesign.certified.certificate import Demands
 
 MILLIMETRE = "/ 1 mm"
 
@@ -174,10 +175,10 @@ def quiet(options: Options) -> Workload:
 
 def decision(options: Options) -> Workload:
     """Time of a decision of the certified policy."""
-    size = "16 machines, 30 s" if options.quick else "256 machines, 60 s"
+    machines = 16 if options.quick else Demands().machines
     return Workload(
         "decision",
-        f"settings verified on {size} each",
+        f"settings verified on {machines} machines",
         decisions.decisions(options.quick),
         (Check("not settled", "%", lambda result: 100.0 * (1.0 - float(result[0]))),),
         lambda _: "",

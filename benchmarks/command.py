@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 
 from rich.console import Console
 from rich.markup import escape
@@ -91,7 +92,13 @@ def table(result: WorkloadResult) -> Table:
     workload = result.workload
     shown = Table(title=f"{workload.name}: {workload.title}", title_justify="left", box=None, pad_edge=False)
     shown.add_column("contestant")
-    for heading in ("median", "ratio", *(f"{check.name}\n{check.unit}" for check in workload.checks)):
+    for heading in (
+        "median",
+        "ratio",
+        "processor",
+        "ratio",
+        *(f"{check.name}\n{check.unit}" for check in workload.checks),
+    ):
         shown.add_column(heading, justify="right")
     shown.add_column("notes")
     for row in result.rows:
@@ -101,9 +108,10 @@ def table(result: WorkloadResult) -> Table:
 
 def _numbers(result: WorkloadResult, row: ContestantTimes, checks: Sequence[Check]) -> list[str]:
     if row.missing:
-        return ["-"] * (2 + len(checks))
+        return ["-"] * (4 + len(checks))
     errors = [f"{row.errors[check.name]:.2g}" for check in checks]
-    return [duration(row.median), figure(result.ratio(row)), *errors]
+    processor = [duration(median(row.processor)), figure(result.processor_ratio(row))]
+    return [duration(row.median), figure(result.ratio(row)), *processor, *errors]
 
 
 def figure(ratio: float) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -32,6 +33,8 @@ class ContestantTimes:
         By the name of the check.
     missing : str
         Reason for which it did not take part; all else is then empty.
+    processor : tuple of float
+        s, processor time of a run, of all threads of this process: of each round.
     """
 
     name: str
@@ -40,6 +43,7 @@ class ContestantTimes:
     errors: dict[str, float]
     remark: str
     missing: str
+    processor: tuple[float, ...] = ()
 
     @property
     def times(self) -> tuple[float, ...]:
@@ -66,14 +70,16 @@ class _Runner:
     repeats: int
     answer: Array
     rounds: list[tuple[float, ...]]
+    processor: list[float]
 
     def run(self, clock: Clock) -> None:
         """Measure one round."""
-        times = []
+        times, before = [], time.process_time()
         for _ in range(self.repeats):
             begin = clock()
             self.answer = self.job()
             times.append(clock() - begin)
+        self.processor.append((time.process_time() - before) / self.repeats)
         self.rounds.append(tuple(times))
 
 
@@ -115,7 +121,7 @@ def _prepared(contestant: Contestant, block: float, clock: Clock, notice: Notice
     job()
     warm = clock() - begin
     repeats = max(1, min(MOST_REPEATS, round(block / warm))) if warm > 0.0 else 1
-    return _Runner(contestant, job, first, repeats, answer, [])
+    return _Runner(contestant, job, first, repeats, answer, [], [])
 
 
 def _row(contestant: Contestant, runner: _Runner | None, workload: Workload, notice: Notice) -> ContestantTimes:
@@ -123,7 +129,8 @@ def _row(contestant: Contestant, runner: _Runner | None, workload: Workload, not
         return ContestantTimes(contestant.name, 0.0, (), {}, "", contestant.missing)
     notice(f"checking {contestant.name}")
     errors = {check.name: check.of(runner.answer) for check in workload.checks}
-    return ContestantTimes(contestant.name, runner.first, tuple(runner.rounds), errors, contestant.remark(), "")
+    rounds, processor = tuple(runner.rounds), tuple(runner.processor)
+    return ContestantTimes(contestant.name, runner.first, rounds, errors, contestant.remark(), "", processor)
 
 
 @dataclass(frozen=True)
@@ -136,6 +143,11 @@ class WorkloadResult:
     def ratio(self, row: ContestantTimes) -> float:
         """Median over the rounds of the time over servotwin's in the same round."""
         return median(row.ratios(self.rows[0]))
+
+    def processor_ratio(self, row: ContestantTimes) -> float:
+        """Median over the rounds of the processor time over servotwin's in the same round; NaN where that is zero."""
+        pairs = zip(row.processor, self.rows[0].processor, strict=True)
+        return median(own / base if base > 0.0 else math.nan for own, base in pairs)
 
     def note(self, row: ContestantTimes) -> str:
         """Remark beside the numbers."""
@@ -175,6 +187,7 @@ def _row_json(result: WorkloadResult, row: ContestantTimes) -> dict[str, Any]:
         "ratios": list(row.ratios(result.rows[0])),
         "first_s": row.first,
         "rounds_s": [list(times) for times in row.rounds],
+        "processor_s": list(row.processor),
         "errors": {name: None if math.isnan(value) else value for name, value in row.errors.items()},
         "note": result.note(row),
     }

@@ -209,12 +209,11 @@ def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool
     _fill_single(t, mode)
 
 
-@bare
 def fill_tables(t: Tables, numbers: Numbers, step: float, blocks: bool, w: Workspace) -> None:
     """Tables of the automaton with these numbers; `t` has its structure. Without `blocks` the coarse scale is left out,
     for loops that only take steps."""
-    for flow in range(len(w.filled)):
-        w.filled[flow] = 0
+    w.filled[:] = 0
+    # Not compiled: all that a compiled function calls is compiled once more with it.
     for mode in range(len(t.guard_count)):
         _fill_mode(t, numbers, mode, step, blocks, w)
 

@@ -128,7 +128,9 @@ def run_family(
         Naming the member.
     """
     traces = np.empty((len(members.mode), rows.shape[1], samples))
-    results = MemberResults(traces, np.empty((0, rows.shape[1], 0)), np.zeros(len(traces), dtype=np.int64))
+    results = MemberResults(
+        traces, np.empty((0, rows.shape[1], 0)), np.zeros(len(traces), dtype=np.int64), np.empty((0, 0))
+    )
     stack = _stacked(automata)
     _run(_family(stack, rows, sample_step), stack.first, members, results, None, threads)
     return traces, results.events
@@ -142,12 +144,17 @@ def figures_of_family(
     samples: int,
     options: FigureOptions,
     threads: int | None = None,
+    ends: Array | None = None,
 ) -> Figures:
-    """Run the members as `run_family` does and reduce their samples to figures, arrays (K, O)."""
+    """Run the members as `run_family` does and reduce their samples to figures, arrays (K, O).
+
+    `ends` (K, n), where given, becomes the states at the end.
+    """
     if not 1 <= options.last <= samples:
         raise InvalidInput(f"the last {options.last} of {samples} samples: must be 1 to {samples}")
     figures = np.empty((len(members.mode), rows.shape[1], len(Figures._fields)))
-    results = MemberResults(np.empty((1, rows.shape[1], samples)), figures, np.zeros(len(figures), dtype=np.int64))
+    traces, events = np.empty((1, rows.shape[1], samples)), np.zeros(len(figures), dtype=np.int64)
+    results = MemberResults(traces, figures, events, np.empty((0, 0)) if ends is None else ends)
     stack = _stacked(automata)
     _run(_family(stack, rows, sample_step), stack.first, members, results, options, threads)
     return Figures(*np.moveaxis(figures, 2, 0))

@@ -8,7 +8,7 @@ first root is the event.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +109,8 @@ def follow_guards(
     A jump or a reset may make several guards positive at once; each change is an event of its own.
     """
     for _ in range(CHANGES_AT_ONCE):
-        leaving = -1
+        # A literal is a type of its own to numba: `fire` would be compiled once more for it.
+        leaving: Any = np.int64(-1)
         for g in range(t.guard_count[mode]):
             if is_leaving(t, mode, g, x, scratch.series):
                 leaving = g
@@ -127,9 +128,11 @@ def cross(
     """Advance from fraction `start` to `end` of one step through every event; return the mode (-1: Zeno) and the number
     of events."""
     place, before = start, record.size[1]
+    forced: Any = np.bool_(False)
     while record.size[1] - before < EVENTS_PER_STEP:
         # Every guard, because several may be crossed within the step: the earliest crossing is the event.
-        first, which = np.inf, -1
+        first = np.inf
+        which: Any = np.int64(-1)
         for g in range(t.guard_count[mode]):
             time = next_crossing(t, mode, g, x, end - place, scratch)
             if time < first:
@@ -140,8 +143,8 @@ def cross(
         advance_fraction(t, mode, x, first, scratch)
         # Rounding of the sum must not put the event behind the end of this part of the step.
         place = min(place + first, end)
-        mode = fire(t, mode, which, x, step, place, False, record, scratch)
-        mode = follow_guards(t, mode, x, step, place, False, record, scratch)
+        mode = fire(t, mode, which, x, step, place, forced, record, scratch)
+        mode = follow_guards(t, mode, x, step, place, forced, record, scratch)
         if mode < 0:
             break
         note_segment(record, step, place, mode, x)
@@ -243,7 +246,8 @@ def follow_schedule(
     while True:
         # A start or a jump may have made guards positive: they are followed before anything flows.
         if at[3] == 1:
-            mode = follow_guards(t, at[1], x, at[0], place[0], True, record, scratch)
+            forced: Any = np.bool_(True)
+            mode = follow_guards(t, at[1], x, at[0], place[0], forced, record, scratch)
             if mode < 0:
                 return ZENO
             at[1], at[3] = mode, 0

@@ -63,6 +63,8 @@ class LiftedWorkspace(NamedTuple):
     half: Array  # N * W * N
     turned: Array  # N * W * N
     product: Array  # N * N
+    deviations: Array  # 3 * 16 * N: those from one cubic, at the control points of every interval
+    column: Array  # 3 * 16
 
 
 def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
@@ -84,8 +86,9 @@ def new_lifted_workspace(states: int, watches: int) -> LiftedWorkspace:
     """Working memory to fill slots."""
     n, n2 = states, states * states
     rows = (watches * n,) * 4
-    sizes = (n2, *rows, watches, watches * n2, COARSE * n2, 3 * (COARSE + 1) * n, n, *(watches * n2,) * 3, n2)
-    return LiftedWorkspace(*(zeros(size) for size in sizes))
+    points = 3 * COARSE
+    sizes = (n2, *rows, watches, watches * n2, COARSE * n2, (points + 3) * n, n, *(watches * n2,) * 3, n2)
+    return LiftedWorkspace(*(zeros(size) for size in (*sizes, points * n, points)))
 
 
 def row_count(states: int, watches: int, intervals: int) -> int:
@@ -131,13 +134,15 @@ def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
         for i in range(n):
             at = i * stride
             for k in range(n):
-                w.row[k] = u[at + last + k]
+                w.row[k] = w.product[k] = u[at + last + k]
             w.row[i] += 1.0
             to = at + known * n
-            tall_product(u, 0, stride, known * n, w.row, u[to : to + known * n])
+            # By way of another array: what it reads and writes side by side would not be vectorised.
+            new = w.rows[: known * n]
+            tall_product(u, 0, stride, known * n, w.row, new)
             for j in range(known):
                 for k in range(np.uint64(n)):
-                    u[to + j * n + k] += u[at + last + k]
+                    u[to + j * n + k] = new[j * n + k] + w.product[k]
         known *= 2
 
 
@@ -227,29 +232,32 @@ def _add_deviation(
     """Make the sums of one scale those of an interval of the next: add the squares of its cubics' deviation from the
     cubic over all of its intervals."""
     starts, ends = (COARSE + 1) * n, 2 * (COARSE + 1) * n
-    whole = intervals * length
+    whole, count, inner = intervals * length, 0, w.product
+    for j in range(n):
+        inner[j] = w.rows[j] + whole * w.rows[starts + j]
+        inner[n + j] = w.rows[intervals * n + j] - whole * w.rows[ends + intervals * n + j]
     for i in range(intervals):
         for point in range(1, 4):
             if point < 3 and only_ends:
                 continue
             u = (i if point == 1 else i + 1) / intervals
-            tilt = 0.0 if point == 3 else (1.0 if point == 1 else -1.0) / intervals
-            c0, c1, c2, c3 = cubic_weights(u, tilt)
-            for j in range(n):
-                start, end = w.rows[j], w.rows[intervals * n + j]
-                second = start + whole * w.rows[starts + j]
-                third = end - whole * w.rows[ends + intervals * n + j]
-                true = w.rows[(i if point == 1 else i + 1) * n + j]
-                if point == 1:
-                    true += length * w.rows[starts + i * n + j]
-                elif point == 2:
-                    true -= length * w.rows[ends + (i + 1) * n + j]
-                w.row[j] = true - ((c0 * start + c1 * second) + (c2 * third + c3 * end))
-            add_square(n, w.row, w.sums, watch * n, watches * n)
+            side = 0.0 if point == 3 else (1.0 if point == 1 else -1.0)
+            c0, c1, c2, c3 = cubic_weights(u, side / intervals)
+            at, slope = (i if point == 1 else i + 1) * n, (starts + i * n if point == 1 else ends + (i + 1) * n)
+            lean, to, last = side * length, count * n, intervals * n
+            for j in range(np.uint64(n)):
+                true = w.rows[at + j] + lean * w.rows[slope + j]
+                cubic = (c0 * w.rows[j] + c1 * inner[j]) + (c2 * inner[n + j] + c3 * w.rows[last + j])
+                w.deviations[to + j] = true - cubic
+            count += 1
     for i in range(n):
+        for k in range(count):
+            w.column[k] = w.deviations[k * n + i]
+        tall_product(w.deviations, 0, n, n, w.column[:count], w.row)
         for j in range(n):
+            at = (i * watches + watch) * n + j
             # The square of a sum is at most twice the sum of the squares.
-            w.sums[(i * watches + watch) * n + j] *= 2.0
+            w.sums[at] = 2.0 * (w.sums[at] + w.row[j])
 
 
 @bare
@@ -290,8 +298,8 @@ def _fill_scale(
 
 
 @bare
-def fill_slot(t: LiftedTables, slot: int, watches: int, deep: bool, w: LiftedWorkspace) -> None:
-    """All tables of the map and the watches in `w`; those of the vast scale only where it is to be `deep`."""
+def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """The tables of the map and the watches in `w`, but for those of the vast scale."""
     n, n2 = t.states, t.states * t.states
     for watch in range(watches):
         for i in range(n):
@@ -304,10 +312,28 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, deep: bool, w: LiftedWor
     # Literals would have the function compiled once for each.
     _fill_scale(t, t.fine, t.jump_fine, slot, watches, int(FINE), 1, False, w)
     _rebase(n, int(FINE), int(COARSE), w)
-    _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), not deep, w)
-    if deep:
-        _rebase(n, int(COARSE), int(COARSE), w)
-        _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
+    _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), True, w)
+
+
+@bare
+def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """The tables of the vast scale, from those of the coarse one and the watches in `w`."""
+    n, stride, block = t.states, _stride(t, COARSE), (COARSE + 1) * t.states
+    for i in range(n):
+        for k in range(n):
+            w.powers[i * COARSE * n + k] = t.jump_coarse[((slot * n + k + 1) * COARSE - 1) * n + i]
+    for watch in range(watches):
+        for j in range(n):
+            at = (slot * n + j) * stride + watch * (3 * COARSE + 1 + n)
+            for i in range(COARSE + 1):
+                w.rows[i * n + j] = t.coarse[at + i]
+            for i in range(COARSE):
+                w.rows[block + i * n + j] = t.coarse[at + COARSE + 1 + i] / FINE
+                w.rows[2 * block + (i + 1) * n + j] = t.coarse[at + 2 * COARSE + 1 + i] / FINE
+            for i in range(n):
+                w.sums[(i * watches + watch) * n + j] = t.coarse[at + 3 * COARSE + 1 + i]
+        _add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
+    _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
 
 
 @inlined

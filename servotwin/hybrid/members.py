@@ -74,6 +74,7 @@ class MemberResults(NamedTuple):
     traces: Array  # (K, O, samples), or (1, O, samples) when only figures are computed
     figures: Array  # (K, O, number of figures), or (0, O, number of figures)
     events: NDArray[np.int64]  # (K,)
+    ends: Array  # (K, n) states at the end, or (0, n)
 
 
 class WorkerMemory(NamedTuple):
@@ -174,8 +175,9 @@ def run_members(
     """Run members at places first .. last - 1 of the order; return the status and the place it concerns. `tail` is the
     number of samples at the end that have figures of their own."""
     t = memory.tables
-    # A literal 0 is a type of its own to numba: all that it is given to would be compiled once more.
+    # A literal is a type of its own to numba: all that it is given to would be compiled once more.
     begin: Any = np.int64(0)
+    forced: Any = np.bool_(True)
     for place in range(first, last):
         k = starts.order[place]
         a = starts.automaton[k]
@@ -189,13 +191,16 @@ def run_members(
         record.size[0] = record.size[1] = 0
         if memory.scratch.pending.filled[starts.mode[k]] == 0:
             fill_entered(t, starts.mode[k], memory.scratch.pending)
-        mode = follow_guards(t, starts.mode[k], memory.state, begin, 0.0, True, record, memory.scratch)
+        mode = follow_guards(t, starts.mode[k], memory.state, begin, 0.0, forced, record, memory.scratch)
         if mode < 0:
             return ZENO, place
         status, _, _, mode = flow_until(t, memory.state, mode, begin, 0.0, steps, 0.0, record, memory.scratch)
         if status != DONE:
             return status, place
         results.events[k] = record.size[1]
+        if len(results.ends) > 0:
+            for i in range(t.states):
+                results.ends[k, i] = memory.state[i]
         fill_sampled(family, a, record, memory)
         sample_all(record, memory, family.stride[a], traces)
         if len(results.figures) > 0:

@@ -13,7 +13,7 @@ from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import LINGERING, Scratch
 from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
-from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, changes_at_ends, clean_ticks, jump
+from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, clean_ticks, jump
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.lifted_tables import (
     LIMITED,
@@ -30,10 +30,13 @@ tick = verbatim(law.tick)
 
 UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
-# The vast scale's tables pay after so many calm ticks, and where so many more are to come.
-_CALM, _WORTH = 8 * BLOCK, 16 * COARSE * BLOCK
+# The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
+# earlier.
+_PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
+VAST = -2
+"""``VAST - slot`` is that of a segment of up to 16 blocks."""
 
 
 class Segments(NamedTuple):
@@ -170,29 +173,23 @@ def note(segments: Segments, k: int, slot: int, z: Array) -> None:
 @inlined
 def deepens(place: Place, end: int, filled: int) -> bool:
     """True where a run has been calm, and goes on so long that the tables of the vast scale pay."""
-    return filled < 2 and place.at[5] >= _CALM and end - place.at[0] >= _WORTH
+    return filled < 2 and place.at[5] >= _PAYS and end - place.at[0] >= _WORTH
 
 
 @inlined
 def vast_blocks(
     z: Array, place: Place, slot: int, watches: int, end: int, segments: Segments, memory: LiftedMemory
 ) -> bool:
-    """Advance by intervals of 128 ticks, a start recorded for each; return True where a whole block was clean."""
-    lifted, n = memory.lifted, memory.lifted.states
+    """Advance by intervals of 128 ticks, one start recorded for all; return True where a whole block was clean."""
+    lifted = memory.lifted
     wanted = min(COARSE, (end - place.at[0]) // BLOCK)
     clean = clean_ticks(
         lifted, lifted.vast, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, z, memory.out
     )
     if clean > 0:
-        changes_at_ends(n, lifted.jump_vast, slot, z, memory.out)
-        for i in range(np.uint64(n)):
-            memory.change[i] = z[i]
-        for part in range(clean):
-            note(segments, place.at[0], slot, z)
-            for i in range(np.uint64(n)):
-                z[i] = memory.change[i] + memory.out[np.uint64(part) * np.uint64(n) + i]
-            place.at[0] += BLOCK
-        place.at[5] += clean * BLOCK
+        note(segments, place.at[0], VAST - slot, z)
+        jump(lifted.states, lifted.jump_vast, slot, COARSE, clean, z, memory.change)
+        place.at[0], place.at[5] = place.at[0] + clean * BLOCK, place.at[5] + clean * BLOCK
     return clean == wanted
 
 
@@ -203,7 +200,7 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
     n, again = lifted.states, begin
     low, high, slack, out = memory.low, memory.high, memory.slack, memory.out
-    while end - place.at[0] >= 2 and segments.size[0] + COARSE + 4 < len(segments.tick):
+    while end - place.at[0] >= 2 and segments.size[0] + 4 < len(segments.tick):
         filled, k = memory.filled[slot], place.at[0]
         if deepens(place, end, filled):
             break
@@ -254,7 +251,7 @@ def run_lifted(
     at, x = place.at, z[: places.plant]
     room = len(record.event_step) - 2 * EVENTS_PER_STEP
     while at[0] < end:
-        if segments.size[0] + 2 * COARSE > len(segments.tick) or segments.size[1] + 8 > len(segments.tick):
+        if segments.size[0] + 8 > len(segments.tick) or segments.size[1] + 8 > len(segments.tick):
             return FULL
         if record.size[1] > room:
             return FULL

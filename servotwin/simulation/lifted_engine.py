@@ -283,10 +283,10 @@ class LiftedEngine:
     def sampled(self, row: Array) -> Array:
         """``row @ state`` after the tick, at every sample."""
         slots, n = len(self.memory.filled), self.places.states
-        out, table = np.empty(self.samples), np.empty(slots * BLOCK * n)
-        filled, end = np.zeros(slots, dtype=np.int8), (self.samples - 1) * self.every + 1
-        sample_lifted(self.segments, self.memory, self.places, row, end, self.every, filled, table, out)
-        return out
+        out, table = np.empty((1, self.samples)), np.empty((1, slots * BLOCK * n))
+        filled, end = np.zeros((1, slots), dtype=np.int8), (self.samples - 1) * self.every + 1
+        sample_lifted(self.segments, self.memory, self.places, row[None], end, self.every, filled, table, out)
+        return out[0]
 
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Events of the plant and of the ticks, in time order."""

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.flow import dot, product, tall_product
-from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables, LiftedWorkspace
-from servotwin.simulation.lifted import TICKED, Segments
+from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables, LiftedWorkspace, changes_at_ends
+from servotwin.simulation.lifted import TICKED, VAST, Segments
 from servotwin.simulation.lifted_tables import LiftedMemory, Places
 
 
@@ -43,42 +43,71 @@ def _fill_output(
                 out[_at(c * FINE + j, k, n, samples_first)] = start[k] + rows[(j - 1) * n + k]
 
 
+@inlined
+def _sample(table: Array, base: int, begin: int, stop: int, stride: int, z: Array, out: Array) -> None:
+    """Samples from tick `begin`, where the state is `z`, up to `stop`, at most a block later."""
+    first, last = -(-begin // stride), -(-stop // stride)
+    if stride > 1:
+        for sample in range(first, last):
+            out[sample] = dot(table, base + (sample * stride - begin) * z.size, z)
+    elif last > first:
+        product(table, base, BLOCK, last - first, z, out[first:last])
+
+
+@bare
+def _prepare(
+    memory: LiftedMemory, places: Places, slot: int, row: Array, stride: int, filled: NDArray[np.int8], table: Array
+) -> None:
+    """Fill the table of an output in a slot, where that was not done yet."""
+    n = places.states
+    base, whole = slot * BLOCK * n, memory.change
+    if filled[slot] == 0:
+        for j in range(n):
+            whole[j] = row[j] if j != places.voltage else 0.0
+        for j in range(n):
+            whole[j] += row[places.voltage] * memory.voltage_rows[slot * n + j]
+        _fill_output(memory.lifted, memory.workspace, slot, whole, stride == 1, table[base : base + BLOCK * n])
+        filled[slot] = 1
+
+
 @bare
 def sample_lifted(
     segments: Segments,
     memory: LiftedMemory,
     places: Places,
-    row: Array,
+    rows: Array,
     end: int,
     stride: int,
     filled: NDArray[np.int8],
-    table: Array,
-    out: Array,
+    tables: Array,
+    traces: Array,
 ) -> None:
-    """``row @ z`` after the tick, at every `stride`-th tick up to `end`; `table` and `filled` have room for every slot
-    and hold those filled before."""
-    n, size = places.states, segments.size[0]
+    """``rows @ z`` after the tick, at every `stride`-th tick up to `end`; `tables` and `filled` have room for every
+    output and slot and hold those filled before."""
+    n, size, outputs = places.states, segments.size[0], len(rows)
     for s in range(size):
         begin = segments.tick[s]
         stop = segments.tick[s + 1] if s + 1 < size else end
         first, last = -(-begin // stride), -(-stop // stride)
         if last <= first:
             continue
-        slot, z = segments.slot[s], segments.state[s]
+        slot, start, z = segments.slot[s], segments.state[s], memory.change
         if slot == TICKED:
-            out[first] = dot(row, 0, z)
+            for o in range(outputs):
+                traces[o, first] = dot(rows[o], 0, start)
             continue
-        base = slot * BLOCK * n
-        if filled[slot] == 0:
-            whole = memory.change
-            for j in range(n):
-                whole[j] = row[j] if j != places.voltage else 0.0
-            for j in range(n):
-                whole[j] += row[places.voltage] * memory.voltage_rows[slot * n + j]
-            _fill_output(memory.lifted, memory.workspace, slot, whole, stride == 1, table[base : base + BLOCK * n])
-            filled[slot] = 1
-        if stride == 1:
-            product(table, base, BLOCK, last - first, z, out[first:last])
-        else:
-            for sample in range(first, last):
-                out[sample] = dot(table, base + (sample * stride - begin) * n, z)
+        parts = 1
+        if slot <= VAST:
+            slot, parts = VAST - slot, -(-(stop - begin) // BLOCK)
+        for o in range(outputs):
+            _prepare(memory, places, slot, rows[o], stride, filled[o], tables[o])
+        if parts > 1:
+            changes_at_ends(n, memory.lifted.jump_vast, slot, start, memory.out)
+        for part in range(parts):
+            for i in range(np.uint64(n)):
+                z[i] = start[i]
+                if part > 0:
+                    z[i] += memory.out[np.uint64(part - 1) * np.uint64(n) + i]
+            for o in range(outputs):
+                at = begin + part * BLOCK
+                _sample(tables[o], slot * BLOCK * n, at, min(stop, at + BLOCK), stride, z, traces[o])

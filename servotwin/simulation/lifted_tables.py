@@ -14,7 +14,7 @@ from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.flow import product
-from servotwin.hybrid.lifted import LiftedTables, LiftedWorkspace, add_square, cubic_weights, fill_slot
+from servotwin.hybrid.lifted import LiftedTables, LiftedWorkspace, add_square, cubic_weights, deepen_slot, fill_slot
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, TERMS, Tables
 
 LINEAR, LIMITED, RATE_LIMITED = 0, 1, 2
@@ -311,17 +311,18 @@ def slot_of(mode: int, active: bool, kind: int) -> int:
 
 @bare
 def fill_here(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory: LiftedMemory) -> None:
-    """Fill the slot of the plant's mode and the law's branch where a run is."""
+    """Fill the slot of the plant's mode and the law's branch where a run is; the vast scale where it is wanted."""
     mode, active, kind = place.at[1], place.at[2] == 1, place.at[3]
     n, w, slot = places.states, memory.workspace, slot_of(mode, active, kind)
-    guards = t.guard_count[mode]
+    guards, new = t.guard_count[mode], memory.filled[slot] == 0
     _fill_tick(loop, places, active, kind, memory)
     watches = _law_watches(loop, places, memory, guards)
     _fill_flow(t, loop, mode, memory)
     _fill_map(loop, places, memory)
     for guard in range(guards):
         _plant_watch(t, loop, places, mode, guard, memory)
-        _inside_tick(t, loop, places, mode, guard, memory)
+        if new:
+            _inside_tick(t, loop, places, mode, guard, memory)
         w.discrete[guard] = 0.0
     for watch in range(guards, watches):
         w.discrete[watch] = 1.0
@@ -334,6 +335,9 @@ def fill_here(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory:
             w.inside[watch * n * n + i] = 0.0
     for i in range(n):
         memory.voltage_rows[slot * n + i] = memory.tick_map[places.voltage * n + i] + (i == places.voltage)
-    deep = place.at[6] == 1
-    fill_slot(memory.lifted, slot, watches, deep, w)
-    memory.filled[slot] = 2 if deep else 1
+    if new:
+        fill_slot(memory.lifted, slot, watches, w)
+        memory.filled[slot] = 1
+    if place.at[6] == 1:
+        deepen_slot(memory.lifted, slot, watches, w)
+        memory.filled[slot] = 2

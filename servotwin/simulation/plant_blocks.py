@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,7 +147,9 @@ def run_plant_blocks(
 ) -> tuple[int, int, int, LawState]:
     """Run ticks `tick` .. `end` - 1; return status, the next tick, mode and law state. Stops early when a record is
     full."""
-    fresh, recent, unnoted = True, 0.0, 0
+    # A literal is a type of its own to numba: `begin_block` would be compiled once more for it.
+    fresh: Any = np.bool_(True)
+    recent, unnoted = 0.0, 0
     while tick < end:
         if record.size[1] > port.room or blocks.size[0] == len(blocks.tick):
             return FULL, tick, mode, state

@@ -166,11 +166,10 @@ def run_sampled(
         status = run_one(family, starts, k, places, end, worker, segments, record)
         if status != DONE:
             return status, at
-        for o in range(len(traces)):
-            sample_lifted(
-                segments, worker.lifted, places, family.rows[o], end + 1, stride, worker.filled[o], worker.outputs[o],
-                traces[o],
-            )  # fmt: skip
-            if len(results.figures) > 0:
+        sample_lifted(
+            segments, worker.lifted, places, family.rows, end + 1, stride, worker.filled, worker.outputs, traces
+        )
+        if len(results.figures) > 0:
+            for o in range(len(traces)):
                 figures_of(traces[o], starts.limits[k, o], tail, results.figures[k, o])
     return DONE, last

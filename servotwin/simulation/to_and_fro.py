@@ -47,16 +47,14 @@ def errors_to_and_fro(
     members, samples = members_of(servos, controllers, cases), samples_of(duration, sample_rate)
     errors = np.zeros(len(members.servos))
     for group in members.groups(("error",)):
-        count, _, modes, names = group.rows.shape
-        # The states are outputs too: the mean of each over the last sample alone is the state at the end of a move.
-        every = np.broadcast_to(np.eye(names)[:, None, :], (count, names, modes, names))
-        rows, place = np.concatenate([group.rows, every], axis=1), group.automata.first.index("reference")
-        options = FigureOptions(np.full((len(group.which), 1 + names), np.inf), 1)
+        place, ends = group.automata.first.index("reference"), np.empty_like(group.members.state)
+        options = FigureOptions(np.full((len(group.which), 1), np.inf), 1)
         starts, goals = group.members, (0.0, group.members.state[:, place].copy())
         for move in range(moves + 1):
-            figures = figures_of_family(group.automata, rows, starts, 1.0 / sample_rate, samples, options, threads)
+            figures = figures_of_family(
+                group.automata, group.rows, starts, 1.0 / sample_rate, samples, options, threads, ends
+            )
             errors[group.which] += figures.mean_size[:, 0] / moves if move > 0 else 0.0
-            ends = figures.last_mean[:, 1:].copy()
             ends[:, place] = goals[move % 2]
-            starts = group.restarted(ends)
+            starts = group.restarted(ends.copy())
     return errors.reshape(members.shape)

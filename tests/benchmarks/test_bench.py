@@ -21,7 +21,7 @@ QUICK = catalogue.Options(quick=True)
 
 
 def quiet():
-    return Console(file=io.StringIO(), width=100)
+    return Console(file=io.StringIO(), width=120)
 
 
 # The timing.
@@ -121,7 +121,17 @@ def test_json_holds_every_run(written):
             if "missing" in entry:
                 assert entry == {"name": row.name, "missing": row.missing}
                 continue
-            assert set(entry) == {"name", "median_s", "ratio", "ratios", "first_s", "rounds_s", "errors", "note"}
+            assert set(entry) == {
+                "name",
+                "median_s",
+                "ratio",
+                "ratios",
+                "first_s",
+                "rounds_s",
+                "processor_s",
+                "errors",
+                "note",
+            }
             assert entry["first_s"] > 0.0
             assert all(seconds > 0.0 for runs in entry["rounds_s"] for seconds in runs)
             assert set(entry["errors"]) == set(workload["units"])

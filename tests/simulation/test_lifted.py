@@ -10,7 +10,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave, as_pieces
 from servotwin.simulation import Simulation, simulate
 from servotwin.simulation.inputs import RunInputs
-from servotwin.simulation.lifted import TICKED
+from servotwin.simulation.lifted import TICKED, VAST
 from servotwin.simulation.lifted_engine import LiftedEngine
 
 PAPER = Servo.preset("paper")
@@ -54,6 +54,19 @@ def test_most_ticks_are_advanced_in_blocks() -> None:
     resting = SampledCase(PAPER, calm, inputs, 0.0, 500_001, 1).in_blocks()
     assert share_of_ticks(resting) < 0.01
     assert resting.segments.slot[resting.segments.size[0] - 2] != TICKED
+
+
+@pytest.mark.parametrize("every", [1, 100])
+def test_a_calm_run_in_vast_blocks_is_that_of_the_ticks(every: int) -> None:
+    law = PAPER.controller.replace(sample_rate=5e3, Ki=0.0)
+    wave = as_pieces(SquareWave(1e-3, 60.0), 60.0)
+    inputs = RunInputs(wave, PiecewiseCubic.constant(10.0 * DEGREE), None, 5e3 / every, 0.01)
+    case = SampledCase(PAPER, law, inputs, 0.0, 300_000 // every + 1, 0)
+    blocks = case.in_blocks()
+    slots = blocks.segments.slot[: blocks.segments.size[0]]
+    assert np.count_nonzero(slots <= VAST) > 20
+    assert slots.size < 1000
+    assert largest_difference(case, case.ticked(), blocks) < 1e-9
 
 
 @pytest.mark.parametrize("rate", [1e3, 5e3])

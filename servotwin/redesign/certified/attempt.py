@@ -33,8 +33,9 @@ _NOISE_BAND = (6.0, 1600.0)
 # The error that an input bias leaves is the same number on every plant, but for rounding.
 ROUNDED = 1.0 + 1e-6
 
-# Machines that are simulated before the rest: a setting that leaves some of the gaps oscillating shows it on them.
-_FIRST = 75
+# Machines that are simulated before the rest, in lots: a setting that leaves some of the gaps oscillating shows it on
+# them, and mostly on the first few.
+_LOTS = (12, 36, 75)
 
 
 @dataclass(frozen=True)
@@ -101,28 +102,32 @@ class Attempt:
     def __init__(self, question: Question, setting: Design) -> None:
         self.question, self.setting = question, setting
         self._seed = _seed(question.servo, question.uncertainty, setting, question.demands.seed)
+        self._measures: MachineMeasures | None = None
 
     def cannot_pass(self) -> bool:
         """True where a part shows already that the certificate would not meet the demands."""
-        question, demands = self.question, self.question.demands
-        law, allowed = self.setting.controller, question.largest_error(self.setting)
-        if margins_missing(self._loop, law.sample_rate, demands) or self._loop.crossover == 0.0:
+        demands, rate = self.question.demands, self.setting.controller.sample_rate
+        if margins_missing(self._loop, rate, demands) or self._loop.crossover == 0.0:
             return True
-        few = self._first
-        most = demands.machines - int(np.sum(~few.settled))
-        if share_at_least(most, demands.machines, demands.confidence) < demands.settled:
-            return True
-        if few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot:
+        if any(self._refused_by(self._measured(lot)) for lot in _LOTS):
             return True
         if self._ramp.settled < 1.0:
             return True
         return self._beyond is not None and self._beyond.settled < 1.0
 
+    def _refused_by(self, few: MachineMeasures) -> bool:
+        """True where some of the machines show already that a demand is not met."""
+        demands, allowed = self.question.demands, self.question.largest_error(self.setting)
+        most = demands.machines - int(np.sum(~few.settled))
+        if share_at_least(most, demands.machines, demands.confidence) < demands.settled:
+            return True
+        return bool(few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot)
+
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
         question, setting, loop = self.question, self.setting, self._loop
         demands, known, members, law = question.demands, question.uncertainty, self._members, unfed(setting.controller)
-        measures = self._first if self._rest is None else joined(self._first, self._rest)
+        measures = self._measured(members.count)
         settled = int(measures.settled.sum())
         ends = (np.array(known.input_bias), np.array(known.friction), known.step[1])
         return Certificate(
@@ -170,18 +175,16 @@ class Attempt:
         question = self.question
         return draw_independently(question.servo, question.uncertainty, question.demands.machines, self._seed)
 
-    @cached_property
-    def _first(self) -> MachineMeasures:
-        return self._measured(0, _FIRST)
-
-    @cached_property
-    def _rest(self) -> MachineMeasures | None:
-        return self._measured(_FIRST, self._members.count) if self._members.count > _FIRST else None
-
-    def _measured(self, first: int, last: int) -> MachineMeasures:
-        members = self._members
+    def _measured(self, count: int) -> MachineMeasures:
+        """Measures of the first machines, at least so many or all; each is simulated once."""
+        before, members = self._measures, self._members
+        done, last = (0 if before is None else len(before.cost)), min(count, members.count)
+        if before is not None and last <= done:
+            return before
         largest = float(members.step.max())
-        return assess([self.setting], members.part(first, last), self.question.trial, largest)[0]
+        (new,) = assess([self.setting], members.part(done, last), self.question.trial, largest)
+        self._measures = new if before is None else joined(before, new)
+        return self._measures
 
     @cached_property
     def _ramp(self) -> RampResult:

@@ -20,7 +20,7 @@ from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
-from servotwin.redesign.certified.screening import Screening
+from servotwin.redesign.certified.screening import Screening, is_plain
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
@@ -80,7 +80,9 @@ def certify(
     in_force = None if running is None else with_feedforward(running, feedforward)
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
     attempts: list[Attempt] = []
-    for setting in _shortlist(_ranked_in_stages(question, candidates, in_force), demands.attempts):
+    screening = Screening(question)
+    ranked = _ranked_in_stages(question, screening, candidates, in_force)
+    for setting in _shortlist(screening, ranked, demands.attempts):
         attempt = Attempt(question, setting)
         attempts.append(attempt)
         if attempt.cannot_pass():
@@ -121,15 +123,15 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
-def _shortlist(ranked: Iterator[Design], attempts: int) -> Iterator[Design]:
+def _shortlist(screening: Screening, ranked: Iterator[Design], attempts: int) -> Iterator[Design]:
     """The first candidates, then as many without integral action and dead zone, which settle most surely."""
     plain = 0
     for place, setting in enumerate(ranked):
-        is_plain = not setting.controller.Ki and not setting.tolerance
-        if place < attempts or (is_plain and plain < attempts):
+        if place < attempts or (is_plain(setting) and plain < attempts):
             yield setting
-        plain += is_plain
-        if place + 1 >= attempts and plain >= attempts:
+        plain += is_plain(setting)
+        screening.plain_only = place + 1 >= attempts
+        if screening.plain_only and plain >= attempts:
             return
 
 
@@ -202,13 +204,15 @@ def _gains(law: Controller) -> tuple[float, float, float]:
     return law.Kp, law.Kd, law.Tf
 
 
-def _ranked_in_stages(question: Question, candidates: list[Design], running: Design | None) -> Iterator[Design]:
+def _ranked_in_stages(
+    question: Question, screening: Screening, candidates: list[Design], running: Design | None
+) -> Iterator[Design]:
     """Candidates in the order of their costs: integral action is tried with the own gains and the best laws without it.
 
     The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
     would otherwise take turns, whenever the evidence moves a little.
     """
-    screening, own = Screening(question), _gains(question.servo.controller)
+    own = _gains(question.servo.controller)
     plain = [setting for setting in candidates if not setting.controller.Ki]
     if plain and len(plain) < len(candidates):
         fed = _velocities(screening.ranked(plain), own)
@@ -251,10 +255,7 @@ def _by_moves(
     screening: Screening, candidates: list[Design], always: list[Design], running: Design | None
 ) -> Iterator[Design]:
     """The first candidates and those of `always` by their cost while they move to and fro, then the others."""
-    ranked = screening.ranked(candidates)
-    settings = dict.fromkeys([*islice(ranked, _MOVED), *always])
+    settings = dict.fromkeys([*islice(screening.ranked(candidates, passing=True), _MOVED), *always])
     costs = screening.expected_costs([each for each in settings if not screening.fails(each)])
-    first = sorted(costs, key=lambda each: costs[each] / (_WORTH if each == running else 1.0))
-    yield from first
-    yield from (each for each in settings if each not in costs)
-    yield from (each for each in ranked if each not in settings)
+    yield from sorted(costs, key=lambda each: costs[each] / (_WORTH if each == running else 1.0))
+    yield from (each for each in screening.ranked(candidates) if each not in costs)

@@ -2,11 +2,11 @@
 
 A candidate is simulated on the costliest few of the machines first. What it costs on all of them is at least what it
 would cost if the rest cost nothing, so that one whose least cost is beyond the costs of others waits, mostly for ever.
+Next come the machines on which other candidates failed: one that fails there is behind all that do not.
 """
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -22,8 +22,13 @@ from servotwin.redesign.design import Design
 _FAST = 10.0
 # Of the machines, those on which every candidate is simulated: the percentile of the cost needs the two or three worst.
 _FIRST = 0.125
-# Candidates that are simulated on the other machines at once.
-_AT_ONCE = 2
+# Candidates that are simulated on the other machines at once, and machines on which others failed, before the rest.
+_AT_ONCE, _HARDEST = 2, 4
+
+
+def is_plain(setting: Design) -> bool:
+    """True without integral action and dead zone."""
+    return not setting.controller.Ki and not setting.tolerance
 
 
 @dataclass(frozen=True, order=True)
@@ -36,42 +41,57 @@ class _Rank:
 
 
 class Screening:
-    """Candidates of one question on the few machines that rank them; each is simulated once on each of them."""
+    """Candidates of one question on the few machines that rank them; each is simulated once on each of them.
+
+    Attributes
+    ----------
+    plain_only : bool
+        Set to True while candidates are ranked, it drops those with integral action or a dead zone.
+    """
 
     def __init__(self, question: Question) -> None:
         demands, known = question.demands, question.uncertainty
-        self.question = question
+        self.question, self.plain_only = question, False
         self._moves = known.replace(step=known.usual_step or known.step)
         self._members = draw(question.servo, self._moves, demands.screened, demands.conditions, demands.seed)
         self._largest = float(self._members.step.max())
+        self._first = max(1, round(_FIRST * self._members.count))
         self._order: NDArray[np.int64] | None = None
         self._known: dict[Design, MachineMeasures] = {}
+        # Machines on which each setting was simulated; settings that missed a demand on each machine.
+        self._places: dict[Design, NDArray[np.int64]] = {}
+        self._misses = np.zeros(self._members.count, dtype=np.int64)
 
-    def ranked(self, candidates: Sequence[Design]) -> Iterator[Design]:
-        """Candidates that meet the demands on the machines first, then by cost."""
+    def ranked(self, candidates: Sequence[Design], passing: bool = False) -> Iterator[Design]:
+        """Candidates that meet the demands on the machines first, then by cost; `passing`: no others."""
         self._start(candidates)
         waiting = [(self._rank(setting, place), setting) for place, setting in enumerate(candidates)]
-        heapq.heapify(waiting)
         while waiting:
-            _, setting = waiting[0]
-            if self._is_whole(setting):
-                heapq.heappop(waiting)
-                yield setting
+            if self.plain_only:
+                waiting = [each for each in waiting if is_plain(each[1])]
+            waiting.sort()
+            if passing and waiting and waiting[0][0].fails:
+                return
+            if waiting and self._is_whole(waiting[0][1]):
+                yield waiting.pop(0)[1]
                 continue
-            due = [waiting[0][1]]
-            due += [each for _, each in heapq.nsmallest(_AT_ONCE, waiting)[1:] if not self._is_whole(each)]
+            due = [each for _, each in waiting[:1]]
+            due += [each for _, each in waiting[1:_AT_ONCE] if not self._is_whole(each)]
             self._finish(due)
             waiting = [(self._rank(each, rank.place) if each in due else rank, each) for rank, each in waiting]
-            heapq.heapify(waiting)
 
     def fails(self, setting: Design) -> bool:
         """True where a setting misses a demand on the machines."""
-        self._complete(setting)
+        self._start([setting])
+        while not (self._is_whole(setting) or self._rank(setting, 0).fails):
+            self._finish([setting])
         return self._rank(setting, 0).fails
 
     def cost(self, setting: Design) -> float:
         """s: 95th percentile over the machines."""
-        self._complete(setting)
+        self._start([setting])
+        while not self._is_whole(setting):
+            self._finish([setting])
         return self._rank(setting, 0).cost
 
     def expected_costs(self, settings: Sequence[Design]) -> dict[Design, float]:
@@ -88,36 +108,48 @@ class Screening:
         costs = [float(cost.mean()) + question.price(each) for each, cost in zip(settings, moves, strict=True)]
         return dict(zip(settings, costs, strict=True))
 
-    def _complete(self, setting: Design) -> None:
-        self._start([setting])
-        if not self._is_whole(setting):
-            self._finish([setting])
-
     def _start(self, candidates: Sequence[Design]) -> None:
         """Simulate the candidates that are new: the first of all on every machine, which tells the costliest ones."""
         new = [setting for setting in dict.fromkeys(candidates) if setting not in self._known]
         if new and self._order is None:
-            self._order = np.arange(self._members.count)
-            self._finish(new[:1])
+            every = np.arange(self._members.count)
+            self._simulate(new[:1], every)
             self._order = np.argsort(-self._known[new[0]].cost.ravel(), kind="stable")
             new = new[1:]
         if new:
-            first = max(1, round(_FIRST * self._members.count))
-            self._known |= dict(zip(new, self._simulated(new, 0, first), strict=True))
+            assert self._order is not None
+            self._simulate(new, self._order[: self._first])
 
     def _finish(self, settings: list[Design]) -> None:
-        """Simulate settings on the machines on which they were not yet."""
-        done = [self._known.get(setting) for setting in settings]
-        first = 0 if done[0] is None else done[0].cost.size
-        rest = self._simulated(settings, first, self._members.count)
-        for setting, before, after in zip(settings, done, rest, strict=True):
-            self._known[setting] = after if before is None else joined(before, after)
+        """Simulate settings on machines on which they were not yet: those on which most others failed, then the
+        rest."""
+        alike: dict[bytes, list[Design]] = {}
+        for setting in settings:
+            alike.setdefault(self._places[setting].tobytes(), []).append(setting)
+        for group in alike.values():
+            done = self._places[group[0]]
+            rest = np.setdiff1d(np.arange(self._members.count), done)
+            hard = rest[np.argsort(-self._misses[rest], kind="stable")][:_HARDEST]
+            hard = hard[self._misses[hard] > 0]
+            # Every call has costs of its own: two stages, not more.
+            self._simulate(group, hard if hard.size and done.size == self._first else rest)
 
-    def _simulated(self, settings: list[Design], first: int, last: int) -> list[MachineMeasures]:
-        """Measures on the machines at places first .. last - 1 of the order."""
-        assert self._order is not None
-        machines = self._members.each(self._order[first:last])
-        return assess([self._quick(each) for each in settings], machines, self.question.trial.half, self._largest)
+    def _simulate(self, settings: list[Design], places: NDArray[np.int64]) -> None:
+        """Simulate settings on the machines at these places."""
+        machines = self._members.each(places)
+        quick = [self._quick(each) for each in settings]
+        for setting, new in zip(
+            settings, assess(quick, machines, self.question.trial.half, self._largest), strict=True
+        ):
+            before = self._known.get(setting)
+            self._known[setting] = new if before is None else joined(before, new)
+            self._places[setting] = places if before is None else np.concatenate([self._places[setting], places])
+            self._misses[places] += (~new.settled | self._is_off(setting, new)).ravel()
+
+    def _is_off(self, setting: Design, few: MachineMeasures) -> NDArray[np.bool_]:
+        """True for machines on which the error in the end or the overshoot is larger than demanded."""
+        off = few.tail > ROUNDED * self.question.largest_error(setting)
+        return np.asarray(off | (few.overshoot > self.question.demands.overshoot))
 
     def _quick(self, setting: Design) -> Design:
         """The setting as it is ranked: in continuous time where the rate is so high that the order is the same there.
@@ -135,8 +167,7 @@ class Screening:
     def _rank(self, setting: Design, place: int) -> _Rank:
         demands, few = self.question.demands, self._known[setting]
         most = self._members.count - int(np.sum(~few.settled))
-        fails = most / self._members.count < demands.settled or bool(few.overshoot.max() > demands.overshoot)
-        fails = fails or bool(few.tail.max() > ROUNDED * self.question.largest_error(setting))
+        fails = most / self._members.count < demands.settled or bool(self._is_off(setting, few).any())
         missing = self._members.count - few.cost.size
         costs = np.concatenate([few.cost.ravel(), np.zeros(missing)])
         return _Rank(fails, self.question.cost(setting, costs), place)
