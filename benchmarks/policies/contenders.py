@@ -45,7 +45,8 @@ def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
     own, policies = model.controller, {}
     for setting in candidates_of(model, known, demands, disturbed=True, noisy=False):
         law = setting.controller
-        policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}"] = setting
+        fed = f", velocity x {law.velocity_feedforward * model.p / model.k_B:g}" if law.velocity_feedforward else ""
+        policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}{fed}"] = setting
     for share in (1.0 / 6.0, 0.5, 1.0):
         width = model.tolerance_for(share * known.gap[1], 1.5)
         policies[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)
