@@ -8,8 +8,9 @@ PACKAGES ?= yes
 # Every process of a run would otherwise compile all modules again, and the tests' assertions.
 unexport PYTHONDONTWRITEBYTECODE
 
-# A file's tests run in one process, in the order of tests/conftest.py: what they share is computed once.
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+# A file's tests run in one process, in the order of tests/conftest.py: what they share is computed once. Three processes on two
+# cores, because some tests wait for machines that run by the clock.
+PYTEST := $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 
 .PHONY: help demo reproduce reference check test fuzz bench lint format lock clean packages
 
