@@ -62,7 +62,8 @@ def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
     learnt = run_machine(machine, "bias", MODEL, contender("certified", MODEL, KNOWN))
     constant = run_machine(machine, "bias", MODEL, Contender(None, CALM))
     assert constant.tail == pytest.approx(abs(machine.input_bias / CALM.controller.Kp), rel=1e-2)
-    assert learnt.tail < 0.05 * constant.tail
+    # Between the two redesigns after the step it rests in the zone that stops the integral.
+    assert learnt.tail < min(1e-5, 0.15 * constant.tail)
     assert learnt.cost < constant.cost
 
 

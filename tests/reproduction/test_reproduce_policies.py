@@ -59,7 +59,8 @@ def test_the_certified_twin_takes_the_bias_away_and_its_fallback_set_alone_takes
     start = certified.run.changes[0]
     assert start.gains.integral_only
     zone = start.gains.leave * start.tolerance
-    assert certified.steps[1].error < alone.steps[1].error < zone < 0.25 * 0.05 / start.gains.Kp
+    assert certified.steps[1].error < alone.steps[1].error < zone < 0.05 / start.gains.Kp
+    assert alone.steps[1].error < 0.25 * 0.05 / start.gains.Kp
     assert certified.run.changes[-1].gains.feedforward == pytest.approx(-0.05, abs=2e-4)
     assert not outcomes["paper"].steps[1].settled
 

@@ -162,7 +162,7 @@ def test_retention_deletes_old_bodies_except_those_of_windows_that_led_to_an_upd
     store.commit([outcome(claim, led, *every)], 201.0)
     pauses: list[None] = []
     assert delete_old_bodies(store, 109.0, 3, lambda: pauses.append(None)) == RetentionResult(
-        emptied=7, bytes=7000, kept=2
+        emptied=7, bytes=7000, retained=2
     )
     assert pauses
     bodies = {n: store.window("a", "boot", n).body for n in range(10)}
