@@ -205,7 +205,7 @@ def updated(
 def _contradicted(
     before: LearntMachine, settings: LearningSettings, reading: MachineReading, now: float
 ) -> LearntMachine:
-    """What is known after a window that only other numbers explain."""
+    """The learnt machine after a window that only other numbers explain: the alarm, and the rival."""
     rival = LearntMachine(reading.factors, reading.covariance, now, softness=reading.softness)
     if before.rival is not None and _distance(before.rival.prior(settings, now), reading) <= _AGREEMENT:
         rival = replace(rival, windows=before.rival.windows + 1)

@@ -170,11 +170,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
-        stated = stated_machine(model.settings)
-        wear, rejection = state.wear.update(trends, message.boot, estimate, arrived, learning, stated)
-        if model.motor is not None and decoded.window is not None:
-            wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
-        state = replace(state, wear=wear)
+        state, rejection = _learn(model, state, decoded, estimate, arrived)
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
     records += [AlarmRecord(message, sentence) for sentence in alarms(model.settings, before, state.wear, estimate)]
@@ -210,6 +206,18 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
     return StepResult(sent.state, sent.messages + others, all_records)
+
+
+def _learn(
+    model: TwinModel, state: TwinState, decoded: DecodedWindow, estimate: GapEstimate, arrived: float
+) -> tuple[TwinState, str]:
+    """Add a window to trend, machine and motor; return the reason why the trend rejected it, or an empty string."""
+    settings, message = model.settings, decoded.message
+    stated = stated_machine(settings)
+    wear, rejection = state.wear.update(settings.trend, message.boot, estimate, arrived, settings.learning, stated)
+    if model.motor is not None and decoded.window is not None:
+        wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
+    return replace(state, wear=wear), rejection
 
 
 def _ask(

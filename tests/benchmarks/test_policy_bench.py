@@ -64,6 +64,8 @@ def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
     assert constant.tail == pytest.approx(abs(machine.input_bias / CALM.controller.Kp), rel=1e-2)
     # Between the two redesigns after the step it rests in the zone that stops the integral.
     assert learnt.tail < min(1e-5, 0.15 * constant.tail)
+    # Without integral action only a bias that is known meets the demands.
+    assert learnt.integral == 0.0
     assert learnt.cost < constant.cost
 
 
