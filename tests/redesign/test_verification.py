@@ -1,15 +1,13 @@
-"""Verification of the loop that runs: its own rate, the worst plant, bounds of shares, no units, what is refused."""
+"""Verification of the loop that runs: its own rate, the worst plant, bounds of shares, what is refused."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import fields, replace
+from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
-from scaling import scaled
 from scipy import stats
 
 from servotwin.commissioning.edge_settings import guarding
@@ -360,57 +358,3 @@ def test_a_loop_that_meets_the_circle_criterion_has_no_limit_cycle_in_any_gap() 
         settled, hunting = assess([Design(calm), Design(OWN)], members, Trial(200.0, 20.0))
         assert settled.at_rest.all()
         assert not hunting.at_rest.any()
-
-
-# --- no units
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    ("time", "length", "voltage"),
-    [(1e-3, 1.0, 1.0), (1e3, 1.0, 1.0), (1.0, 1e-6, 1.0), (1.0, 1e6, 1.0), (1.0, 1.0, 1e-2), (10.0, 1e-3, 1e2)],
-)
-def test_another_unit_changes_no_verdict_and_scales_the_setting(time: float, length: float, voltage: float) -> None:
-    here = certify(SERVO, NARROW, SMALL)
-    there = certify(
-        scaled(SERVO, time, length, voltage),
-        NARROW.replace(
-            step=tuple(length * end for end in NARROW.step),
-            input_bias=tuple(voltage * end for end in NARROW.input_bias),
-        ),
-        SMALL,
-    )
-    assert isinstance(here, Certificate)
-    assert isinstance(there, Certificate)
-    law, other = here.setting.controller, there.setting.controller
-    assert other.Kp == pytest.approx(law.Kp * voltage / length, rel=1e-9)
-    assert other.Kd == pytest.approx(law.Kd * voltage * time / length, rel=1e-9)
-    assert other.Tf == pytest.approx(law.Tf * time, rel=1e-9)
-    assert there.Ms == pytest.approx(here.Ms, rel=1e-6)
-    assert there.loop is not None
-    assert here.loop is not None
-    assert there.loop.Ms_worst == pytest.approx(here.loop.Ms_worst, rel=1e-6)
-    assert there.looked_at == here.looked_at
-
-
-@pytest.mark.parametrize("time", [1e-2, 10.0])
-def test_a_slower_or_faster_servo_has_a_fallback_set(time: float) -> None:
-    servo = scaled(SERVO, time, 1.0, 1.0)
-    known = Uncertainty(input_bias=(-0.1, 0.1))
-    assert isinstance(certify(servo, known, replace(SMALL, scales=(0.5,), shapes=((1.5, 0.85),))), Certificate)
-    assert trial_for(servo, known, Demands()).duration == pytest.approx(
-        time * trial_for(SERVO, known, Demands()).duration, rel=1e-6
-    )
-
-
-# --- stored ones
-
-
-def test_a_certificate_of_the_version_before_is_read() -> None:
-    found = certify(SERVO, NARROW, SMALL)
-    assert isinstance(found, Certificate)
-    new = ("settled_least", "confidence", "loop", "beyond", "ramp", "rate", "delay", "error_per_volt", "lag")
-    document = {name: value for name, value in msgspec.to_builtins(found).items() if name not in new}
-    read = msgspec.convert(document, Certificate)
-    assert read.loop is None
-    assert all(getattr(read, f.name) == getattr(found, f.name) for f in fields(read) if f.compare and f.name not in new)
