@@ -39,7 +39,7 @@ def assert_equal_but_for_rounding(found, expected, part=1e-12):
 @pytest.mark.parametrize("factor", [1, 2, 3, 9, 12, 40])
 def test_one_pass_gives_what_response_and_decimation_give(servo, factor):
     model, reduce, angles = response(servo, RATE), decimation(factor), walk(3)
-    reduced = ReducedResponse.of(model, reduce)
+    reduced = ReducedResponse(model, reduce)
     assert_equal_but_for_rounding(reduced.respond(angles), reduce.rows(model.respond(angles)))
     assert_equal_but_for_rounding(reduced.velocities(angles), reduce.rows(model.velocities(angles)))
     assert_equal_but_for_rounding(reduced.free(angles.shape[1]), reduce.rows(model.free(angles.shape[1])))
@@ -74,6 +74,6 @@ def test_motions_are_the_changes_of_the_position(servo):
     shares = 1e-4 * np.random.default_rng(1).standard_normal(len(near.model.free(angle.size)))
     motions = near.motions(screw, near.model.respond(screw)[0], shares)
     for row in range(len(FACTORS)):
-        there = ReducedResponse.of(response(adapted(servo, factors + STEP * np.eye(4)[row]), RATE), reduce)
+        there = ReducedResponse(response(adapted(servo, factors + STEP * np.eye(4)[row]), RATE), reduce)
         ahead, here = (one.respond(screw)[0] + shares @ one.free(angle.size) for one in (there, near.model))
         assert np.abs(motions[row] - (ahead - here) / STEP).max() <= 1e-7 * np.abs(motions).max()

@@ -8,8 +8,9 @@ at the full rate waits for its own result at every angle. The free motions are g
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -56,22 +57,25 @@ class ReducedResponse:
     ----------
     response : Response
     decimation : Decimation
-    position, velocity : BlockWeights, optional
-        None: the decimation's factor is 1.
     """
 
     response: Response
     decimation: Decimation
-    position: BlockWeights | None
-    velocity: BlockWeights | None
 
-    @classmethod
-    def of(cls, model: Response, reduce: Decimation) -> ReducedResponse:
-        """Join a response and a decimation."""
-        if reduce.factor == 1:
-            return cls(model, reduce, None, None)
-        readouts = model.position, model.velocity
-        return cls(model, reduce, *(BlockWeights.of(model.decay, readout, reduce) for readout in readouts))
+    @cached_property
+    def position(self) -> BlockWeights | None:
+        """Weights of the positions; None: the decimation's factor is 1."""
+        return self._weights(self.response.position)
+
+    @cached_property
+    def velocity(self) -> BlockWeights | None:
+        """Weights of the velocities; None: the decimation's factor is 1."""
+        return self._weights(self.response.velocity)
+
+    def _weights(self, readout: Readout) -> BlockWeights | None:
+        if self.decimation.factor == 1:
+            return None
+        return BlockWeights.of(self.response.decay, readout, self.decimation)
 
     def respond(self, inputs: Array) -> Array:
         """(k, m) reduced positions (m) for angles (k, n) (rad) at the full rate; see `Response.respond`."""
@@ -92,14 +96,33 @@ def free_motions(exponents: Complex, reduce: Decimation, samples: int) -> Comple
     factor = reduce.factor
     if factor == 1:
         return geometric(exponents, samples)
-    averages = np.exp(np.outer(exponents, np.arange(AVERAGES * factor))) @ reduce.taps
-    return np.asarray(averages[:, None] * geometric(factor * exponents, samples // factor - AVERAGES + 1))
+    return np.asarray(
+        _averages(exponents, factor)[:, None] * geometric(factor * exponents, samples // factor - AVERAGES + 1)
+    )
+
+
+def summed_motions(exponents: Complex, shares: Complex, reduce: Decimation, samples: int) -> Array:
+    """(s, m) real parts of the `free_motions` of some structures (s, modes), summed with the modes' shares (modes,)."""
+    factor = reduce.factor
+    count = samples if factor == 1 else samples // factor - AVERAGES + 1
+    # As in `geometric`, a product of two exponentials; summing first leaves a product of two small matrices.
+    width = max(1, math.isqrt(count))
+    height = -(-count // width)
+    far = np.exp((factor * width) * exponents[:, None, :] * np.arange(height)[:, None])
+    near = np.exp(factor * exponents[:, :, None] * np.arange(width))
+    weights = shares if factor == 1 else shares * _averages(exponents, factor)[:, None, :]
+    return np.asarray(((far * weights) @ near).real.reshape(len(exponents), -1)[:, :count])
+
+
+def _averages(exponents: Complex, factor: int) -> Complex:
+    """Weighted sums of exp(exponent i) under the taps of a decimation, which are `AVERAGES` means, one after another."""
+    return np.asarray((np.expm1(factor * exponents) / (factor * np.expm1(exponents))) ** AVERAGES)
 
 
 @lru_cache(maxsize=64)
 def reduced_response(model: Response, reduce: Decimation) -> ReducedResponse:
-    """Return `ReducedResponse.of` the two, made once."""
-    return ReducedResponse.of(model, reduce)
+    """Return the `ReducedResponse` of the two, made once."""
+    return ReducedResponse(model, reduce)
 
 
 def _run(inputs: Array, weights: BlockWeights) -> Array:

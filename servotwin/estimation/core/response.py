@@ -184,7 +184,7 @@ def _hold(poles: Complex, interval: float) -> tuple[Complex, Complex]:
 
 
 def _parts(values: Complex) -> Array:
-    return np.column_stack([values.real, values.imag])
+    return np.ascontiguousarray(values).view(float).reshape(-1, 2)
 
 
 def _respond(inputs: Array, decay: Array, readout: Readout) -> Array:

@@ -81,10 +81,11 @@ def burg(series: Array, most: int) -> Autoregression:
 
 
 def with_noise_restored(residual: Array, columns: Array, root: Array, scale: float = 1.0) -> Array:
-    """(2, n) equally likely series of the noise in a residual (n,), with what the fit may have taken put back.
+    """(1 + d, n) series for `burg` of the noise in a residual (n,), with what the fit may have taken put back.
 
     A fit takes noise away with every parameter, and most where the gap shows, so that the residual looks quieter there
-    than the noise was. It is put back one standard deviation up and down along every direction of the parameters.
+    than the noise was. It is put back one standard deviation up and down along every direction of the parameters: 2 d
+    equally likely series, whose products are those of the residual and of what is put back, without mixed ones.
 
     Parameters
     ----------
@@ -97,8 +98,7 @@ def with_noise_restored(residual: Array, columns: Array, root: Array, scale: flo
     scale : float
         Standard deviation of the whitened noise.
     """
-    restored = scale * math.sqrt(len(root)) * (root @ columns)
-    return np.vstack([residual + restored, residual - restored])
+    return math.sqrt(1.0 + len(root)) * np.vstack([residual, scale * (root @ columns)])
 
 
 def _criteria(power: Array, size: int) -> Array:

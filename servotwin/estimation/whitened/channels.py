@@ -44,13 +44,17 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
     if span == 0.0:
         return f"{name} is constant at {factor * samples[0]:.6g} {unit}: nothing moved, or the sensor is dead"
     index = int(np.argmax(steps))
-    usual = float(np.partition(steps, -20)[-20]) if steps.size > 400 else math.inf
-    if steps[index] > _JUMP * max(usual, 1e-9 * span) and steps[index] > 0.2 * span:
+    if steps[index] > 0.2 * span and steps[index] > _JUMP * max(_usual(steps), 1e-9 * span):
         return (
             f"{name} jumps by {factor * steps[index]:.6g} {unit} between samples {index} and {index + 1}: a wrapped "
             "encoder, or samples are missing"
         )
     return _saturation(name, samples, steps, factor, unit) or _repeating(name, steps)
+
+
+def _usual(steps: Array) -> float:
+    """Usual fastest motion: only few steps are larger."""
+    return float(np.partition(steps, -20)[-20]) if steps.size > 400 else math.inf
 
 
 def _repeating(name: str, steps: Array) -> str:
@@ -63,10 +67,12 @@ def _repeating(name: str, steps: Array) -> str:
     """
     still = np.concatenate([[False], steps == 0.0, [False]])
     begins, ends = np.flatnonzero(still[1:] & ~still[:-1]), np.flatnonzero(still[:-1] & ~still[1:])
+    long = ends - begins >= _REPEATED - 1
+    if not np.any(long):
+        return ""
     moving = np.flatnonzero(steps > 0.0)
     if moving.size < 2 or np.median(np.diff(moving)) > 1.0:
         return ""
-    long = ends - begins >= _REPEATED - 1
     least = max(_ABRUPT * float(np.min(steps[steps > 0.0])), _STEEP * float(np.max(steps)))
     for begin, end in zip(begins[long], ends[long], strict=True):
         before, after = steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]
@@ -84,12 +90,12 @@ def _abrupt(side: Array, least: float) -> bool:
 
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
     """Describe samples that stay at an extreme value which was reached at speed; empty without them."""
-    run = np.abs(samples[_RUN:] - samples[:-_RUN])
-    fastest = float(np.partition(run, -5)[-5])
     for extreme in (float(samples.max()), float(samples.min())):
         at = np.flatnonzero(samples == extreme)
         if at.size < _FLAT:
             continue
+        run = np.abs(samples[_RUN:] - samples[:-_RUN])
+        fastest = float(np.partition(run, -5)[-5])
         entries = at[(at >= _RUN) & ~np.isin(at - 1, at)]
         reached = [entry for entry in entries if np.all(steps[entry - _RUN : entry] > 0.0)]
         if any(run[entry - _RUN] > _STEEP * fastest for entry in reached):

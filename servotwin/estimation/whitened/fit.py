@@ -155,7 +155,8 @@ def refine(
         table = reduction.table(fit.point)
         noise = estimate_noise(reduction, table, noise, order, number >= _PLAIN)
         reduction = reduction.growing(noise, table)
-        misfit = reduction.misfit(noise, fit.point)
+        # In a growing gap the rate, and with it the table, has changed.
+        misfit = reduction.misfit(noise, fit.point, None if reduction.growth else table)
         last = number == passes - 1
         starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
         fit = _best_of(misfit, starts, largest, tolerance)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.estimation.core.decimation import Decimation
-from servotwin.estimation.core.reduced import ReducedResponse, free_motions, reduced_response
+from servotwin.estimation.core.reduced import ReducedResponse, reduced_response, summed_motions
 from servotwin.estimation.core.response import Complex, Readout, Response
 from servotwin.estimation.core.variants import variants
 from servotwin.plant.servo import Servo
@@ -55,7 +55,7 @@ class Neighbour:
         mine, theirs = model.response.poles, other.poles
         if theirs.size != mine.size:
             other = with_modes_at_rest(other, np.argmin(np.abs(theirs[None, :] - mine[:, None]), axis=1))
-        return cls(ReducedResponse.of(other, model.decimation), other.poles, step, row)
+        return cls(ReducedResponse(other, model.decimation), other.poles, step, row)
 
 
 def with_modes_at_rest(model: Response, modes: Indices) -> Response:
@@ -89,12 +89,11 @@ def motions(model: ReducedResponse, others: Sequence[Neighbour], screw: Array, a
     weights : (2 modes,) array
         Fitted shares of the free motions.
     """
-    modes, samples = model.response.poles.size, screw.shape[1]
+    modes = model.response.poles.size
     shares = weights[:modes].astype(complex)
     shares[np.abs(model.response.poles.imag) > 0.0] -= 1j * weights[modes:]
-    poles: Complex = np.concatenate([model.response.poles, *(other.poles for other in others)])
-    free = free_motions(poles * model.response.interval, model.decimation, samples)
-    changes = (shares @ free.reshape(1 + len(others), modes, -1)).real
+    poles: Complex = np.array([model.response.poles, *(other.poles for other in others)])
+    changes = summed_motions(poles * model.response.interval, shares, model.decimation, screw.shape[1])
     moved = [
         (other.reduced.respond(screw)[0] - answer + change - changes[0]) / other.step
         for other, change in zip(others, changes[1:], strict=True)

@@ -215,11 +215,10 @@ class Reduction:
         basis = _fixed_basis(self.reduced, self.theta_m.size, self.offset is None)
         return Misfit(self.theta_m, self.position - known, basis, self.reduced, rate=self.rate)
 
-    def misfit(self, noise: Autoregression, point: Point) -> Misfit:
-        """The misfit in noise of a known kind, its nuisances taken at a point."""
-        table = self.table(point)
-        table[RESIDUAL] = self.position
-        rows = self.prepared(noise, np.delete(table, [GAP, PLACE], axis=0), 1)
+    def misfit(self, noise: Autoregression, point: Point, table: Array | None = None) -> Misfit:
+        """The misfit in noise of a known kind, its nuisances taken at a point; `table`: that of the point, if known."""
+        nuisances = (self.table(point) if table is None else table)[CONSTANT:]
+        rows = self.prepared(noise, np.vstack([self.position, nuisances]), 1)
         extra = rows.shape[1] - self.position.size
         basis = orthonormal(rows[1:])
         return Misfit(self.theta_m, rows[0], basis, self.reduced, noise, extra, self.rate)
