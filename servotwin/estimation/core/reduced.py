@@ -115,7 +115,7 @@ def summed_motions(exponents: Complex, shares: Complex, reduce: Decimation, samp
 
 
 def _averages(exponents: Complex, factor: int) -> Complex:
-    """Weighted sums of exp(exponent i) under the taps of a decimation, which are `AVERAGES` means, one after another."""
+    """Weighted sums of exp(exponent i) under the taps of a decimation: `AVERAGES` means, one after another."""
     return np.asarray((np.expm1(factor * exponents) / (factor * np.expm1(exponents))) ** AVERAGES)
 
 

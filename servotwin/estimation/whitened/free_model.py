@@ -261,7 +261,7 @@ class ContactEvidence:
 BELIEVED = 100.0
 _ENOUGH, HOPELESS = 0.3, 30.0  # times that: clearly too little; so much that no start has come back from there
 _STARTS = 3
-# Of 167 windows whose best start is that far off, no other start's linearised problem came below 0.41 of the best one's.
+# Of 167 windows whose best start is so far off, no other start's linearised problem came below 0.41 of the best's.
 _OUT_OF_REACH = 10.0 * HOPELESS
 
 
