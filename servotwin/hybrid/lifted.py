@@ -16,7 +16,7 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined
-from servotwin.hybrid.flow import SIGNIFICANT, dot_sizes, product, tall_product
+from servotwin.hybrid.flow import SIGNIFICANT, dot, dot_sizes, product, tall_product
 from servotwin.hybrid.tables import VECTOR, padded, zeros
 
 FINE = 8
@@ -27,6 +27,9 @@ BLOCK = FINE * COARSE
 """Ticks of a coarse block, and of an interval of the vast scale."""
 # Rounding of a product with a row, of the sum of its terms' sizes, in units of `SIGNIFICANT`.
 _ROUNDING = 0.01
+# Of the vast block: two million ticks, after which all that decays is gone.
+_DOUBLINGS, _GONE = 10, 1e-40
+_EVEN = 1e-11  # of what the other states make a watch deviate: rounding
 
 
 class LiftedTables(NamedTuple):
@@ -44,6 +47,8 @@ class LiftedTables(NamedTuple):
     jump_coarse: Array  # S * N * 16 * N: M**(8 j) - I
     jump_vast: Array  # S * N * 16 * N: M**(128 j) - I
     sizes: Array  # S * W * N: a watch below this part of abs(z) times `SIGNIFICANT` is rounding
+    settling: Array  # S * N * N: M**k - I after two million ticks
+    uneven: Array  # S * N: 1.0 for a state of which something is left then that does not move evenly
 
 
 class LiftedWorkspace(NamedTuple):
@@ -78,6 +83,8 @@ def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
         COARSE * n2,
         COARSE * n2,
         watches * states,
+        n2,
+        states,
     )
     return LiftedTables(states, watches, *(zeros(slots * size) for size in sizes))
 
@@ -316,8 +323,65 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
 
 
 @bare
+def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """A high power of the map, from those of the vast scale in `w`, and what it leaves uneven."""
+    n, d, new = t.states, w.product, w.powers
+    for i in range(n):
+        for k in range(n):
+            d[i * n + k] = w.powers[(i + 1) * COARSE * n - n + k]
+    for _ in range(_DOUBLINGS):
+        for i in range(n):
+            row = new[i * n : (i + 1) * n]
+            for j in range(n):
+                row[j] = 2.0 * d[i * n + j]
+            for k in range(n):
+                factor = d[i * n + k]
+                for j in range(n):
+                    row[j] += factor * d[k * n + j]
+        for i in range(n * n):
+            d[i] = new[i]
+    for i in range(n * n):
+        t.settling[slot * n * n + i] = d[i]
+    for i in range(n):
+        d[i * n + i] += 1.0
+    for i in range(n * n):
+        d[i] = d[i] if abs(d[i]) > _GONE else 0.0
+    _find_uneven(t, slot, watches, w)
+
+
+@bare
+def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """States from which the matrix in `product` makes others on which a watch deviates by more than rounding."""
+    n, stride = t.states, _stride(t, COARSE)
+    sizes, row = w.powers[:n], w.powers[n : 2 * n]
+    for j in range(n):
+        t.uneven[slot * n + j] = 0.0
+    for watch in range(watches):
+        square = slot * n * stride + watch * (3 * COARSE + 1 + n) + 3 * COARSE + 1
+        for j in range(n):
+            sizes[j] = 0.0
+        for k in range(n):
+            own = math.sqrt(max(t.vast[square + k * stride + k], 0.0))
+            size = SIGNIFICANT * t.sizes[(slot * t.watches + watch) * n + k] + _EVEN * own
+            for j in range(n):
+                sizes[j] += size * abs(w.product[k * n + j])
+        for i in range(n):
+            for j in range(n):
+                row[j] = 0.0
+            for k in range(n):
+                factor = t.vast[square + i * stride + k]
+                for j in range(n):
+                    row[j] += factor * w.product[k * n + j]
+            scale = math.sqrt(max(t.vast[square + i * stride + i], 0.0))
+            for j in range(n):
+                # Also without numbers, where the powers have grown beyond all.
+                if not abs(row[j]) <= scale * sizes[j]:
+                    t.uneven[slot * n + j] = 1.0
+
+
+@bare
 def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """The tables of the vast scale, from those of the coarse one and the watches in `w`."""
+    """The tables of the vast scale and of settling, from those of the coarse one and the watches in `w`."""
     n, stride, block = t.states, _stride(t, COARSE), (COARSE + 1) * t.states
     for i in range(n):
         for k in range(n):
@@ -334,21 +398,19 @@ def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) ->
                 w.sums[(i * watches + watch) * n + j] = t.coarse[at + 3 * COARSE + 1 + i]
         _add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
     _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
+    _settle(t, slot, watches, w)
 
 
 @inlined
 def clean_part(
     t: LiftedTables, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array, slack: Array,
-    z: Array, out: Array,
+    less: float, squares: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
     """Number of intervals, at most `wanted`, before the first in which some watch may leave its bounds."""
-    clean, n = wanted, np.uint64(t.states)
+    clean = wanted
     for watch in range(watches):
-        square, at = 0.0, np.uint64(watch * (3 * intervals + 1 + t.states) + 3 * intervals + 1)
-        for i in range(n):
-            square += out[at + i] * z[i]
         size = dot_sizes(t.sizes, (slot * t.watches + watch) * t.states, z)
-        room = slack[watch] * (SIGNIFICANT * size) - math.sqrt(max(square, 0.0))
+        room = (slack[watch] - less) * (SIGNIFICANT * size) - math.sqrt(max(squares[watch], 0.0))
         top, bottom = high[watch] + room, low[watch] - room
         a = np.uint64(watch * (3 * intervals + 1 + t.states))
         b = a + np.uint64(intervals + 1)
@@ -370,16 +432,56 @@ def clean_part(
     return clean
 
 
+@bare
+def settled_squares(
+    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, z: Array, way: Array, squares: Array
+) -> bool:
+    """Squares of every watch's deviation, from the state's way to rest, which goes into `way`: at rest nothing
+    deviates. False where the state does not come to rest."""
+    n, stride = t.states, _stride(t, intervals)
+    if dot_sizes(t.uneven, slot * n, z) > 0.0:
+        return False
+    for i in range(n):
+        way[i] = dot(t.settling, (slot * n + i) * n, z)
+    for watch in range(watches):
+        square, at = 0.0, slot * n * stride + watch * (3 * intervals + 1 + n) + 3 * intervals + 1
+        for j in range(n):
+            # The matrix is symmetric.
+            square += way[j] * dot(table, at + j * stride, way)
+        squares[watch] = square
+    return True
+
+
 @inlined
 def clean_ticks(
     t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array,
-    slack: Array, z: Array, out: Array,
+    slack: Array, settles: bool, squares: Array, change: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
-    """Number of intervals of a block, at most `wanted`, before the first in which some watch may leave its bounds."""
+    """Number of intervals of a block, at most `wanted`, before the first in which some watch may leave its bounds.
+
+    With `settles` the squares of the deviations are taken a second time where they are too large, from the state's way
+    to where it rests or moves evenly: near rest those of the state are rounding, whose root is far above that of a
+    watch.
+    """
     stride = _stride(t, intervals)
     used = (watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
     tall_product(table, slot * t.states * stride, stride, used, z, out)
-    return clean_part(t, slot, watches, intervals, wanted, low, high, slack, z, out)
+    clean, less, n = 0, 0.0, np.uint64(t.states)
+    for watch in range(watches):
+        square, at = 0.0, np.uint64(watch * (3 * intervals + 1 + t.states) + 3 * intervals + 1)
+        for i in range(n):
+            square += out[at + i] * z[i]
+        squares[watch] = square
+    for attempt in range(2):
+        if attempt == 1:
+            if not settled_squares(t, table, slot, watches, intervals, z, change, squares):
+                break
+            # What rests deviates by rounding only.
+            less = 1.0
+        clean = clean_part(t, slot, watches, intervals, wanted, low, high, slack, less, squares, z, out)
+        if clean == wanted or not settles:
+            break
+    return clean
 
 
 @inlined

@@ -184,8 +184,9 @@ def vast_blocks(
     lifted = memory.lifted
     wanted = min(COARSE, (end - place.at[0]) // BLOCK)
     clean = clean_ticks(
-        lifted, lifted.vast, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, z, memory.out
-    )
+        lifted, lifted.vast, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, True,
+        memory.squares, memory.change, z, memory.out,
+    )  # fmt: skip
     if clean > 0:
         note(segments, place.at[0], VAST - slot, z)
         jump(lifted.states, lifted.jump_vast, slot, COARSE, clean, z, memory.change)
@@ -200,30 +201,36 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
     n, again = lifted.states, begin
     low, high, slack, out = memory.low, memory.high, memory.slack, memory.out
+    squares, change = memory.squares, memory.change
     while end - place.at[0] >= 2 and segments.size[0] + 4 < len(segments.tick):
         filled, k = memory.filled[slot], place.at[0]
+        settles = filled == 2
         if deepens(place, end, filled):
             break
-        if filled == 2 and place.at[5] >= _CALM and k >= again and end - k >= BLOCK:
+        if settles and place.at[5] >= _CALM and k >= again and end - k >= BLOCK:
             if vast_blocks(z, place, slot, watches, end, segments, memory):
                 continue
             # What is near its bound now is so for a while.
             again, k = place.at[0] + 4 * BLOCK, place.at[0]
         if place.at[5] >= FINE and end - k >= FINE:
             wanted = min(COARSE, (end - k) // FINE)
-            clean = clean_ticks(lifted, lifted.coarse, slot, watches, COARSE, wanted, low, high, slack, z, out)
+            clean = clean_ticks(
+                lifted, lifted.coarse, slot, watches, COARSE, wanted, low, high, slack, settles, squares, change, z, out
+            )
             if clean > 0:
                 note(segments, k, slot, z)
-                jump(n, lifted.jump_coarse, slot, COARSE, clean, z, memory.change)
+                jump(n, lifted.jump_coarse, slot, COARSE, clean, z, change)
                 k += clean * FINE
                 place.at[0], place.at[5] = k, place.at[5] + clean * FINE
             if clean == wanted:
                 continue
         wanted = min(FINE, end - k)
-        clean = clean_ticks(lifted, lifted.fine, slot, watches, FINE, wanted, low, high, slack, z, out)
+        clean = clean_ticks(
+            lifted, lifted.fine, slot, watches, FINE, wanted, low, high, slack, settles, squares, change, z, out
+        )
         if clean > 0:
             note(segments, k, slot, z)
-            jump(n, lifted.jump_fine, slot, FINE, clean, z, memory.change)
+            jump(n, lifted.jump_fine, slot, FINE, clean, z, change)
             place.at[0], place.at[5] = k + clean, place.at[5] + clean
         if clean < wanted:
             break

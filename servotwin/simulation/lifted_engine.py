@@ -107,6 +107,7 @@ def new_memory(places: Places, modes: int, watches: int) -> LiftedMemory:
         np.zeros(watches),
         np.zeros(watches),
         np.zeros(watches),
+        np.zeros(watches),
         np.zeros(rows),
         np.zeros(n),
         np.zeros(n),

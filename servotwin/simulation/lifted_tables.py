@@ -63,6 +63,7 @@ class LiftedMemory(NamedTuple):
     low: Array
     high: Array
     slack: Array
+    squares: Array
     out: Array
     change: Array
     sizes: Array
