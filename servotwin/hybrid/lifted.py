@@ -323,33 +323,6 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
 
 
 @bare
-def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """A high power of the map, from those of the vast scale in `w`, and what it leaves uneven."""
-    n, d, new = t.states, w.product, w.powers
-    for i in range(n):
-        for k in range(n):
-            d[i * n + k] = w.powers[(i + 1) * COARSE * n - n + k]
-    for _ in range(_DOUBLINGS):
-        for i in range(n):
-            row = new[i * n : (i + 1) * n]
-            for j in range(n):
-                row[j] = 2.0 * d[i * n + j]
-            for k in range(n):
-                factor = d[i * n + k]
-                for j in range(n):
-                    row[j] += factor * d[k * n + j]
-        for i in range(n * n):
-            d[i] = new[i]
-    for i in range(n * n):
-        t.settling[slot * n * n + i] = d[i]
-    for i in range(n):
-        d[i * n + i] += 1.0
-    for i in range(n * n):
-        d[i] = d[i] if abs(d[i]) > _GONE else 0.0
-    _find_uneven(t, slot, watches, w)
-
-
-@bare
 def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """States from which the matrix in `product` makes others on which a watch deviates by more than rounding."""
     n, stride = t.states, _stride(t, COARSE)
@@ -377,6 +350,33 @@ def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -
                 # Also without numbers, where the powers have grown beyond all.
                 if not abs(row[j]) <= scale * sizes[j]:
                     t.uneven[slot * n + j] = 1.0
+
+
+@bare
+def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """A high power of the map, from those of the vast scale in `w`, and what it leaves uneven."""
+    n, d, new = t.states, w.product, w.powers
+    for i in range(n):
+        for k in range(n):
+            d[i * n + k] = w.powers[(i + 1) * COARSE * n - n + k]
+    for _ in range(_DOUBLINGS):
+        for i in range(n):
+            row = new[i * n : (i + 1) * n]
+            for j in range(n):
+                row[j] = 2.0 * d[i * n + j]
+            for k in range(n):
+                factor = d[i * n + k]
+                for j in range(n):
+                    row[j] += factor * d[k * n + j]
+        for i in range(n * n):
+            d[i] = new[i]
+    for i in range(n * n):
+        t.settling[slot * n * n + i] = d[i]
+    for i in range(n):
+        d[i * n + i] += 1.0
+    for i in range(n * n):
+        d[i] = d[i] if abs(d[i]) > _GONE else 0.0
+    _find_uneven(t, slot, watches, w)
 
 
 @bare

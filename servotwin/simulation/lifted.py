@@ -32,6 +32,7 @@ UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
+_FILLS = 128  # ticks in a mode and branch, after which its tables pay
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
@@ -264,12 +265,15 @@ def run_lifted(
             return FULL
         set_reference(places, coefficients, at[0] / rate - origin, z)
         if at[5] > 0 and end - at[0] >= 2:
-            filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
+            slot = slot_of(at[1], at[2] == 1, at[3])
+            filled = memory.filled[slot]
             at[6] = 1 if deepens(place, end, filled) else 0
-            if filled == 0 or at[6] == 1:
+            memory.ticked[slot] += 1 if filled == 0 else 0
+            if memory.ticked[slot] > _FILLS or at[6] == 1:
+                memory.ticked[slot] = 0
                 return UNFILLED
             watches = set_bounds(t, loop, places, place, memory)
-            if advance_block(z, place, watches, end, segments, memory) > 0:
+            if filled > 0 and advance_block(z, place, watches, end, segments, memory) > 0:
                 if at[0] >= end:
                     break
                 set_reference(places, coefficients, at[0] / rate - origin, z)

@@ -59,6 +59,7 @@ class LiftedMemory(NamedTuple):
     lifted: LiftedTables
     workspace: LiftedWorkspace
     filled: NDArray[np.int8]  # (slots,): 1, or 2 with the vast scale
+    ticked: NDArray[np.int64]  # (slots,) single ticks that might have been part of a block before the slot was filled
     voltage_rows: Array  # slots * N: the applied voltage after a tick, of the state before it
     low: Array
     high: Array

@@ -85,6 +85,7 @@ def load(family: SampledFamily, plant: int, law: int, worker: SampledWorker) -> 
     worker.loaded[0], worker.loaded[1] = plant, law
     for slot in range(len(worker.lifted.filled)):
         worker.lifted.filled[slot] = 0
+        worker.lifted.ticked[slot] = 0
         for o in range(len(worker.filled)):
             worker.filled[o, slot] = 0
 
