@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.twin.estimating import Wear
+from servotwin.estimation.learning.wear import Wear
 from servotwin.twin.settings import TwinSettings
 
 

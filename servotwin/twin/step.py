@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import (
     Answer,
     Fallback,
@@ -33,7 +34,7 @@ from servotwin.messages import (
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.alarms import alarms
-from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Wear, stated_machine
+from servotwin.twin.estimating import UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
     AlarmRecord,
     DisturbanceRecord,
@@ -50,9 +51,9 @@ from servotwin.twin.evidence import (
 )
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
-from servotwin.twin.state import TwinState
+from servotwin.twin.requests import Attempts
+from servotwin.twin.state import TwinState, noted_setting
 from servotwin.twin.triage import Glance
-from servotwin.twin.versions import Attempts, noted_setting
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
@@ -170,7 +171,17 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
-        state, rejection = _learn(model, state, decoded, estimate, arrived)
+        wear, rejection = before.update(
+            trends,
+            message.boot,
+            estimate,
+            arrived,
+            learning,
+            stated_machine(model.settings),
+            decoded.window,
+            model.motor,
+        )
+        state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
     records += [AlarmRecord(message, sentence) for sentence in alarms(model.settings, before, state.wear, estimate)]
@@ -206,18 +217,6 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
     return StepResult(sent.state, sent.messages + others, all_records)
-
-
-def _learn(
-    model: TwinModel, state: TwinState, decoded: DecodedWindow, estimate: GapEstimate, arrived: float
-) -> tuple[TwinState, str]:
-    """Add a window to trend, machine and motor; return the reason why the trend rejected it, or an empty string."""
-    settings, message = model.settings, decoded.message
-    stated = stated_machine(settings)
-    wear, rejection = state.wear.update(settings.trend, message.boot, estimate, arrived, settings.learning, stated)
-    if model.motor is not None and decoded.window is not None:
-        wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
-    return replace(state, wear=wear), rejection
 
 
 def _ask(
