@@ -33,7 +33,6 @@ from servotwin.messages import (
 )
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.alarms import alarms
 from servotwin.twin.estimating import UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
     AlarmRecord,
@@ -184,7 +183,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
-    records += [AlarmRecord(message, sentence) for sentence in alarms(model.settings, before, state.wear, estimate)]
+    records += [AlarmRecord(message, sentence) for sentence in state.wear.alarms(before, estimate, trends, learning)]
     if model.triage is not None and state.triage is not None and not stale:
         known = state.wear.known_machine(learning, arrived)
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)

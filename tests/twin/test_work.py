@@ -34,7 +34,7 @@ from servotwin.messages import (
     decode,
     encode,
 )
-from servotwin.messages.compression import DEFLATE, ZSTD, compress
+from servotwin.messages.codec import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import step as stepping

@@ -206,6 +206,28 @@ class Wear(Struct, frozen=True):
         machine = updated(self.machine, learning, estimate, counts=not rejection, now=now, stated=stated)
         return replace(wear, machine=machine), rejection
 
+    def alarms(
+        self, before: Wear, estimate: GapEstimate, settings: TrendSettings, learning: LearningSettings
+    ) -> list[str]:
+        """List what an operator should know of the machine after a window, besides what was learnt.
+
+        `before` is the knowledge before the window, and `estimate` its estimate.
+        """
+        sentences, count = list[str](), learning.restart_after
+        if self.mismatches == count > before.mismatches and self.machine == before.machine:
+            because = "; ".join(estimate.reasons)
+            sentences.append(
+                f"{count} windows in a row fit no machine within what is known of this one ({because}): check the "
+                "nameplate (stiffness, damping, pitch, masses), the channels' units, and what may be loose"
+            )
+        trend, earlier = self.trend(settings), before.trend(settings)
+        if trend is not None and earlier is not None and trend.afresh and not earlier.afresh:
+            sentences.append(
+                f"the gap has jumped from {math.degrees(earlier.gap):.3g} to {math.degrees(trend.gap):.3g} deg, as "
+                "after a crash, a repair or a new screw: it is followed from there"
+            )
+        return sentences
+
     def _mismatches(self, estimate: GapEstimate) -> int:
         """`mismatches` after an estimate."""
         if estimate.status is GapStatus.MODEL_MISMATCH:
