@@ -4,9 +4,16 @@ from __future__ import annotations
 
 import math
 
+from servotwin.control.controller import Controller
+from servotwin.control.gains import with_gains
+from servotwin.estimation.controller import compare_controller
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.twin.estimating import Wear
+from servotwin.messages import Setting
+from servotwin.twin.estimating import DecodedWindow, Wear
 from servotwin.twin.settings import TwinSettings
+
+OTHER_CONTROLLER = 2
+"""Windows in a row under another controller than stated that raise an alarm: a change of setting may lie in one."""
 
 
 def alarms(settings: TwinSettings, before: Wear, after: Wear, estimate: GapEstimate) -> list[str]:
@@ -25,3 +32,31 @@ def alarms(settings: TwinSettings, before: Wear, after: Wear, estimate: GapEstim
             "crash, a repair or a new screw: it is followed from there"
         )
     return sentences
+
+
+def windows_of_other_controller(
+    controller: Controller | None, stated: Setting | None, decoded: DecodedWindow, before: int
+) -> tuple[int, str]:
+    """Count the windows in a row whose voltage is not that of the controller stated for them.
+
+    Parameters
+    ----------
+    controller : Controller or None
+        The servo's, with its limits, filters and rates; None: not known.
+    stated : Setting or None
+        In force when the window was cut; None: not known.
+    decoded : DecodedWindow
+    before : int
+        The count before this window, which stays where the window does not tell.
+
+    Returns
+    -------
+    count, sentence : int, str
+        And what is wrong with this window's voltage; empty: nothing, or the window does not tell.
+    """
+    if controller is None or stated is None or decoded.window is None:
+        return before, ""
+    made = compare_controller(decoded.window, with_gains(controller, stated.gains), stated.tolerance)
+    if made is None:
+        return before, ""
+    return (0, "") if made.agrees else (before + 1, made.sentence)

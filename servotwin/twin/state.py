@@ -40,6 +40,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         V, input biases that the last windows showed, the newest last.
     steps : tuple of float
         m, sizes of the reference's steps in the last windows, the newest last.
+    other_controller : int
+        Windows in a row whose voltage is not that of the controller stated for them.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -56,6 +58,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     rests: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
     responses: ResponseState | None = None
+    other_controller: int = 0
 
 
 _encoder = msgspec.msgpack.Encoder()

@@ -32,7 +32,7 @@ from servotwin.messages import (
 )
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.alarms import alarms
+from servotwin.twin.alarms import OTHER_CONTROLLER, alarms, windows_of_other_controller
 from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Wear, stated_machine
 from servotwin.twin.evidence import (
     AlarmRecord,
@@ -55,6 +55,7 @@ from servotwin.twin.triage import Glance
 from servotwin.twin.versions import Attempts, noted_setting
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
+_OTHER = "another controller runs than is stated: a setting follows when a window is of the stated one"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
@@ -174,6 +175,9 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
     records += [AlarmRecord(message, sentence) for sentence in alarms(model.settings, before, state.wear, estimate)]
+    if not stale:
+        state, differs = _compare(model, state, decoded)
+        records += [AlarmRecord(message, sentence) for sentence in differs]
     if model.triage is not None and state.triage is not None and not stale:
         known = state.wear.known_machine(learning, arrived)
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
@@ -218,6 +222,13 @@ def _learn(
     if model.motor is not None and decoded.window is not None:
         wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
     return replace(state, wear=wear), rejection
+
+
+def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tuple[TwinState, list[str]]:
+    """Compare a window's voltage with that of the controller stated for it; return the alarm, if it is one."""
+    stated, before = state.known.get(decoded.message.parameter_version), state.other_controller
+    count, sentence = windows_of_other_controller(model.controller, stated, decoded, before)
+    return replace(state, other_controller=count), [sentence] if count == OTHER_CONTROLLER > before else []
 
 
 def _ask(
@@ -274,6 +285,8 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     machine = state.wear.machine
     if machine is not None and machine.disputed and not stale:
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
+    if state.other_controller >= OTHER_CONTROLLER and not stale:
+        return state, Redesign(None, math.nan, _OTHER)
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)
