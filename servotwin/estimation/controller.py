@@ -28,6 +28,7 @@ _ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, a
 _LARGEST = 0.5  # share of the voltage's swing: a window whose noise needs more tolerance shows nothing
 _FILTERED = 5.0  # time constants of the loop filter after which the measurement before the window is forgotten
 _AT_LIMIT, _FEWEST = 0.999, 20  # of the limit; samples before the first one at the limit that show the initial state
+_DELAYS = 4  # samples, from none on, by which the voltage may be recorded later than it was computed
 _ROUNDS = 3  # fits of the initial state: a limit of the voltage makes it nonlinear
 
 
@@ -95,8 +96,21 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
     """
     if window.voltage is None or window.reference is None:
         return None
-    voltage, reference, position = window.voltage, window.reference, window.position
     parameters = controller.replace(sample_rate=window.sample_rate).law(tolerance)
+    made = None
+    for delay in range(_DELAYS):
+        voltage, rest = window.voltage[delay:], window.voltage.size - delay
+        later = _compared(parameters, voltage, window.reference[:rest], window.position[:rest])
+        if later is None or later.agrees:
+            return later
+        made = later if made is None or (later.factors and not made.factors) else made
+    return made
+
+
+def _compared(
+    parameters: LawParameters, voltage: Array, reference: Array, position: Array
+) -> ControllerComparison | None:
+    """Compare a voltage with that of a law, sample by sample."""
     first = _forgotten(parameters)
     if position.size - first < 2 * _BLOCKS:
         return None

@@ -299,7 +299,7 @@ def _row(record: Record) -> EvidenceRecord | None:
             shown = result if isinstance(result, Certificate) else result.best
             body_of = {"question": request, "certificate": shown and _timeless(shown)}
             reason = "" if isinstance(result, Certificate) else result.reason
-            return _computed("proof", body_of, reason, **_of_update(request))
+            return _computed("verification", body_of, reason, **_of_update(request))
         case WithdrawalRecord(request, why):
             return _computed("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
         case Update():

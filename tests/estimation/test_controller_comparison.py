@@ -92,6 +92,14 @@ def test_a_loop_agrees_with_its_own_controller_at_any_recording_rate(controller,
     assert made.unexplained < 0.06 * made.swing
 
 
+@pytest.mark.parametrize("delay", [1, 3])
+def test_a_voltage_that_reaches_the_motor_some_samples_later_is_still_the_laws(delay):
+    window = by_hand(LAW.replace(voltage_limit=1.0), 2e-4)
+    late = np.concatenate([np.full(delay, window.voltage[0]), window.voltage[:-delay]])
+    made = compare_controller(window.replace(voltage=late), LAW.replace(voltage_limit=1.0), 2e-4)
+    assert made.agrees
+
+
 def test_scales_do_not_matter():
     """Metres a million times smaller and gains as much larger: the same voltages and the same shares."""
     changed = LAW.replace(Kp=0.5 * LAW.Kp)

@@ -60,7 +60,7 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, observed=None, status=GapStatu
 
 
 @pytest.mark.slow
-def test_what_is_proved_is_sent_with_its_proof_and_band():
+def test_what_is_verified_is_sent_with_its_certificate_and_band():
     (update,), redesign = answer()
     assert isinstance(update, Update)
     assert update.setting.gains.feedforward == pytest.approx(-0.05)
