@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import MachineReading
-from servotwin.estimation.motor import LearntMotor
+from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting, Update
 from servotwin.redesign.certified.certificate import Certificate, NotVerified

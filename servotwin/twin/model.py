@@ -9,20 +9,20 @@ from msgspec.structs import replace
 
 from servotwin.control.controller import Controller
 from servotwin.estimation.disturbance import disturbance
-from servotwin.estimation.motor import MotorLearning
+from servotwin.estimation.learning.motor import MotorLearning
+from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.estimating import Estimator, Observer, Wear, estimator_of, motor_learning_of
+from servotwin.twin.estimating import Estimator, Observer, estimator_of, motor_learning_of
 from servotwin.twin.lookups import Lookups, LookupState
 from servotwin.twin.requests import Requests, RequestState
 from servotwin.twin.responses import Responses, ResponseState
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.state import TwinState, decode_state
+from servotwin.twin.state import TwinState, Versions, decode_state
 from servotwin.twin.triage import Triage, TriageState
-from servotwin.twin.versions import Versions
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ from servotwin.store.store import open_store
 from servotwin.twin_service import command as service
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker_pool import WorkerPool
+from servotwin.twin_service.worker import WorkerPool
 
 PATIENCE = 60.0
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups")
