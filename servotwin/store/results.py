@@ -13,8 +13,10 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.engine import SQLITE
 from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
-from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
+from servotwin.store.records import EvidenceRecord, Lease, MessageKind, OutgoingMessage, StoredMessage, WorkResult
 from servotwin.store.schema import VERIFICATIONS, WORK, bodies, contexts, evidence, messages, outgoing, states, twins
+
+_NAMES_PER_QUERY = 5000
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
@@ -181,6 +183,23 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
             valid[i] = posted + len(results[i].outgoing)
             serials[results[i].servo] = serial + 1, valid[i]
     return valid
+
+
+def outgoing_messages(connection: sa.Connection, servo: str, after: int, limit: int) -> list[OutgoingMessage]:
+    """Messages to the edge with serials above `after`."""
+    query = sa.select(outgoing.c.serial, outgoing.c.body).where(outgoing.c.servo == servo, outgoing.c.serial > after)
+    rows = connection.execute(query.order_by(outgoing.c.serial).limit(limit))
+    return [OutgoingMessage(row.serial, row.body) for row in rows]
+
+
+def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
+    """Serials of the newest messages to the edges of these servos."""
+    names, newest = list(servos), dict[str, int]()
+    for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
+        part = names[begin : begin + _NAMES_PER_QUERY]
+        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
+        newest.update((servo, serial) for servo, serial in connection.execute(query))
+    return newest
 
 
 def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
