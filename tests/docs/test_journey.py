@@ -29,7 +29,7 @@ NOT_COUNTED = {
     ),
     "settings": ("config/", "control/controller.py", "edge/settings.py"),
     "plumbing": ("runtime/retry.py",),
-    "beside the way": ("edge/watch.py", "twin/responses.py", "twin/lookups.py", "twin/requests.py"),
+    "beside the way": ("edge/watch.py", "estimation/controller.py", "twin/responses.py", "twin/lookups.py", "twin/requests.py"),
 }  # fmt: skip
 COMPILED = {"control/law.py"}
 """On the page, though no Python code of it runs in a simulation."""
