@@ -80,7 +80,7 @@ def events(connection: sa.Connection, servo: str, since: float, limit: int) -> l
     """Evidence that belongs to no window, newest first."""
     columns = [evidence.c[name] for name in StoredEvidence._fields]
     apart = sa.or_(evidence.c.kind.in_(_EVENTS), evidence.c.message.is_(None))
-    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.made >= since)
+    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.created >= since)
     rows = connection.execute(query.order_by(evidence.c.id.desc()).limit(limit)).all()
     return [record for row in rows if (record := _evidence(row, 0)) is not None]
 

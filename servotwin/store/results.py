@@ -82,7 +82,7 @@ def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[An
         queues.append((_next(ready, twins.c.ready, one), 1.0))
         queues.append((_next(due, twins.c.wake, one), 1.0))
     if MessageKind.VERIFICATION in kinds:
-        queues.append((_next(twins.c.asked.is_not(None), twins.c.asked, one), 1.0))
+        queues.append((_next(twins.c.verification_ready.is_not(None), twins.c.verification_ready, one), 1.0))
     return queues
 
 
@@ -278,13 +278,13 @@ def _evidence_row(
 ) -> dict[str, Any]:
     row = record._asdict()
     message = windows.get((servo, row.pop("window")), record.message)
-    return row | {"message": message or None, "context": record.context or None, "servo": servo, "made": now}
+    return row | {"message": message or None, "context": record.context or None, "servo": servo, "created": now}
 
 
 def _outgoing_rows(result: WorkResult, last: int, now: float) -> list[dict[str, Any]]:
     first = last - len(result.outgoing) + 1
     return [
-        {"servo": result.servo, "serial": first + i, "body": body, "made": now}
+        {"servo": result.servo, "serial": first + i, "body": body, "created": now}
         for i, body in enumerate(result.outgoing)
     ]
 
@@ -347,5 +347,5 @@ def _oldest_time(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
 _RESCHEDULE = (
     sa.update(twins)
     .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
-    .values(ready=_oldest_time(WORK), asked=_oldest_time(VERIFICATIONS))
+    .values(ready=_oldest_time(WORK), verification_ready=_oldest_time(VERIFICATIONS))
 )

@@ -10,8 +10,11 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin import messages
+from servotwin.control.controller import Controller
+from servotwin.control.gains import with_gains
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
+from servotwin.estimation.controller import ControllerComparison, compare_controller
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.gap import estimate_gap, settings_of
@@ -20,6 +23,7 @@ from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
 from servotwin.redesign.policy import NOT_OBSERVED
@@ -30,6 +34,9 @@ Estimator = Callable[[Window, Expectation], GapEstimate]
 
 Observer = Callable[[Window], Disturbance]
 """window -> input bias and noise."""
+
+OTHER_CONTROLLER = 2
+"""Windows in a row under another controller than stated that raise an alarm: a change of setting may lie in one."""
 
 UNUSABLE = "none"
 """Method of the estimate of an unusable window; a probing move would not improve it."""
@@ -148,6 +155,15 @@ class DecodedWindow(NamedTuple):
             except InvalidInput as error:
                 problem = str(error)
         return nothing_known(math.nan, problem)
+
+    def compare_controller(self, controller: Controller | None, stated: Setting | None) -> ControllerComparison | None:
+        """Compare the voltage with that of a servo's controller with the gains and the dead zone stated for the window.
+
+        None: one of the two is not known, or the window does not tell.
+        """
+        if controller is None or stated is None or self.window is None:
+            return None
+        return compare_controller(self.window, with_gains(controller, stated.gains), stated.tolerance)
 
     @property
     def tail(self) -> float | None:

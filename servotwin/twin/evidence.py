@@ -30,7 +30,6 @@ from servotwin.messages import (
     Receipt,
     Request,
     Update,
-    Verification,
     WindowMessage,
     encode,
     finite,
@@ -300,7 +299,7 @@ def _row(record: Record) -> EvidenceRecord | None:
             shown = result if isinstance(result, Certificate) else result.best
             body_of = {"question": request, "certificate": shown and _timeless(shown)}
             reason = "" if isinstance(result, Certificate) else result.reason
-            return _computed("proof", body_of, reason, **_of_update(request))
+            return _computed("verification", body_of, reason, **_of_update(request))
         case WithdrawalRecord(request, why):
             return _computed("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
         case Update():
@@ -359,25 +358,6 @@ def _redesign_body(redesign: Redesign) -> dict[str, Any]:
 
 def _timeless(certificate: Certificate) -> dict[str, Any]:
     return {each.name: getattr(certificate, each.name) for each in fields(certificate) if each.compare}
-
-
-def verification_of(certificate: Certificate) -> Verification:
-    """Summarise a certificate for an update, without its computing time: equal twins send equal bytes."""
-    return Verification(
-        members=certificate.members,
-        looked_at=certificate.looked_at,
-        settled=certificate.settled,
-        tail=certificate.tail,
-        overshoot=certificate.overshoot,
-        Ms=certificate.Ms,
-        crossover=certificate.crossover,
-        phase_margin=certificate.phase_margin,
-        saturated=certificate.saturated,
-        settled_least=certificate.settled_least,
-        confidence=certificate.confidence if certificate.settled_least else 0.0,
-        Ms_worst=0.0 if certificate.loop is None else certificate.loop.Ms_worst,
-        phase_margin_worst=0.0 if certificate.loop is None else certificate.loop.phase_margin_worst,
-    )
 
 
 def _plain_value(value: object) -> object:

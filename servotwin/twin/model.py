@@ -7,6 +7,7 @@ from functools import partial
 
 from msgspec.structs import replace
 
+from servotwin.control.controller import Controller
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Wear
@@ -49,6 +50,8 @@ class TwinModel:
         Learns the motor's numbers; None: the model's are taken as they are.
     responses : Responses, optional
         Sends the learnt structure to edges that can use it.
+    controller : Controller, optional
+        The servo's, with which windows are compared; None: they are not.
     """
 
     estimator: Estimator
@@ -61,6 +64,7 @@ class TwinModel:
     lookups: Lookups | None = None
     motor: MotorLearning | None = None
     responses: Responses | None = None
+    controller: Controller | None = None
 
     @classmethod
     def of(
@@ -93,6 +97,7 @@ class TwinModel:
             triage=None if settings.triage is None else Triage(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
+            controller=servo.controller,
         )
 
     def initial_state(self, servo: str) -> TwinState:

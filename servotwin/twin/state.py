@@ -16,8 +16,10 @@ from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.learning.wear import Wear
-from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage
+from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite
 from servotwin.messages.legacy import upgrade
+from servotwin.redesign.certified.certificate import verification_of
+from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.requests import Attempts, RequestState
 from servotwin.twin.responses import ResponseState
@@ -152,6 +154,27 @@ def noted_setting(known: Settings, version: int, setting: Setting, base: int, in
     return {number: each for number, each in sorted(after.items()) if number in keep}
 
 
+def draft_update(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
+    """Make an update without version and base; it may be applied until `validity` (s) after the window's start."""
+    assert redesign.setting is not None
+    estimate = evidence.estimate
+    low, high = estimate.interval
+    return Update(
+        servo=message.servo,
+        version=1,
+        base_version=0,
+        window=(message.boot, message.sequence),
+        data_time=message.start,
+        gap=finite(estimate.gap),
+        std=finite(estimate.std_total),
+        interval=(finite(low), finite(high)),
+        status=estimate.status.value,
+        setting=redesign.setting,
+        not_after=message.start + validity,
+        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
+    )
+
+
 class TwinState(Struct, frozen=True, tag="twin-state/2"):
     """State of the twin of one servo.
 
@@ -170,6 +193,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         V, input biases that the last windows showed, the newest last.
     steps : tuple of float
         m, sizes of the reference's steps in the last windows, the newest last.
+    other_controller : int
+        Windows in a row whose voltage is not that of the controller stated for them.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -186,6 +211,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     rests: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
     responses: ResponseState | None = None
+    other_controller: int = 0
 
 
 _encoder = msgspec.msgpack.Encoder()

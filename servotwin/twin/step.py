@@ -28,10 +28,9 @@ from servotwin.messages import (
     Receipt,
     Update,
     WindowMessage,
-    finite,
 )
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.estimating import UNUSABLE, DecodedWindow, stated_machine
+from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
     AlarmRecord,
     DisturbanceRecord,
@@ -45,15 +44,15 @@ from servotwin.twin.evidence import (
     TrendRecord,
     VerificationRecord,
     WithdrawalRecord,
-    verification_of,
 )
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.requests import Attempts
-from servotwin.twin.state import TwinState, noted_setting
+from servotwin.twin.state import TwinState, draft_update, noted_setting
 from servotwin.twin.triage import Glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
+_OTHER = "another controller runs than is stated: a setting follows when a window is of the stated one"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
@@ -186,7 +185,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         others, records = [*others, *requested], [*records, *decided]
     if redesign.setting is None:
         return StepResult(state, tuple(others), tuple(records))
-    versions = state.versions.with_update(_draft(message, evidence, redesign, model.settings.validity))
+    versions = state.versions.with_update(draft_update(message, evidence, redesign, model.settings.validity))
     state = replace(state, versions=versions, tuned_for=float(redesign.gap))
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
@@ -226,6 +225,9 @@ def _learn(
     if after.motor is not None and after.motor != before.motor:
         records.append(MotorRecord(message, after.motor))
     records += [AlarmRecord(message, sentence) for sentence in after.alarms(before, estimate, trends, learning)]
+    if not stale:
+        state, differs = _compare(model, state, decoded)
+        records += [AlarmRecord(message, sentence) for sentence in differs]
     return state, _Learnt(estimate, disturbed, rejection, stale), records
 
 
@@ -244,6 +246,15 @@ def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: floa
         state.rests,
         state.steps,
     )
+
+
+def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tuple[TwinState, list[str]]:
+    """Compare a window's voltage with that of the controller stated for it; return the alarm, if it is one."""
+    made = decoded.compare_controller(model.controller, state.known.get(decoded.message.parameter_version))
+    if made is None:
+        return state, []
+    before, count = state.other_controller, 0 if made.agrees else state.other_controller + 1
+    return replace(state, other_controller=count), [made.sentence] if count == OTHER_CONTROLLER > before else []
 
 
 def _ask(
@@ -290,6 +301,8 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     machine = state.wear.machine
     if machine is not None and machine.disputed and not stale:
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
+    if state.other_controller >= OTHER_CONTROLLER and not stale:
+        return state, Redesign(None, math.nan, _OTHER)
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)
@@ -369,24 +382,3 @@ def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) ->
     triage = state.triage and state.triage.doubted(why)
     state = replace(state, lookups=lookups, versions=state.versions.without_pending(), triage=triage)
     return StepResult(state, (), (record, WithdrawalRecord(request, why)))
-
-
-def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
-    """Make an update without version and base; it may be applied until `validity` (s) after the window's start."""
-    assert redesign.setting is not None
-    estimate = evidence.estimate
-    low, high = estimate.interval
-    return Update(
-        servo=message.servo,
-        version=1,
-        base_version=0,
-        window=(message.boot, message.sequence),
-        data_time=message.start,
-        gap=finite(estimate.gap),
-        std=finite(estimate.std_total),
-        interval=(finite(low), finite(high)),
-        status=estimate.status.value,
-        setting=redesign.setting,
-        not_after=message.start + validity,
-        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
-    )

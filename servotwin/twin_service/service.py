@@ -95,7 +95,7 @@ class TwinService:
             metrics=self.metrics,
             clocks=self.clocks,
             owner=self._owner,
-            quota=VerificationQuota(config.proofs_per_minute),
+            quota=VerificationQuota(config.verifications_per_minute),
         )
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
