@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import (
     Answer,
     Fallback,
@@ -26,14 +27,12 @@ from servotwin.messages import (
     ParameterMessage,
     Receipt,
     Update,
-    Verification,
     WindowMessage,
     finite,
 )
-from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.certificate import verification_of
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.alarms import alarms
-from servotwin.twin.estimating import UNUSABLE, DecodedWindow, Wear, stated_machine
+from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
     AlarmRecord,
     DisturbanceRecord,
@@ -50,11 +49,12 @@ from servotwin.twin.evidence import (
 )
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
-from servotwin.twin.state import TwinState
+from servotwin.twin.requests import Attempts
+from servotwin.twin.state import TwinState, noted_setting
 from servotwin.twin.triage import Glance
-from servotwin.twin.versions import Attempts, noted_setting
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
+_OTHER = "another controller runs than is stated: a setting follows when a window is of the stated one"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
@@ -170,10 +170,23 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     stale = not state.versions.admits(message)
     rejection = _STALE
     if not stale:
-        state, rejection = _learn(model, state, decoded, estimate, arrived)
+        wear, rejection = before.update(
+            trends,
+            message.boot,
+            estimate,
+            arrived,
+            learning,
+            stated_machine(model.settings),
+            decoded.window,
+            model.motor,
+        )
+        state = replace(state, wear=wear)
     trend = state.wear.trend(trends)
     records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
-    records += [AlarmRecord(message, sentence) for sentence in alarms(model.settings, before, state.wear, estimate)]
+    records += [AlarmRecord(message, sentence) for sentence in state.wear.alarms(before, estimate, trends, learning)]
+    if not stale:
+        state, differs = _compare(model, state, decoded)
+        records += [AlarmRecord(message, sentence) for sentence in differs]
     if model.triage is not None and state.triage is not None and not stale:
         known = state.wear.known_machine(learning, arrived)
         triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
@@ -208,16 +221,13 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     return StepResult(sent.state, sent.messages + others, all_records)
 
 
-def _learn(
-    model: TwinModel, state: TwinState, decoded: DecodedWindow, estimate: GapEstimate, arrived: float
-) -> tuple[TwinState, str]:
-    """Add a window to trend, machine and motor; return the reason why the trend rejected it, or an empty string."""
-    settings, message = model.settings, decoded.message
-    stated = stated_machine(settings)
-    wear, rejection = state.wear.update(settings.trend, message.boot, estimate, arrived, settings.learning, stated)
-    if model.motor is not None and decoded.window is not None:
-        wear = replace(wear, motor=model.motor.updated(wear.motor, decoded.window, arrived))
-    return replace(state, wear=wear), rejection
+def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tuple[TwinState, list[str]]:
+    """Compare a window's voltage with that of the controller stated for it; return the alarm, if it is one."""
+    made = decoded.compare_controller(model.controller, state.known.get(decoded.message.parameter_version))
+    if made is None:
+        return state, []
+    before, count = state.other_controller, 0 if made.agrees else state.other_controller + 1
+    return replace(state, other_controller=count), [made.sentence] if count == OTHER_CONTROLLER > before else []
 
 
 def _ask(
@@ -274,6 +284,8 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     machine = state.wear.machine
     if machine is not None and machine.disputed and not stale:
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
+    if state.other_controller >= OTHER_CONTROLLER and not stale:
+        return state, Redesign(None, math.nan, _OTHER)
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale or (evidence.why_not and needs_estimate):
         return state, Redesign(None, math.nan, evidence.why_not)
@@ -373,23 +385,4 @@ def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, valid
         setting=redesign.setting,
         not_after=message.start + validity,
         verification=None if redesign.certificate is None else verification_of(redesign.certificate),
-    )
-
-
-def verification_of(certificate: Certificate) -> Verification:
-    """Summarise a certificate for an update, without its computing time: equal twins send equal bytes."""
-    return Verification(
-        members=certificate.members,
-        looked_at=certificate.looked_at,
-        settled=certificate.settled,
-        tail=certificate.tail,
-        overshoot=certificate.overshoot,
-        Ms=certificate.Ms,
-        crossover=certificate.crossover,
-        phase_margin=certificate.phase_margin,
-        saturated=certificate.saturated,
-        settled_least=certificate.settled_least,
-        confidence=certificate.confidence if certificate.settled_least else 0.0,
-        Ms_worst=0.0 if certificate.loop is None else certificate.loop.Ms_worst,
-        phase_margin_worst=0.0 if certificate.loop is None else certificate.loop.phase_margin_worst,
     )

@@ -20,7 +20,8 @@ from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
+from servotwin.estimation.learning.wear import TrendState
 from servotwin.messages import (
     Acknowledge,
     Hello,
@@ -33,11 +34,11 @@ from servotwin.messages import (
     decode,
     encode,
 )
-from servotwin.messages.compression import DEFLATE, ZSTD, compress
+from servotwin.messages.codec import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import step as stepping
-from servotwin.twin.estimating import DecodedWindow, TrendState
+from servotwin.twin.estimating import DecodedWindow
 from servotwin.twin.evidence import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings

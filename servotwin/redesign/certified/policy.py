@@ -12,8 +12,8 @@ from typing import ClassVar, Protocol
 from servotwin.control.gains import with_gains
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
-from servotwin.estimation.motor import BIAS, FRICTION, LearntMotor
-from servotwin.estimation.trend import Trend
+from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
+from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
 from servotwin.plant.servo import Servo

@@ -22,7 +22,7 @@ from msgspec.structs import replace
 from scipy.special import erf
 
 from servotwin.estimation.estimate import NORMAL_95
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
