@@ -16,6 +16,7 @@ from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachi
 from servotwin.analysis.maps.pool import shared, workplace
 from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.redesign.certified.margins import scaled_law
+from servotwin.redesign.registry import certified_policy
 from servotwin.simulation import Run
 
 SCHEMA, NAME = "servotwin-bench-loops/1", "loops"
