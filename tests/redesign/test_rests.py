@@ -10,7 +10,7 @@ import pytest
 from servotwin.control.gains import gains_of
 from servotwin.estimation.disturbance import Disturbance, disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.motor import LearntMotor
+from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.window import Window
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
