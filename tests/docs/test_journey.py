@@ -29,10 +29,12 @@ NOT_COUNTED = {
     ),
     "settings": ("config/", "control/controller.py", "edge/settings.py"),
     "plumbing": ("runtime/retry.py",),
-    "beside the way": ("edge/watch.py", "estimation/controller.py", "twin/responses.py", "twin/lookups.py", "twin/requests.py"),
+    "beside the way": (
+        "edge/watch.py", "estimation/controller.py", "twin/responses.py", "twin/lookups.py", "twin/requests.py",
+    ),
 }  # fmt: skip
 COMPILED = {"control/law.py"}
-"""On the page, though no Python code of it runs in a simulation."""
+"""On the page, though it runs compiled in a simulation."""
 
 
 def test_the_numbers_in_the_text_are_the_rows_of_the_tables():
@@ -84,4 +86,4 @@ def test_the_rows_of_the_co_simulation_are_the_files_that_run():
     passed = {hop_of(file) for file in files if not file.startswith(ignored)}
     rows = {file.removeprefix("servotwin/") for co_simulated, _, file in ROW.findall(PAGE) if co_simulated == "C"}
     assert passed - rows == set()
-    assert rows - passed == COMPILED
+    assert rows - passed <= COMPILED
