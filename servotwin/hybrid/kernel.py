@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.build import fill_entered
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.crossing import is_leaving, next_crossing
 from servotwin.hybrid.flow import Scratch, advance, advance_clean, advance_fraction, product
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
@@ -170,7 +170,7 @@ def step_once(t: Tables, mode: int, x: Array, step: int, record: RunRecord, scra
     return mode
 
 
-@bare
+@subroutine
 def flow_until(
     t: Tables,
     x: Array,

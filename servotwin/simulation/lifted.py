@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from servotwin.control import law
 from servotwin.control.law import LawState
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined, verbatim
+from servotwin.hybrid.compiled import bare, inlined, subroutine, verbatim
 from servotwin.hybrid.flow import LINGERING, Scratch
 from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, clean_ticks, jump
@@ -193,7 +193,7 @@ def vast_blocks(
     return clean == wanted
 
 
-@bare
+@subroutine
 def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segments, memory: LiftedMemory) -> int:
     """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced. Stops where
     `deepens`."""
