@@ -222,7 +222,7 @@ class MotorLearning:
             if after.surely(index) > stated and (before is None or before.surely(index) <= stated):
                 return (
                     f"the motor is not what is stated: its {name} is at least {100.0 * after.surely(index):.3g} % off "
-                    f"the model's, and {100.0 * stated:.3g} % are stated; check the nameplate, and what the motor drives"
+                    f"the model's, and {100.0 * stated:.3g} % are stated; check the nameplate, and the motor's load"
                 )
         return ""
 
