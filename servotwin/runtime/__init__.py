@@ -1,1 +1,1 @@
-"""Plumbing without servos: retries, frames, child processes, locks and atomic files; standard library and msgspec only."""
+"""Plumbing without servos: retries, frames, processes, locks and atomic files; standard library and msgspec only."""
