@@ -15,12 +15,13 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.estimator_windows import WindowCase, paper_loop_cases
 from benchmarks.wrong_models import ModelError
+from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.quick import QuickFit, quick_fit
 from servotwin.messages import Channel, WindowMessage, checksum, decode, encode, pack_channel, pack_finely
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.twin.estimating import Wear, decode_window, estimator_of
+from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.triage import TriageState, glance
 

@@ -15,10 +15,10 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.window import Window
 from servotwin.messages import Acknowledge, Band, Fallback, Gains, Message, Receipt, Setting, Update, WindowMessage
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.estimating import Expectation
 from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 

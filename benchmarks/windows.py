@@ -18,7 +18,7 @@ from benchmarks.corrupted import KINDS, corrupted_windows
 from benchmarks.wrong_models import LOOPS, ModelError, Tally, learning_twin
 from servotwin.analysis.maps.pool import shared, workplace
 from servotwin.estimation import whitened
-from servotwin.estimation.machine import LearningSettings, nameplate
+from servotwin.estimation.learning.machine import LearningSettings, nameplate
 
 SCHEMA = "servotwin-bench-windows/1"
 NAME = "windows"

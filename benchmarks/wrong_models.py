@@ -12,10 +12,11 @@ import numpy as np
 from benchmarks.estimator_windows import WindowCase, cut, random_servo
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus
+from servotwin.estimation.learning.wear import Wear
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Run, simulate
-from servotwin.twin.estimating import Wear, estimator_of
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 FALSE = math.radians(0.1)  # error from which an accepted estimate outside its own interval counts as false

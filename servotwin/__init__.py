@@ -27,7 +27,7 @@ _HOMES = {
     "SquareWave": "servotwin.plant.signals",
     "StabilityMap": "servotwin.analysis.maps.result",
     "Step": "servotwin.plant.signals",
-    "Trend": "servotwin.estimation.trend",
+    "Trend": "servotwin.estimation.learning.trend",
     "Tuning": "servotwin.analysis.tuning.tune",
     "Uncertainty": "servotwin.redesign.certified.uncertainty",
     "Window": "servotwin.estimation.window",
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from servotwin.estimation.estimate import GapEstimate, GapStatus
     from servotwin.estimation.gap import estimate_gap
     from servotwin.estimation.joint.estimator import estimate_jointly
-    from servotwin.estimation.trend import Trend
+    from servotwin.estimation.learning.trend import Trend
     from servotwin.estimation.window import Window
     from servotwin.plant.noise import Noise
     from servotwin.plant.servo import Servo

@@ -36,7 +36,7 @@ def reading(file: Path) -> Iterator[sqlite3.Connection]:
 
 def waiting(connection: sqlite3.Connection, now: float) -> tuple[int, float]:
     """Windows and letters that wait, and the age (s) of the oldest."""
-    query = "SELECT count(*) FROM messages WHERE done IS NULL AND kind != 'proof'"
+    query = "SELECT count(*) FROM messages WHERE done IS NULL AND kind != 'verification'"
     (count,) = connection.execute(query).fetchone()
     (oldest,) = connection.execute("SELECT min(ready) FROM twins WHERE ready IS NOT NULL").fetchone()
     return int(count), 0.0 if oldest is None else max(0.0, now - float(oldest))
@@ -58,7 +58,7 @@ def done(connection: sqlite3.Connection, since: float, until: float) -> Processe
 
 def made(connection: sqlite3.Connection, since: float) -> dict[str, int]:
     """Number of records of each kind of evidence since a time (s since the epoch)."""
-    query = "SELECT kind, count(*) FROM evidence WHERE made >= ? GROUP BY kind"
+    query = "SELECT kind, count(*) FROM evidence WHERE created >= ? GROUP BY kind"
     return {str(kind): int(count) for kind, count in connection.execute(query, (since,))}
 
 

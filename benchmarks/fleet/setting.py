@@ -31,7 +31,7 @@ _FILE = """
 port = 0
 store = "sqlite:///{store}"
 workers = {workers}
-proofs_per_minute = {proofs}
+verifications_per_minute = {verifications}
 speed = 1e6
 rate_limit_per_s = 1000.0
 log_level = "warning"
@@ -72,7 +72,7 @@ class FleetScale:
     places, windows : int
         Of the stock: gaps, and windows of each.
     workers, connections : int
-    proofs : float
+    verifications : float
         Verifications per minute, at most.
     every : int
         At least every so many windows of a servo one is estimated.
@@ -89,7 +89,7 @@ class FleetScale:
     windows: int = 16
     workers: int = 2
     connections: int = 64
-    proofs: float = 6.0
+    verifications: float = 6.0
     every: int = 50
 
     def full(self) -> FleetScale:
@@ -173,5 +173,11 @@ def _hello(servo: str, now: float) -> Incoming:
 
 
 def _text(scale: FleetScale, enabled: bool) -> str:
-    values = {"store": STORE, "table": TABLE, "workers": scale.workers, "proofs": scale.proofs, "every": scale.every}
+    values = {
+        "store": STORE,
+        "table": TABLE,
+        "workers": scale.workers,
+        "verifications": scale.verifications,
+        "every": scale.every,
+    }
     return _FILE.format(**values, enabled=str(enabled).lower())

@@ -58,7 +58,7 @@ def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
     )
     estimated, glances = whole.made.get("estimate", 0), max(1, whole.made.get("glance", 0))
     yield ReportLine("... estimated, the others glanced at", "", f"{100.0 * estimated / glances:.1f} %")
-    verifications = whole.made.get("proof", 0)  # the store's word
+    verifications = whole.made.get("verification", 0)
     yield ReportLine("... updates, verifications by now", "", f"{whole.made.get('update', 0)}, {verifications}")
     yield ReportLine("... queue age: median, 99 %, most", "", _numbers("s", *steady.age))
     yield ReportLine(

@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks.estimator_figures import FLOOR
 from servotwin.analysis.maps.pool import shared
+from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.whitened.free_model import adapted
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
@@ -22,7 +23,7 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SquareWave
 from servotwin.simulation import simulate
-from servotwin.twin.estimating import Wear, estimator_of
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 RATE, SECONDS = 5000.0, 1.0

@@ -56,7 +56,7 @@ def lines_of(
 def servo_line(servo: JsonObject) -> str:
     """One row of the table of servos."""
     version = "-" if servo["version"] is None else servo["version"]
-    received = "never" if servo["heard"] is None else _time(servo["heard"])
+    received = "never" if servo["last_message"] is None else _time(servo["last_message"])
     receipt = servo["receipt"][:12] or "-"
     status = f"{_gap(servo) or '-':>15}  {_status(servo)[:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>7}"
     return f"{servo['servo']:24}  {status}  {received}"
@@ -72,7 +72,7 @@ def _head(servo: JsonObject, traces: Sequence[JsonObject]) -> Iterator[str]:
     gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg (95 %; {_status(servo) or 'unchanged'})"
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
     receipt = f" ({servo['receipt']})" if servo["receipt"] else ""
-    last = "" if servo["heard"] is None else f", last message {_time(servo['heard'])} UTC"
+    last = "" if servo["last_message"] is None else f", last message {_time(servo['last_message'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
     yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{last}"
     newest = [line for line in (_wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"))) if line]
@@ -82,7 +82,7 @@ def _head(servo: JsonObject, traces: Sequence[JsonObject]) -> Iterator[str]:
 
 def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
     """Body of the newest evidence of a kind."""
-    evidence = (one for trace in traces for one in reversed(trace["found"]) if one["kind"] == kind)
+    evidence = (one for trace in traces for one in reversed(trace["evidence"]) if one["kind"] == kind)
     return next((one["body"] for one in evidence if one["body"]), {})
 
 
@@ -102,8 +102,8 @@ def _disturbance(body: JsonObject) -> str:
 
 def _matters(trace: JsonObject) -> bool:
     """True where more than an estimate followed from the window."""
-    quiet = all(one["kind"] in _REMARKS for one in trace["found"])
-    return bool(trace["steps"]) or not quiet or any(_failed(one) for one in trace["found"])
+    quiet = all(one["kind"] in _REMARKS for one in trace["evidence"])
+    return bool(trace["steps"]) or not quiet or any(_failed(one) for one in trace["evidence"])
 
 
 def _window(trace: JsonObject) -> Iterator[Entry]:
@@ -119,7 +119,7 @@ def _window(trace: JsonObject) -> Iterator[Entry]:
 
 def _estimate(trace: JsonObject) -> JsonObject | None:
     """Estimate of a window, or the glance where there is no estimate."""
-    estimates = [one for one in trace["found"] if one["kind"] in ("glance", "estimate") and not _failed(one)]
+    estimates = [one for one in trace["evidence"] if one["kind"] in ("glance", "estimate") and not _failed(one)]
     return estimates[-1] if estimates else None
 
 
@@ -130,8 +130,8 @@ def _remarks(trace: JsonObject) -> Iterator[str]:
         yield "waits to be processed"
     # Evidence of the second kind has a remark of its own, which repeats that on the first.
     repeated_by = {"glance": "estimate", "estimate": "redesign"}
-    with_remark = {one["kind"] for one in trace["found"] if one["status"]}
-    for one in trace["found"]:
+    with_remark = {one["kind"] for one in trace["evidence"] if one["status"]}
+    for one in trace["evidence"]:
         if _failed(one):
             yield one["status"]
         elif one["kind"] == "redesign" and not one["status"] and not trace["steps"]:
@@ -166,7 +166,7 @@ def _remark(one: JsonObject) -> Iterator[str]:
             yield f"{status}: {'; '.join(_reasons(one))}"
         elif status and _REMARKS[kind]:
             yield _REMARKS[kind].format("no new information" if status == _UNCHANGED else status)
-    elif kind == "proof":
+    elif kind == "verification":
         yield f"version {version} " + (
             f"FAILED its verification: {status}" if status else "is verified for this evidence"
         )
@@ -223,7 +223,7 @@ def _event(one: JsonObject) -> Entry:
         text = f"the edge answers a request: {one['status']}"
     else:
         text = one["status"] or kind
-    return one["made"], "", f"{_time(one['made'])}  {text}"
+    return one["created"], "", f"{_time(one['created'])}  {text}"
 
 
 def _measured(body: JsonObject) -> str:

@@ -15,13 +15,14 @@ from rich.table import Table
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
-from servotwin.estimation.trend import Trend, TrendSettings
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
-from servotwin.twin.estimating import Wear, estimator_of
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 WINDOW = 1.0  # s of the servo's own

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, InvalidMessage
-from servotwin.messages.compression import decompress
+from servotwin.messages.codec import decompress
 from servotwin.store.records import StoredEvidence, WindowTrace
 from servotwin.store.store import Store
 from servotwin.twin.model_registry import ServoModel

@@ -17,15 +17,31 @@ from typing import Protocol
 import numpy as np
 
 from servotwin.control.gains import gains_of
-from servotwin.cosim.edge import SimulatedEdge
 from servotwin.cosim.loop import Loop, Transmission
 from servotwin.cosim.machine import Machine, SimulatedMachine
 from servotwin.cosim.scenario import Scenario
-from servotwin.link.outbox import letter_digest
-from servotwin.link.simulated import SimulatedLink
-from servotwin.messages import LetterAcknowledge, Message, Request, Setting, Update, WindowMessage, decode, encode
+from servotwin.edge.agent import Agent, ScheduledMessage
+from servotwin.edge.drive import SettingWriter
+from servotwin.edge.outlet import CHANNELS
+from servotwin.edge.settings import AgentSettings
+from servotwin.link.outbox import MemoryOutbox, letter_digest
+from servotwin.link.session import Session
+from servotwin.link.simulated import Event, LinkDirection, SimulatedLink, SimulatedSender, VirtualClock
+from servotwin.messages import (
+    Acknowledge,
+    Answer,
+    Fallback,
+    LetterAcknowledge,
+    Message,
+    Receipt,
+    Request,
+    Setting,
+    Update,
+    WindowMessage,
+    decode,
+    encode,
+)
 from servotwin.plant.signals import as_pieces
-from servotwin.runtime.clock import Event, VirtualClock
 from servotwin.simulation import Run
 from servotwin.twin.estimating import Estimator
 from servotwin.twin.evidence import EvidenceLog
@@ -60,6 +76,71 @@ def cosimulate(scenario: Scenario, progress: Progress | None = None, estimator: 
         if progress is not None:
             progress(cosimulation.share)
     return cosimulation.loop(machine.run())
+
+
+class SimulatedEdge:
+    """The deployed edge's agent, outbox and session, on a simulated machine and link.
+
+    Parameters
+    ----------
+    settings : AgentSettings
+    machine : Machine
+        It begins with the parameters of the settings in force.
+    clock : VirtualClock
+    line : LinkDirection
+        To the twin.
+
+    Attributes
+    ----------
+    agent : Agent
+    outbox : MemoryOutbox
+    receipts, fallbacks, answers : list
+        Letters, in the order in which the agent wrote them.
+    """
+
+    def __init__(self, settings: AgentSettings, machine: Machine, clock: VirtualClock, line: LinkDirection) -> None:
+        self.outbox = MemoryOutbox()
+        self.agent = Agent(settings, self.outbox)
+        self.receipts: list[Receipt] = []
+        self.fallbacks: list[Fallback] = []
+        self.answers: list[Answer] = []
+        self._machine = machine
+        # Retries are not spread at random: a run is the same each time.
+        self._sender = SimulatedSender(Session(self.outbox, settings.retry), clock, line)
+        self._writer = SettingWriter(machine, self.agent.parameters)
+
+    def advance(self, stop: int) -> None:
+        """Advance the machine to a sample, and have the agent take the samples before it."""
+        first = self._machine.index
+        self._machine.advance(stop)
+        letters = self.agent.absorb_block(*(self._machine.measured(name, first, stop) for name in CHANNELS))
+        self._writer.write(self.agent)
+        self._store(letters)
+        self._sender.plan(self.agent.time)
+
+    def receive(self, data: bytes) -> None:
+        """Take bytes that arrived from the twin."""
+        message = decode(data)
+        if isinstance(message, LetterAcknowledge):
+            self._sender.acknowledge(message.digest)
+            return
+        if isinstance(message, Acknowledge):
+            # Before the agent, which looks if others still wait.
+            self._sender.acknowledge((message.boot, message.sequence))
+        letters = self.agent.receive(message)
+        self._writer.write(self.agent)
+        self._store(letters)
+        self._sender.send_due()
+
+    def _store(self, letters: list[ScheduledMessage]) -> None:
+        for _, letter in letters:
+            if isinstance(letter, Receipt):
+                self.receipts.append(letter)
+            elif isinstance(letter, Fallback):
+                self.fallbacks.append(letter)
+            elif isinstance(letter, Answer):
+                self.answers.append(letter)
+            self.outbox.put_letter(encode(letter))
 
 
 class Remote(Protocol):

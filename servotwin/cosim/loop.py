@@ -13,8 +13,8 @@ import numpy as np
 from servotwin.cosim.scenario import Scenario
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.passage import Passage
-from servotwin.estimation.trend import Trend
 from servotwin.link.simulated import Fate
 from servotwin.messages import Answer, Fallback, Message, Receipt, Request, Update, WindowMessage, decode
 from servotwin.redesign.excitation import Decision

@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from servotwin.cosim.loop import Loop
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.simulation import Run
-from servotwin.twin.estimating import Expectation, decode_window, estimator_of
+from servotwin.twin.estimating import decode_window, estimator_of
 
 
 @dataclass(frozen=True)

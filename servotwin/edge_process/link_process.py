@@ -30,9 +30,8 @@ from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frames import LetterFrame, ProcessedFrame, SaveFrame, StatusFrame, ToLink, WindowFrame
 from servotwin.edge_process.monitoring import TroubleLog, log, summarise, write_status
 from servotwin.errors import InvalidInput
-from servotwin.link.client import Receiver, Sender
 from servotwin.link.outbox import Key
-from servotwin.link.session import Session
+from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import MOST_UNWRITTEN, SqliteOutbox
 from servotwin.link.transport import Transport
 from servotwin.messages import Acknowledge, InvalidMessage, LearntResponse, decode, encode

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servotwin.hybrid.automaton import Array, Automaton
-from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.compiled import bare, subroutine
 from servotwin.hybrid.exponential import next_power, rebase, start_powers
 from servotwin.hybrid.flow import product
 from servotwin.hybrid.tables import (
@@ -44,7 +44,7 @@ def build_tables(automaton: Automaton, step: float) -> Tables:
     return tables
 
 
-@bare
+@subroutine
 def _fill_guards(t: Tables, numbers: Numbers, mode: int, w: Workspace) -> None:
     """Rows, slopes and resets."""
     n = t.states
@@ -60,7 +60,7 @@ def _fill_guards(t: Tables, numbers: Numbers, mode: int, w: Workspace) -> None:
                 t.reset[(at + j) * n + i] = numbers.resets[(at + i) * n + j] - (i == j)
 
 
-@bare
+@subroutine
 def _fill_single(t: Tables, mode: int) -> None:
     """One step: the flow's first power, and every guard's Bernstein rows from its values and slopes at both ends."""
     n, stride = t.states, t.states + 4 * t.guards
@@ -79,7 +79,7 @@ def _fill_single(t: Tables, mode: int) -> None:
             t.single[to + 3] = t.fine[value + 1]
 
 
-@bare
+@subroutine
 def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
     """The terms ``(A s)**k / k!`` of a part's flow, k = 1 .. PART_TERMS, transposed side by side."""
     n, stride = t.states, t.states * PART_TERMS
@@ -95,7 +95,7 @@ def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float,
                 w.powers.term[j] = w.next_row[j] * (step / PARTS) / (k + 2)
 
 
-@bare
+@subroutine
 def _store(p: Powers, n: int, table: Array, base: int) -> None:
     """The present power, transposed."""
     for i in range(n):
@@ -103,7 +103,7 @@ def _store(p: Powers, n: int, table: Array, base: int) -> None:
             table[base + j * n + i] = p.power[i * n + j]
 
 
-@bare
+@subroutine
 def _fill_guard(
     t: Tables, table: Array, nodes: int, mode: int, g: int, node: int, spacing: float, w: Workspace
 ) -> None:
@@ -126,7 +126,7 @@ def _fill_guard(
             table[at + j * stride + thirds - 1] = w.slope[j]
 
 
-@bare
+@subroutine
 def _fill_jumps(t: Tables, jumps: Array, nodes: int, flow: int, p: Powers) -> None:
     """Jumps of one scale: the present power becomes its base, and its powers follow."""
     n = t.states
@@ -137,7 +137,7 @@ def _fill_jumps(t: Tables, jumps: Array, nodes: int, flow: int, p: Powers) -> No
         _store(p, n, jumps, (flow * nodes + j) * n * n)
 
 
-@bare
+@subroutine
 def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
     """Everything that advances by the flow of a mode."""
     n, flow, p = t.states, t.flow_of[mode], w.powers
@@ -155,7 +155,7 @@ def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool
         _fill_jumps(t, t.jump_coarse, int(NODES_COARSE), flow, p)
 
 
-@bare
+@subroutine
 def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, mode: int, spacing: float, w: Workspace) -> None:
     """The guards of a mode at the nodes of one scale."""
     n, p = t.states, w.powers
@@ -168,7 +168,7 @@ def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, mode: int, sp
             _fill_guard(t, table, nodes, mode, g, j + 1, spacing, w)
 
 
-@bare
+@subroutine
 def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w: Workspace) -> None:
     """A guard's Taylor series over a step, the sizes of all the terms that enter it and each of its derivatives."""
     n = t.states
@@ -218,7 +218,7 @@ def fill_tables(t: Tables, numbers: Numbers, step: float, blocks: bool, w: Works
         _fill_mode(t, numbers, mode, step, blocks, w)
 
 
-@bare
+@subroutine
 def begin_tables(pending: Pending, automaton: int) -> None:
     """Leave the tables of all modes to the run of one automaton."""
     pending.automaton[0] = automaton
@@ -228,7 +228,7 @@ def begin_tables(pending: Pending, automaton: int) -> None:
         pending.workspace.filled[flow] = 0
 
 
-@bare
+@subroutine
 def fill_entered(t: Tables, mode: int, pending: Pending) -> None:
     """Tables of a mode that is entered for the first time."""
     a = pending.automaton[0]

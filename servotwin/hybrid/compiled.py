@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from types import CodeType
 from typing import Any, TypeVar, cast
 
@@ -17,6 +17,7 @@ from numba import njit
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compile_progress import show_compilation
+from servotwin.hybrid.subroutine import SubroutineCompiler
 
 show_compilation()
 
@@ -34,20 +35,40 @@ def bare(function: _Function) -> _Function:
     return _compile(function, fastmath={"contract"}, _nrt=False)
 
 
+def subroutine(function: _Function) -> _Function:
+    """Compile like `bare`, a function that compiled functions call, and Python only in tests: a part of its callers,
+    without machine code of its own, which would be as much work again."""
+    return _compile_part(function, fastmath={"contract"}, _nrt=False)
+
+
 def inlined(function: _Function) -> _Function:
-    """Compile inline, for helpers of a hot loop: a call would copy the array header of every argument."""
-    return _compile(function, fastmath={"contract"}, _nrt=False, forceinline=True)
+    """Compile a subroutine inline, for helpers of a hot loop: a call would copy the array header of every argument."""
+    return _compile_part(function, fastmath={"contract"}, _nrt=False, forceinline=True)
 
 
 def summed(function: _Function) -> _Function:
-    """Compile inline, additions in any order: one vector of partial sums instead of a chain of additions."""
-    return _compile(function, fastmath={"contract", "reassoc"}, _nrt=False, forceinline=True)
+    """Compile a subroutine inline, additions in any order: a vector of partial sums and no chain of additions."""
+    return _compile_part(function, fastmath={"contract", "reassoc"}, _nrt=False, forceinline=True)
 
 
 def verbatim(function: _Function) -> _Function:
-    """Compile inline, every operation rounded as written: the same bits as the interpreter's."""
+    """Compile a subroutine inline, every operation rounded as written: the same bits as the interpreter's."""
     # Explicit, because numba compiles a callee with its caller's fastmath where the callee sets none.
-    return _compile(function, fastmath=False, _nrt=False, forceinline=True)
+    return _compile_part(function, fastmath=False, _nrt=False, forceinline=True)
+
+
+def _compile_part(function: _Function, **options: Any) -> _Function:
+    """Compile a part of other functions; a test that calls it from Python compiles it once more."""
+    part: Any = _compile(function, **options, no_cpython_wrapper=True, pipeline_class=SubroutineCompiler)
+
+    @cache
+    def callable_from_python() -> Any:
+        return _compile(function, **options)
+
+    # What Python calls it with matches none of the versions that numba knows: it asks here, and calls what it is given.
+    part.add_overload = lambda compiled: part.overloads.update({tuple(compiled.signature.args): compiled})
+    part._compile_for_args = lambda *_arguments, **_keywords: callable_from_python()
+    return cast(_Function, part)
 
 
 def _compile(function: _Function, **options: Any) -> _Function:
@@ -61,7 +82,7 @@ def _compile(function: _Function, **options: Any) -> _Function:
             "environment variable NUMBA_CACHE_DIR to a folder that is"
         ) from None
     # Every process prints a set of strings in another order.
-    sorted_options = {name: sorted(value) if isinstance(value, set) else value for name, value in options.items()}
+    sorted_options = {name: _text(value) for name, value in options.items()}
     dispatcher.options_key = repr(sorted(sorted_options.items()))
     dispatcher.stamp = stamp(function, dispatcher.options_key)
     # numba has no public way to set the stamp that its index file is compared with.
@@ -69,6 +90,11 @@ def _compile(function: _Function, **options: Any) -> _Function:
     index._source_stamp = dispatcher.stamp
     index._load_index = partial(_load_index, index._load_index)
     return cast(_Function, dispatcher)
+
+
+def _text(option: Any) -> str:
+    """The same text in every process."""
+    return option.__name__ if isinstance(option, type) else repr(sorted(option) if isinstance(option, set) else option)
 
 
 def _load_index(load: Callable[[], dict[Any, Any]]) -> dict[Any, Any]:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.linalg import matrix_balance
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined, verbatim
+from servotwin.hybrid.compiled import bare, inlined, subroutine, verbatim
 from servotwin.hybrid.flow import product
 from servotwin.hybrid.tables import Powers, new_powers
 
@@ -61,14 +61,14 @@ def _multiply(a: Array, b: Array, n: int, p: Powers) -> None:
         product(b, 0, n, n, a[at : at + n], p.change[at : at + n])
 
 
-@bare
+@subroutine
 def rebase(n: int, p: Powers) -> None:
     """The present power becomes the base: what comes next are powers of it."""
     for i in range(n * n):
         p.base[i], p.base_low[i] = p.power[i], p.power_low[i]
 
 
-@bare
+@subroutine
 def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None:
     """The first power of ``flow[base:]``, ``(n, n)`` flat, over a time in which no eigenvalue turns far: its Taylor
     series."""
@@ -96,7 +96,7 @@ def start_powers(flow: Array, base: int, n: int, time: float, p: Powers) -> None
     rebase(n, p)
 
 
-@bare
+@subroutine
 def next_power(n: int, p: Powers) -> None:
     """One base more: ``exp(A (j + 1) t) - I = B + P + B P``."""
     _multiply(p.base, p.power, n, p)

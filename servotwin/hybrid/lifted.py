@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import inlined, subroutine
 from servotwin.hybrid.flow import SIGNIFICANT, dot, dot_sizes, product, tall_product
 from servotwin.hybrid.tables import VECTOR, padded, zeros
 
@@ -108,7 +108,7 @@ def _stride(t: LiftedTables, intervals: int) -> int:
     return (t.watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
 
 
-@bare
+@subroutine
 def add_square(n: int, row: Array, sums: Array, base: int, stride: int) -> None:
     """Add ``row' row`` to a matrix whose rows are `stride` apart."""
     for i in range(n):
@@ -131,7 +131,7 @@ def cubic_weights(u: float, tilt: float) -> tuple[float, float, float, float]:
     )
 
 
-@bare
+@subroutine
 def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
     """The powers of a scale from its first, as deviations from one; each round makes as many as there were."""
     u, stride, known = w.powers, intervals * n, 1
@@ -153,7 +153,7 @@ def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
         known *= 2
 
 
-@bare
+@subroutine
 def _store_jumps(n: int, intervals: int, table: Array, slot: int, w: LiftedWorkspace) -> None:
     stride = intervals * n
     for i in range(n):
@@ -162,7 +162,7 @@ def _store_jumps(n: int, intervals: int, table: Array, slot: int, w: LiftedWorks
                 table[(slot * n + i) * stride + j * n + k] = w.powers[k * stride + j * n + i]
 
 
-@bare
+@subroutine
 def _double(n: int, intervals: int, power: int, watches: int, w: LiftedWorkspace) -> None:
     """``G + M' G M`` of every watch for the power of ``M`` at that place: the sums over twice as many intervals."""
     stride, width = intervals * n, watches * n
@@ -187,7 +187,7 @@ def _double(n: int, intervals: int, power: int, watches: int, w: LiftedWorkspace
             w.sums[i * width + j] += half[j] + w.turned[i * width + j]
 
 
-@bare
+@subroutine
 def _fill_rows(n: int, intervals: int, watch: int, w: LiftedWorkspace) -> None:
     """Value row, start row and end row of a watch at all ends of the intervals, into `rows`."""
     stride = intervals * n
@@ -202,7 +202,7 @@ def _fill_rows(n: int, intervals: int, watch: int, w: LiftedWorkspace) -> None:
                 w.rows[first + j * n + k] += row[k]
 
 
-@bare
+@subroutine
 def _fill_level(
     t: LiftedTables,
     table: Array,
@@ -232,7 +232,7 @@ def _fill_level(
             table[square + j * stride + i] = w.sums[(i * watches + watch) * n + j]
 
 
-@bare
+@subroutine
 def _add_deviation(
     n: int, watch: int, watches: int, intervals: int, length: float, only_ends: bool, w: LiftedWorkspace
 ) -> None:
@@ -267,7 +267,7 @@ def _add_deviation(
             w.sums[at] = 2.0 * (w.sums[at] + w.row[j])
 
 
-@bare
+@subroutine
 def _rebase(n: int, intervals: int, following: int, w: LiftedWorkspace) -> None:
     """The last power of a scale becomes the first of the next, which has `following` intervals."""
     last = (intervals - 1) * n
@@ -279,7 +279,7 @@ def _rebase(n: int, intervals: int, following: int, w: LiftedWorkspace) -> None:
             w.powers[i * following * n + k] = w.product[i * n + k]
 
 
-@bare
+@subroutine
 def _fill_scale(
     t: LiftedTables, table: Array, jumps: Array, slot: int, watches: int, intervals: int, length: int, last: bool,
     w: LiftedWorkspace,
@@ -304,7 +304,7 @@ def _fill_scale(
             _add_deviation(n, watch, watches, intervals, float(length), length == 1 and w.discrete[watch] > 0.0, w)
 
 
-@bare
+@subroutine
 def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """The tables of the map and the watches in `w`, but for those of the vast scale."""
     n, n2 = t.states, t.states * t.states
@@ -322,7 +322,7 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
     _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), True, w)
 
 
-@bare
+@subroutine
 def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """States from which the matrix in `product` makes others on which a watch deviates by more than rounding."""
     n, stride = t.states, _stride(t, COARSE)
@@ -352,7 +352,7 @@ def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -
                     t.uneven[slot * n + j] = 1.0
 
 
-@bare
+@subroutine
 def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """A high power of the map, from those of the vast scale in `w`, and what it leaves uneven."""
     n, d, new = t.states, w.product, w.powers
@@ -379,7 +379,7 @@ def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> Non
     _find_uneven(t, slot, watches, w)
 
 
-@bare
+@subroutine
 def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """The tables of the vast scale and of settling, from those of the coarse one and the watches in `w`."""
     n, stride, block = t.states, _stride(t, COARSE), (COARSE + 1) * t.states
@@ -432,7 +432,7 @@ def clean_part(
     return clean
 
 
-@bare
+@subroutine
 def settled_squares(
     t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, z: Array, way: Array, squares: Array
 ) -> bool:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.build import begin_tables, fill_entered
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, flow_until, follow_guards
 from servotwin.hybrid.output import Outputs, OutputWorkspace, fill_output, sample_segments
@@ -95,7 +95,7 @@ def output(memory: WorkerMemory, o: int) -> Outputs:
     return Outputs(every.table[o], every.place[o], every.order[o], every.used[o])
 
 
-@bare
+@subroutine
 def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
     """Make the tables those of automaton `a`, each to be filled when it is needed."""
     begin_tables(memory.scratch.pending, a)
@@ -106,7 +106,7 @@ def load(family: AutomatonFamily, a: int, memory: WorkerMemory) -> None:
     memory.loaded[0] = a
 
 
-@bare
+@subroutine
 def fill_sampled(family: AutomatonFamily, a: int, record: RunRecord, memory: WorkerMemory) -> None:
     """Fill the outputs of the modes in which the run just recorded was."""
     for s in range(record.size[0]):
@@ -116,7 +116,7 @@ def fill_sampled(family: AutomatonFamily, a: int, record: RunRecord, memory: Wor
                 fill_output(memory.tables, m, family.outputs[a, o], family.stride[a], output(memory, o), memory.block)
 
 
-@bare
+@subroutine
 def sample_all(record: RunRecord, memory: WorkerMemory, stride: int, traces: Array) -> None:
     """Every output of the run just recorded."""
     zero: Any = np.int64(0)  # as in run_members
@@ -136,7 +136,7 @@ def sample_all(record: RunRecord, memory: WorkerMemory, stride: int, traces: Arr
         )
 
 
-@bare
+@subroutine
 def _spread(y: Array, out: Array) -> None:
     lowest, highest, total, square = y[0], y[0], 0.0, 0.0
     for value in y:

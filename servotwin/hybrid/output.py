@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import Scratch, advance, advance_fraction, dot, product
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables, zeros
 
@@ -75,7 +75,7 @@ def _fill_rows(t: Tables, flow: int, row: Array, w: OutputWorkspace) -> None:
                 to[k] += start[k]
 
 
-@bare
+@subroutine
 def _lay_out(m: int, n: int, stride: int, outputs: Outputs, w: OutputWorkspace) -> None:
     """Rows as sampling needs them: whole ones, or for every step the columns that are not zero."""
     base = m * _BLOCK * n

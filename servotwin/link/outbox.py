@@ -9,8 +9,9 @@ from hashlib import blake2b
 from typing import NamedTuple, Protocol
 
 from servotwin.errors import InvalidInput
-from servotwin.link.transport import Parcel, deflated
+from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, encode
+from servotwin.messages.codec import deflated
 
 Key = tuple[str, int]
 """(boot, sequence): identifies a window of a servo."""

@@ -1,5 +1,9 @@
-"""A simulated link on the virtual clock, with delay, jitter, loss, duplicates, reordering, outages and a record."""
+"""A simulated link in virtual time, with delay, jitter, loss, duplicates, reordering, outages and a record.
 
+Events of the virtual clock are ordered by (time, priority, serial), so equal times resolve the same way in every run.
+"""
+
+import heapq
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,13 +12,12 @@ from functools import partial
 from hashlib import blake2b
 from math import inf
 from random import Random
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.link.session import Item, Session
 from servotwin.messages import encode
-from servotwin.runtime.clock import Event, VirtualClock
 
 
 def outage_table(
@@ -90,6 +93,78 @@ class SentCopy:
     sent: float
     arrival: float
     fate: Fate = Fate.IN_FLIGHT
+
+
+Action = Callable[[], object]
+
+
+class Event(NamedTuple):
+    """Action and its time (s); at equal times the lower priority goes first, then the event scheduled first."""
+
+    time: float
+    priority: int
+    serial: int
+    action: Action
+
+
+class VirtualClock:
+    """A clock that jumps from event to event.
+
+    Parameters
+    ----------
+    now : float
+        Time at the start, s.
+    """
+
+    def __init__(self, now: float = 0.0) -> None:
+        self._now = now
+        self._serial = 0
+        self._queue: list[Event] = []
+
+    @property
+    def now(self) -> float:
+        """Present time, s."""
+        return self._now
+
+    @property
+    def next_time(self) -> float | None:
+        """Time at which the next event is due, s; None: nothing is scheduled."""
+        return self._queue[0].time if self._queue else None
+
+    def schedule(self, time: float, action: Action, priority: int = 0) -> Event:
+        """Call `action` at `time`; the returned event can be cancelled.
+
+        Raises
+        ------
+        ValueError
+            When the time has passed or is not a number.
+        """
+        if not time >= self._now:
+            raise ValueError(f"cannot schedule at {time} s: it is {self._now} s")
+        event = Event(time, priority, self._serial, action)
+        self._serial += 1
+        heapq.heappush(self._queue, event)
+        return event
+
+    def cancel(self, event: Event) -> bool:
+        """Remove an event from the queue; False when it has happened already."""
+        if event not in self._queue:
+            return False
+        self._queue.remove(event)
+        heapq.heapify(self._queue)
+        return True
+
+    def step(self) -> None:
+        """Advance to the next event and perform it."""
+        event = heapq.heappop(self._queue)
+        self._now = event.time
+        event.action()
+
+    def run_until(self, time: float) -> None:
+        """Perform all events up to and including `time`, and advance to it."""
+        while self._queue and self._queue[0].time <= time:
+            self.step()
+        self._now = max(self._now, time)
 
 
 class LinkDirection:

@@ -31,8 +31,9 @@ from servotwin.link.sqlite_file import (
     put_aside,
     was_read_only,
 )
-from servotwin.link.transport import DEFLATE, Parcel, deflated
+from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, decode, encode
+from servotwin.messages.codec import DEFLATE, deflated
 
 BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters full"
 MOST_UNWRITTEN = 16_000_000

@@ -4,18 +4,9 @@ A transport carries bytes. It may lose, delay and repeat them; `deliver` returns
 acknowledgement.
 """
 
-import zlib
 from typing import NamedTuple, Protocol
 
 from servotwin.messages import Refusal
-
-DEFLATE = "deflate"
-
-
-def deflated(body: bytes) -> tuple[bytes, str]:
-    """Deflate the body where that makes it smaller; return it and its encoding."""
-    smaller = zlib.compress(body, 1)
-    return (smaller, DEFLATE) if len(smaller) < len(body) else (body, "")
 
 
 class Parcel(NamedTuple):

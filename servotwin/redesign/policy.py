@@ -9,8 +9,8 @@ from typing import ClassVar, Protocol
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.estimation.motor import LearntMotor
-from servotwin.estimation.trend import Trend
+from servotwin.estimation.learning.motor import LearntMotor
+from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Gains, Setting
 from servotwin.plant.servo import Servo

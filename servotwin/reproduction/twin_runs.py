@@ -16,11 +16,12 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import Loop
 from servotwin.estimation import paper, whitened
 from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.window import Window
 from servotwin.plant.signals import as_pieces
 from servotwin.reproduction.measures import MeasuredStep
 from servotwin.reproduction.runs import BIPOLAR, PERIOD, RATE, Square, Trace
-from servotwin.twin.estimating import Estimator, Expectation, estimator_of, known_gap
+from servotwin.twin.estimating import Estimator, estimator_of, known_gap
 
 PUBLISHED, OURS = paper.METHOD, whitened.METHOD
 SEEDS = (2023, 2024, 2025)  # of the noise; the first is the packaged scenario's

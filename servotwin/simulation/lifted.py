@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from servotwin.control import law
 from servotwin.control.law import LawState
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined, verbatim
+from servotwin.hybrid.compiled import bare, inlined, subroutine, verbatim
 from servotwin.hybrid.flow import LINGERING, Scratch
 from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, clean_ticks, jump
@@ -32,7 +32,6 @@ UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
-_FILLS = 128  # ticks in a mode and branch, after which its tables pay
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
@@ -195,7 +194,7 @@ def vast_blocks(
     return clean == wanted
 
 
-@bare
+@subroutine
 def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segments, memory: LiftedMemory) -> int:
     """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced. Stops where
     `deepens`."""
@@ -205,10 +204,10 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     squares, change = memory.squares, memory.change
     while end - place.at[0] >= 2 and segments.size[0] + 4 < len(segments.tick):
         filled, k = memory.filled[slot], place.at[0]
-        settles = filled == 2
+        settles = filled == 2 and place.at[5] >= _CALM
         if deepens(place, end, filled):
             break
-        if settles and place.at[5] >= _CALM and k >= again and end - k >= BLOCK:
+        if settles and k >= again and end - k >= BLOCK:
             if vast_blocks(z, place, slot, watches, end, segments, memory):
                 continue
             # What is near its bound now is so for a while.
@@ -265,15 +264,12 @@ def run_lifted(
             return FULL
         set_reference(places, coefficients, at[0] / rate - origin, z)
         if at[5] > 0 and end - at[0] >= 2:
-            slot = slot_of(at[1], at[2] == 1, at[3])
-            filled = memory.filled[slot]
+            filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
             at[6] = 1 if deepens(place, end, filled) else 0
-            memory.ticked[slot] += 1 if filled == 0 else 0
-            if memory.ticked[slot] > _FILLS or at[6] == 1:
-                memory.ticked[slot] = 0
+            if filled == 0 or at[6] == 1:
                 return UNFILLED
             watches = set_bounds(t, loop, places, place, memory)
-            if filled > 0 and advance_block(z, place, watches, end, segments, memory) > 0:
+            if advance_block(z, place, watches, end, segments, memory) > 0:
                 if at[0] >= end:
                     break
                 set_reference(places, coefficients, at[0] / rate - origin, z)

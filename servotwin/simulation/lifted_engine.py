@@ -103,7 +103,6 @@ def new_memory(places: Places, modes: int, watches: int) -> LiftedMemory:
         new_lifted(n, watches, slots),
         new_lifted_workspace(n, watches),
         np.zeros(slots, dtype=np.int8),
-        np.zeros(slots, dtype=np.int64),
         np.zeros(slots * n),
         np.zeros(watches),
         np.zeros(watches),

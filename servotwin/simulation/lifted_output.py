@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import dot, product, tall_product
 from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables, LiftedWorkspace, changes_at_ends
 from servotwin.simulation.lifted import TICKED, VAST, Segments
@@ -18,7 +18,7 @@ def _at(sample: int, state: int, n: int, samples_first: bool) -> int:
     return state * BLOCK + sample if samples_first else sample * n + state
 
 
-@bare
+@subroutine
 def _fill_output(
     lifted: LiftedTables, w: LiftedWorkspace, slot: int, row: Array, samples_first: bool, out: Array
 ) -> None:
@@ -54,7 +54,7 @@ def _sample(table: Array, base: int, begin: int, stop: int, stride: int, z: Arra
         product(table, base, BLOCK, last - first, z, out[first:last])
 
 
-@bare
+@subroutine
 def _prepare(
     memory: LiftedMemory, places: Places, slot: int, row: Array, stride: int, filled: NDArray[np.int8], table: Array
 ) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import bare, inlined
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import product
 from servotwin.hybrid.lifted import LiftedTables, LiftedWorkspace, add_square, cubic_weights, deepen_slot, fill_slot
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, TERMS, Tables
@@ -59,7 +59,6 @@ class LiftedMemory(NamedTuple):
     lifted: LiftedTables
     workspace: LiftedWorkspace
     filled: NDArray[np.int8]  # (slots,): 1, or 2 with the vast scale
-    ticked: NDArray[np.int64]  # (slots,) single ticks that might have been part of a block before the slot was filled
     voltage_rows: Array  # slots * N: the applied voltage after a tick, of the state before it
     low: Array
     high: Array
@@ -89,7 +88,7 @@ def _clear(row: Array) -> None:
         row[i] = 0.0
 
 
-@bare
+@subroutine
 def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory: LiftedMemory) -> None:
     """Fill the tick's map; the rows of the error and of the voltage wanted remain in `change` and `sizes`."""
     p, n, m = loop.parameters, places.states, memory.tick_map
@@ -145,7 +144,7 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
             m[i * n + i] -= 1.0
 
 
-@bare
+@subroutine
 def _law_watches(loop: LiftedLoop, places: Places, memory: LiftedMemory, first: int) -> int:
     """Fill the rows of the law's watches from watch `first` on; return the number of watches."""
     p, n, error, wanted = loop.parameters, places.states, memory.change, memory.sizes
@@ -171,7 +170,7 @@ def _law_watches(loop: LiftedLoop, places: Places, memory: LiftedMemory, first: 
     return count
 
 
-@bare
+@subroutine
 def _fill_flow(t: Tables, loop: LiftedLoop, mode: int, memory: LiftedMemory) -> None:
     """The flow of one tick, from the tables of search steps."""
     n, flow, left, w = t.states, t.flow_of[mode], loop.searches, memory.workspace
@@ -196,7 +195,7 @@ def _fill_flow(t: Tables, loop: LiftedLoop, mode: int, memory: LiftedMemory) -> 
                 row[j] += w.product[i * n + j] + w.row[j]
 
 
-@bare
+@subroutine
 def _fill_map(loop: LiftedLoop, places: Places, memory: LiftedMemory) -> None:
     """The tick, then the flow: ``(I + F)(I + T) - I``."""
     n, plant, m = places.states, places.plant, memory.workspace.map
@@ -228,7 +227,7 @@ def _after_tick(places: Places, memory: LiftedMemory, row: Array, scale: float, 
             out[j] += factor * memory.tick_map[v * n + j]
 
 
-@bare
+@subroutine
 def _plant_watch(t: Tables, loop: LiftedLoop, places: Places, mode: int, guard: int, memory: LiftedMemory) -> None:
     """Rows of a guard of the plant; `rows` begins with its value and slope over a search step, after the tick."""
     w, n, plant, searches = memory.workspace, places.states, places.plant, loop.searches
@@ -252,7 +251,7 @@ def _plant_watch(t: Tables, loop: LiftedLoop, places: Places, mode: int, guard: 
         w.sizes[to + i] = t.sizes[(mode * t.guards + guard) * TERMS * plant + i]
 
 
-@bare
+@subroutine
 def _tick_cubic(t: Tables, loop: LiftedLoop, places: Places, mode: int, memory: LiftedMemory) -> None:
     """Control points of a guard's cubic over a tick, and the flow over a search step, as a deviation."""
     w, n, plant, searches = memory.workspace, places.states, places.plant, loop.searches
@@ -272,7 +271,7 @@ def _tick_cubic(t: Tables, loop: LiftedLoop, places: Places, mode: int, memory: 
         points[2 * n + i] = last - searches * (slope[i] + final_slope[i])
 
 
-@bare
+@subroutine
 def _inside_tick(t: Tables, loop: LiftedLoop, places: Places, mode: int, guard: int, memory: LiftedMemory) -> None:
     """Sum the squares of a guard's deviation from its cubic over a tick, at the control points of every search step."""
     w, n, plant, searches = memory.workspace, places.states, places.plant, loop.searches

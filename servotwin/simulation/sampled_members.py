@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.build import begin_tables, fill_entered
-from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.compiled import bare, subroutine
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, RunRecord
 from servotwin.hybrid.members import figures_of
@@ -74,7 +74,7 @@ class SampledWorker(NamedTuple):
     outputs: Array  # (O, slots * 128 * N)
 
 
-@bare
+@subroutine
 def load(family: SampledFamily, plant: int, law: int, worker: SampledWorker) -> None:
     """Make the tables those of a plant and a law."""
     if worker.loaded[0] != plant:
@@ -85,12 +85,11 @@ def load(family: SampledFamily, plant: int, law: int, worker: SampledWorker) -> 
     worker.loaded[0], worker.loaded[1] = plant, law
     for slot in range(len(worker.lifted.filled)):
         worker.lifted.filled[slot] = 0
-        worker.lifted.ticked[slot] = 0
         for o in range(len(worker.filled)):
             worker.filled[o, slot] = 0
 
 
-@bare
+@subroutine
 def run_one(
     family: SampledFamily,
     starts: SampledStarts,

@@ -1,17 +1,25 @@
-"""Group commit: one thread commits all waiting writes in one transaction, then resolves their futures."""
+"""Group commit: one thread commits all waiting writes in one transaction, then resolves their futures.
+
+Threads wait for these futures; an event loop awaits them through `AwaitedCommits`.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import math
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.records import Incoming, PutResult, WorkResult
 from servotwin.store.store import Store
+
+_Record = TypeVar("_Record", Incoming, WorkResult)
+_Result = TypeVar("_Result")
 
 
 class CommitLimits(NamedTuple):
@@ -156,6 +164,71 @@ class GroupCommit:
         stored, valid = self._store.write(items, results, self._clock())
         _resolve([future for _, future in puts], stored)
         _resolve([future for _, future in commits], valid)
+
+
+class AwaitedCommits:
+    """Writes of a group commit for an event loop, which awaits them.
+
+    Unlike asyncio.wrap_future this wakes the loop once for all futures that one commit resolves.
+
+    Parameters
+    ----------
+    commits : GroupCommit
+    clock : callable
+        Monotonic seconds.
+
+    Attributes
+    ----------
+    failed_at : float
+        Time of the last failure, on `clock`; -inf: the last write succeeded.
+    """
+
+    def __init__(self, commits: GroupCommit, clock: Callable[[], float] = time.monotonic) -> None:
+        self._commits, self._clock = commits, clock
+        self._done: deque[tuple[asyncio.Future[Any], Future[Any]]] = deque()
+        self.failed_at = -math.inf
+
+    async def put(self, item: Incoming) -> PutResult:
+        """Store a message; returns when it is on the disk. Raises as `GroupCommit.put` and its future do."""
+        return await self._result(self._commits.put, item)
+
+    async def commit(self, result: WorkResult) -> bool:
+        """Commit a work result; False: it is void. Raises as `GroupCommit.commit` and its future do."""
+        return await self._result(self._commits.commit, result)
+
+    async def _result(self, write: Callable[[_Record], Future[_Result]], record: _Record) -> _Result:
+        try:
+            result = await self._wrap(write(record))
+        except StoreUnavailable:
+            self.failed_at = self._clock()
+            raise
+        self.failed_at = -math.inf
+        return result
+
+    def _wrap(self, future: Future[_Result]) -> asyncio.Future[_Result]:
+        """Return a future of the running loop with the same result."""
+        loop = asyncio.get_running_loop()
+        wrapped: asyncio.Future[_Result] = loop.create_future()
+
+        def on_done(done: Future[_Result]) -> None:
+            # Appended first: either it is the only one and wakes the loop, or a wake-up is still to come.
+            self._done.append((wrapped, done))
+            if len(self._done) == 1:
+                loop.call_soon_threadsafe(self._resolve)
+
+        future.add_done_callback(on_done)
+        return wrapped
+
+    def _resolve(self) -> None:
+        while self._done:
+            wrapped, done = self._done.popleft()
+            if wrapped.done():
+                continue
+            error = done.exception()
+            if error is None:
+                wrapped.set_result(done.result())
+            else:
+                wrapped.set_exception(error)
 
 
 def _resolve(futures: Sequence[Future[Any]], results: Sequence[object]) -> None:

@@ -90,9 +90,9 @@ def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
         {
             "_servo": servo,
             "_windows": windows[servo],
-            "_heard": max((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
+            "_last_message": max((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
             "_ready": min((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
-            "_asked": min((i.received for i in group if i.kind is MessageKind.VERIFICATION), default=None),
+            "_verification_ready": min((i.received for i in group if i.kind is MessageKind.VERIFICATION), default=None),
         }
         for servo, group in _by_servo(new)
     ]
@@ -141,9 +141,9 @@ _MARK_READY = (
     .where(twins.c.servo == sa.bindparam("_servo"))
     .values(
         windows=twins.c.windows + sa.bindparam("_windows", type_=sa.BigInteger),
-        heard=_min_or_max(twins.c.heard, "_heard", least=False),
+        last_message=_min_or_max(twins.c.last_message, "_last_message", least=False),
         ready=_min_or_max(twins.c.ready, "_ready", least=True),
-        asked=_min_or_max(twins.c.asked, "_asked", least=True),
+        verification_ready=_min_or_max(twins.c.verification_ready, "_verification_ready", least=True),
     )
 )
 

@@ -10,7 +10,6 @@ import sqlalchemy as sa
 from servotwin.store.records import (
     Backlog,
     MessageKind,
-    OutgoingMessage,
     ServoSummary,
     StoredEvidence,
     StoredMessage,
@@ -21,32 +20,12 @@ from servotwin.store.records import (
 )
 from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, evidence, messages, twins
 from servotwin.store.schema import contexts as context_table
-from servotwin.store.schema import outgoing as outgoing_table
 
-_NAMES_PER_QUERY = 5000
 _ESTIMATES = ("glance", "estimate")
 _ANSWERS = ("receipt", "fallback")
 _EVENTS = ("hello", "fallback", "answer")
 """Kinds of evidence that an edge reports by itself, not about a window."""
 _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
-
-
-def outgoing(connection: sa.Connection, servo: str, after: int, limit: int) -> list[OutgoingMessage]:
-    """Messages to the edge with serials above `after`."""
-    table = outgoing_table
-    query = sa.select(table.c.serial, table.c.body).where(table.c.servo == servo, table.c.serial > after)
-    rows = connection.execute(query.order_by(table.c.serial).limit(limit))
-    return [OutgoingMessage(row.serial, row.body) for row in rows]
-
-
-def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
-    """Serials of the newest messages to the edges of these servos."""
-    names, newest = list(servos), dict[str, int]()
-    for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
-        part = names[begin : begin + _NAMES_PER_QUERY]
-        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
-        newest.update((servo, serial) for servo, serial in connection.execute(query))
-    return newest
 
 
 def backlog(connection: sa.Connection, now: float) -> Backlog:
@@ -101,7 +80,7 @@ def events(connection: sa.Connection, servo: str, since: float, limit: int) -> l
     """Evidence that belongs to no window, newest first."""
     columns = [evidence.c[name] for name in StoredEvidence._fields]
     apart = sa.or_(evidence.c.kind.in_(_EVENTS), evidence.c.message.is_(None))
-    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.made >= since)
+    query = sa.select(*columns).where(evidence.c.servo == servo, apart, evidence.c.created >= since)
     rows = connection.execute(query.order_by(evidence.c.id.desc()).limit(limit)).all()
     return [record for row in rows if (record := _evidence(row, 0)) is not None]
 

@@ -11,7 +11,7 @@ class MessageKind(StrEnum):
 
     WINDOW = "window"
     LETTER = "letter"
-    VERIFICATION = "proof"  # the word in every database so far
+    VERIFICATION = "verification"
 
 
 class Incoming(NamedTuple):
@@ -98,7 +98,7 @@ class EvidenceRecord(NamedTuple):
     ----------
     kind : str
         glance, estimate, disturbance, trend, redesign, excitation, update, request, receipt, fallback, answer, hello,
-        proof, withdrawn.
+        verification, withdrawn.
     message : int
         Id of the message that led to it; 0: none.
     body : bytes
@@ -176,14 +176,14 @@ class Backlog(NamedTuple):
 
     Attributes
     ----------
-    messages, proofs : int
+    messages, verifications : int
         Windows and letters; verifications that twins requested of themselves.
     age : float
         s since the oldest window or letter was received; 0.0: none waits.
     """
 
     messages: int
-    proofs: int
+    verifications: int
     age: float
 
 
@@ -194,7 +194,7 @@ class ServoSummary(NamedTuple):
     ----------
     serial, windows, waiting : int
         Results so far, windows stored, windows and letters not yet processed.
-    heard : float or None
+    last_message : float or None
         s since the epoch at which its last message was received.
     wake : float or None
         s since the epoch at which its twin is to be woken.
@@ -214,7 +214,7 @@ class ServoSummary(NamedTuple):
     serial: int
     windows: int
     waiting: int
-    heard: float | None
+    last_message: float | None
     wake: float | None
     gap: float | None
     std: float | None
@@ -245,7 +245,7 @@ class StoredWindow(NamedTuple):
 
 
 class StoredEvidence(NamedTuple):
-    """Evidence in the store; `made`: s since the epoch, the other fields as in `EvidenceRecord`."""
+    """Evidence in the store; `created`: s since the epoch, the other fields as in `EvidenceRecord`."""
 
     id: int
     kind: str
@@ -257,7 +257,7 @@ class StoredEvidence(NamedTuple):
     status: str
     context: str
     tail: float | None
-    made: float
+    created: float
 
 
 class UpdateEffect(NamedTuple):

@@ -13,8 +13,10 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.engine import SQLITE
 from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
-from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
+from servotwin.store.records import EvidenceRecord, Lease, MessageKind, OutgoingMessage, StoredMessage, WorkResult
 from servotwin.store.schema import VERIFICATIONS, WORK, bodies, contexts, evidence, messages, outgoing, states, twins
+
+_NAMES_PER_QUERY = 5000
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
@@ -80,7 +82,7 @@ def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[An
         queues.append((_next(ready, twins.c.ready, one), 1.0))
         queues.append((_next(due, twins.c.wake, one), 1.0))
     if MessageKind.VERIFICATION in kinds:
-        queues.append((_next(twins.c.asked.is_not(None), twins.c.asked, one), 1.0))
+        queues.append((_next(twins.c.verification_ready.is_not(None), twins.c.verification_ready, one), 1.0))
     return queues
 
 
@@ -183,6 +185,23 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
     return valid
 
 
+def outgoing_messages(connection: sa.Connection, servo: str, after: int, limit: int) -> list[OutgoingMessage]:
+    """Messages to the edge with serials above `after`."""
+    query = sa.select(outgoing.c.serial, outgoing.c.body).where(outgoing.c.servo == servo, outgoing.c.serial > after)
+    rows = connection.execute(query.order_by(outgoing.c.serial).limit(limit))
+    return [OutgoingMessage(row.serial, row.body) for row in rows]
+
+
+def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
+    """Serials of the newest messages to the edges of these servos."""
+    names, newest = list(servos), dict[str, int]()
+    for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
+        part = names[begin : begin + _NAMES_PER_QUERY]
+        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
+        newest.update((servo, serial) for servo, serial in connection.execute(query))
+    return newest
+
+
 def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
     """Make the serial of the next message to the edge exceed `serial`."""
     behind = sa.update(twins).where(twins.c.servo == servo, twins.c.posted < serial)
@@ -259,13 +278,13 @@ def _evidence_row(
 ) -> dict[str, Any]:
     row = record._asdict()
     message = windows.get((servo, row.pop("window")), record.message)
-    return row | {"message": message or None, "context": record.context or None, "servo": servo, "made": now}
+    return row | {"message": message or None, "context": record.context or None, "servo": servo, "created": now}
 
 
 def _outgoing_rows(result: WorkResult, last: int, now: float) -> list[dict[str, Any]]:
     first = last - len(result.outgoing) + 1
     return [
-        {"servo": result.servo, "serial": first + i, "body": body, "made": now}
+        {"servo": result.servo, "serial": first + i, "body": body, "created": now}
         for i, body in enumerate(result.outgoing)
     ]
 
@@ -328,5 +347,5 @@ def _oldest_time(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
 _RESCHEDULE = (
     sa.update(twins)
     .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
-    .values(ready=_oldest_time(WORK), asked=_oldest_time(VERIFICATIONS))
+    .values(ready=_oldest_time(WORK), verification_ready=_oldest_time(VERIFICATIONS))
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-REVISION = "0001"
+REVISION = "0002"
 """Newest migration, which makes the tables below."""
 
 metadata = sa.MetaData(
@@ -25,11 +25,11 @@ twins = sa.Table(
     sa.Column("posted", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("windows", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
-    # Time at which the oldest unprocessed window or letter (ready), or verification (asked), was received; null: none.
+    # Time at which the oldest unprocessed window or letter (ready) or verification was received; null: none.
     sa.Column("ready", sa.Double),
-    sa.Column("asked", sa.Double),
+    sa.Column("verification_ready", sa.Double),
     sa.Column("wake", sa.Double),
-    sa.Column("heard", sa.Double),
+    sa.Column("last_message", sa.Double),
     sa.Column("lease_owner", sa.Text),
     sa.Column("lease_until", sa.Double),
     sa.Column("gap", sa.Double),
@@ -91,7 +91,7 @@ evidence = sa.Table(
     sa.Column("status", sa.Text, nullable=False),
     sa.Column("tail", sa.Double),
     sa.Column("context", sa.Text, sa.ForeignKey(contexts.c.key)),
-    sa.Column("made", sa.Double, nullable=False),
+    sa.Column("created", sa.Double, nullable=False),
     sa.Column("body", sa.LargeBinary, nullable=False),
     sqlite_autoincrement=True,
 )
@@ -102,11 +102,11 @@ outgoing = sa.Table(
     sa.Column("servo", sa.Text, sa.ForeignKey(twins.c.servo), primary_key=True),
     sa.Column("serial", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("body", sa.LargeBinary, nullable=False),
-    sa.Column("made", sa.Double, nullable=False),
+    sa.Column("created", sa.Double, nullable=False),
 )
 
 # Literals, not parameters: a planner uses a partial index only where a query repeats its condition word for word.
-_VERIFICATION: sa.ColumnElement[str] = sa.literal_column("'proof'")
+_VERIFICATION: sa.ColumnElement[str] = sa.literal_column("'verification'")
 _WINDOW: sa.ColumnElement[str] = sa.literal_column("'window'")
 WORK = sa.and_(messages.c.done.is_(None), messages.c.kind != _VERIFICATION)
 VERIFICATIONS = sa.and_(messages.c.done.is_(None), messages.c.kind == _VERIFICATION)
@@ -118,10 +118,10 @@ def _index(name: str, *columns: sa.Column[object], where: sa.ColumnElement[bool]
 
 
 _index("ix_messages_work", messages.c.servo, messages.c.id, where=WORK)
-_index("ix_messages_proofs", messages.c.servo, messages.c.id, where=VERIFICATIONS)
+_index("ix_messages_verifications", messages.c.servo, messages.c.id, where=VERIFICATIONS)
 _index("ix_messages_windows", messages.c.servo, messages.c.id, where=WINDOWS)
 _index("ix_twins_ready", twins.c.ready, where=twins.c.ready.is_not(None))
-_index("ix_twins_asked", twins.c.asked, where=twins.c.asked.is_not(None))
+_index("ix_twins_verification_ready", twins.c.verification_ready, where=twins.c.verification_ready.is_not(None))
 _index("ix_twins_wake", twins.c.wake, where=twins.c.wake.is_not(None))
 _index("ix_evidence_message", evidence.c.message)
 _index("ix_evidence_version", evidence.c.servo, evidence.c.kind, evidence.c.version, evidence.c.id)

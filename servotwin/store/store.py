@@ -138,14 +138,14 @@ class Store:
         An edge that reports a higher serial than any that was posted received it before the store was restored from a
         backup: the next message gets a serial that the edge does not take for a duplicate.
         """
-        messages = self._read(lambda connection: queries.outgoing(connection, servo, after, limit))
+        messages = self._read(lambda connection: results.outgoing_messages(connection, servo, after, limit))
         if not messages and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
             self._write(lambda connection: results.skip_to_serial(connection, servo, after))
         return messages
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
-        return self._read(lambda connection: queries.posted(connection, servos))
+        return self._read(lambda connection: results.posted(connection, servos))
 
     def backlog(self, now: float) -> Backlog:
         """Number and age of the unprocessed messages."""

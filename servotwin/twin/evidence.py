@@ -16,9 +16,10 @@ from msgspec import Struct
 
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, MachineReading
-from servotwin.estimation.machine import LearntMachine
-from servotwin.estimation.motor import LearntMotor
-from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.learning.machine import LearntMachine
+from servotwin.estimation.learning.motor import LearntMotor
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.learning.wear import Expectation, TrendState
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import (
     Answer,
@@ -37,7 +38,6 @@ from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.records import EvidenceRecord
-from servotwin.twin.estimating import Expectation, TrendState
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.triage import Glance
 
@@ -299,7 +299,7 @@ def _row(record: Record) -> EvidenceRecord | None:
             shown = result if isinstance(result, Certificate) else result.best
             body_of = {"question": request, "certificate": shown and _timeless(shown)}
             reason = "" if isinstance(result, Certificate) else result.reason
-            return _computed("proof", body_of, reason, **_of_update(request))
+            return _computed("verification", body_of, reason, **_of_update(request))
         case WithdrawalRecord(request, why):
             return _computed("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
         case Update():

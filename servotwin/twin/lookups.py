@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import MachineReading
-from servotwin.estimation.motor import LearntMotor
+from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting, Update
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
@@ -23,7 +23,7 @@ from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
 
-class VerificationRequest(Struct, frozen=True, omit_defaults=True, tag="proof/1"):
+class VerificationRequest(Struct, frozen=True, omit_defaults=True, tag="verification-request/1"):
     """A verification that a twin schedules for itself through the service's queue.
 
     Attributes
@@ -135,7 +135,7 @@ def encode_request(request: VerificationRequest) -> bytes:
 
 
 def decode_request(data: bytes) -> VerificationRequest:
-    """Decode a request from the queue.
+    """Decode a request from the queue; the version before called it "proof/1".
 
     Raises
     ------
@@ -143,10 +143,12 @@ def decode_request(data: bytes) -> VerificationRequest:
         The bytes are not a request.
     """
     try:
-        return _decoder.decode(data)
+        document = msgspec.msgpack.decode(data)
+        if isinstance(document, dict) and document.get("type") == "proof/1":
+            document["type"] = VerificationRequest.__struct_config__.tag
+        return msgspec.convert(document, VerificationRequest)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InvalidInput(f"the verification request is not understood: {error}") from None
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(VerificationRequest)

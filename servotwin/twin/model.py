@@ -7,21 +7,22 @@ from functools import partial
 
 from msgspec.structs import replace
 
+from servotwin.control.controller import Controller
 from servotwin.estimation.disturbance import disturbance
-from servotwin.estimation.motor import MotorLearning
+from servotwin.estimation.learning.motor import MotorLearning
+from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import policy_of
-from servotwin.twin.estimating import Estimator, Observer, Wear, estimator_of, motor_learning_of
+from servotwin.twin.estimating import Estimator, Observer, estimator_of, motor_learning_of
 from servotwin.twin.lookups import Lookups, LookupState
 from servotwin.twin.requests import Requests, RequestState
 from servotwin.twin.responses import Responses, ResponseState
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.state import TwinState, decode_state
+from servotwin.twin.state import TwinState, Versions, decode_state
 from servotwin.twin.triage import Triage, TriageState
-from servotwin.twin.versions import Versions
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,8 @@ class TwinModel:
         Learns the motor's numbers; None: the model's are taken as they are.
     responses : Responses, optional
         Sends the learnt structure to edges that can use it.
+    controller : Controller, optional
+        The servo's, with which windows are compared; None: they are not.
     """
 
     estimator: Estimator
@@ -61,6 +64,7 @@ class TwinModel:
     lookups: Lookups | None = None
     motor: MotorLearning | None = None
     responses: Responses | None = None
+    controller: Controller | None = None
 
     @classmethod
     def of(
@@ -93,6 +97,7 @@ class TwinModel:
             triage=None if settings.triage is None else Triage(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
+            controller=servo.controller,
         )
 
     def initial_state(self, servo: str) -> TwinState:

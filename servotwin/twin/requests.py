@@ -14,7 +14,28 @@ from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, 
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.versions import Attempts
+
+
+class Attempts(Struct, frozen=True):
+    """Sendings of one message.
+
+    Attributes
+    ----------
+    sent_at : float
+        Time of the last one, s.
+    count : int
+    """
+
+    sent_at: float = -math.inf
+    count: int = 0
+
+    def another(self, now: float) -> Attempts:
+        """Count one more at `now`, s."""
+        return Attempts(now, self.count + 1)
+
+    def not_after(self, now: float) -> Attempts:
+        """Copy with the last sending at `now` (s) at the latest, for a clock that was set back."""
+        return self if self.sent_at <= now else Attempts(now, self.count)
 
 
 class RequestState(Struct, frozen=True):

@@ -13,8 +13,8 @@ from servotwin.config.toml import attribute, part, read
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
-from servotwin.estimation.machine import LearningSettings
-from servotwin.estimation.trend_settings import TrendSettings, trend_maker, wear
+from servotwin.estimation.learning.machine import LearningSettings
+from servotwin.estimation.learning.trend_settings import TrendSettings, trend_maker, wear
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands

@@ -1,4 +1,4 @@
-"""State of a twin: its knowledge of the servo, as one frozen value that is stored unchanged.
+"""State of a twin: its knowledge of the servo and of the versions at its edge, as one frozen value, stored unchanged.
 
 MessagePack with a tag that carries the schema's version, every float with all its bits, arrays as lists. The settings
 are no part of the state: a twin that is restored under other settings uses those.
@@ -6,20 +6,173 @@ are no part of the state: a twin that is restored under other settings uses thos
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from typing import Any
 
 import msgspec
 from msgspec import Struct
+from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains, Setting
+from servotwin.estimation.learning.wear import Wear
+from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite
 from servotwin.messages.legacy import upgrade
-from servotwin.twin.estimating import Wear
+from servotwin.redesign.certified.certificate import verification_of
+from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState
-from servotwin.twin.requests import RequestState
+from servotwin.twin.requests import Attempts, RequestState
 from servotwin.twin.responses import ResponseState
 from servotwin.twin.triage import TriageState
-from servotwin.twin.versions import Attempts, Versions
+
+MAX_ENDED_BOOTS = 1000
+"""Number of boots that a twin remembers: its state must stay bounded."""
+MAX_SETTINGS = 16
+"""Number of versions whose setting is remembered, besides the first one and the one in force."""
+
+
+class Versions(Struct, frozen=True):
+    """Parameter versions of one edge.
+
+    Version numbers only rise. The edge swaps a version only for one that names it as its base; when the twin's view
+    was out of date, the receipt says what is in force and the same parameters go out again on that base. Within a boot
+    of the edge, parameters only move forward in the time of their window; a window of an earlier boot never sets any.
+
+    Attributes
+    ----------
+    boot : str or None
+        The edge's current boot; None: no message has come yet.
+    in_force : int
+        Newest version known to run at the edge.
+    issued : int
+        Highest version ever used for an update.
+    pending : Update or None
+        The newest update, while no receipt for it has come.
+    data_time : float
+        Sample time of the data of the newest update of this boot, s.
+    ended_boots : tuple of str
+        The last `MAX_ENDED_BOOTS` of them.
+    root : int
+        First version of the chain of updates that ends with the pending one; its base was in force.
+    """
+
+    boot: str | None = None
+    in_force: int = 0
+    issued: int = 0
+    pending: Update | None = None
+    data_time: float = -math.inf
+    ended_boots: tuple[str, ...] = ()
+    root: int = 0
+
+    def has_ended(self, boot: str) -> bool:
+        """True for a boot that is over."""
+        return boot in self.ended_boots
+
+    def noted(self, boot: str, in_force: int) -> Versions:
+        """Note a boot and its version in force, as a message states them; a boot that is over changes nothing."""
+        if self.has_ended(boot):
+            return self
+        now = self if boot == self.boot else self._rebooted(boot, in_force)
+        in_force = max(now.in_force, in_force)
+        return replace(now, in_force=in_force, issued=max(now.issued, in_force))
+
+    def admits(self, window: WindowMessage) -> bool:
+        """True where the window is newer than the data of every update so far."""
+        return window.boot == self.boot and window.start > self.data_time
+
+    def with_update(self, update: Update) -> Versions:
+        """Make an update pending under the next version; its base is the version in force on its arrival."""
+        return self._rebased(update) if self.pending is None else self._numbered(update, self.pending.version)
+
+    def after_receipt(self, receipt: Receipt) -> tuple[Versions, Update | None]:
+        """Return the versions after a receipt, and the update to send instead of the pending one.
+
+        That is necessary when the edge refused the pending update for its base or number, or will refuse it because it
+        refused an earlier one of the same chain.
+        """
+        now = self.noted(receipt.boot, receipt.parameter_version)
+        pending = now.pending
+        if self.has_ended(receipt.boot) or pending is None:
+            return now, None
+        if now._breaks(receipt, pending):
+            rebased = now._rebased(pending)
+            return rebased, rebased.pending
+        if receipt.version != pending.version or receipt.reason is Reason.TOO_SOON:
+            return now, None
+        if receipt.reason is Reason.BASE_MISMATCH or now.in_force > pending.version:
+            rebased = now._rebased(pending)
+            return rebased, rebased.pending
+        return now.without_pending(), None
+
+    @property
+    def current(self) -> tuple[int, ...]:
+        """Version in force, and the pending one."""
+        return self.in_force, *(() if self.pending is None else (self.pending.version,))
+
+    def without_pending(self) -> Versions:
+        """Copy without the pending update."""
+        return replace(self, pending=None)
+
+    def _rebooted(self, boot: str, in_force: int) -> Versions:
+        ended = self.ended_boots if self.boot is None else (*self.ended_boots, self.boot)[-MAX_ENDED_BOOTS:]
+        return replace(self, boot=boot, in_force=in_force, pending=None, data_time=-math.inf, ended_boots=ended)
+
+    def _breaks(self, receipt: Receipt, pending: Update) -> bool:
+        """True where the base of the pending update will never be in force.
+
+        A twin with a backlog sends several updates before it reads the first receipt. If only the last receipt counted,
+        the edge would refuse all of them until the twin has caught up.
+        """
+        follows = self.root <= receipt.version < pending.version and self.in_force < pending.base_version
+        return follows and not receipt.applied and receipt.reason is not Reason.SUPERSEDED
+
+    def _rebased(self, update: Update) -> Versions:
+        """Make an update pending whose base is the version in force."""
+        return replace(self._numbered(update, self.in_force), root=self.issued + 1)
+
+    def _numbered(self, update: Update, base: int) -> Versions:
+        version = self.issued + 1
+        pending = replace(update, version=version, base_version=base)
+        return replace(self, issued=version, data_time=update.data_time, pending=pending)
+
+
+Settings = Mapping[int, Setting]
+"""Setting of each known version."""
+
+
+def noted_setting(known: Settings, version: int, setting: Setting, base: int, in_force: int = 0) -> dict[int, Setting]:
+    """Add a setting to the known ones; where it has no gains it gets those of its base version.
+
+    The oldest are dropped, but never the first one and the one in force.
+    """
+    before = known.get(base)
+    if setting.gains is None and before is not None:
+        setting = replace(setting, gains=before.gains)
+    after = {**known, version: setting}
+    # The edge starts with version 0: later updates without gains go back to its gains.
+    keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
+    return {number: each for number, each in sorted(after.items()) if number in keep}
+
+
+def draft_update(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
+    """Make an update without version and base; it may be applied until `validity` (s) after the window's start."""
+    assert redesign.setting is not None
+    estimate = evidence.estimate
+    low, high = estimate.interval
+    return Update(
+        servo=message.servo,
+        version=1,
+        base_version=0,
+        window=(message.boot, message.sequence),
+        data_time=message.start,
+        gap=finite(estimate.gap),
+        std=finite(estimate.std_total),
+        interval=(finite(low), finite(high)),
+        status=estimate.status.value,
+        setting=redesign.setting,
+        not_after=message.start + validity,
+        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
+    )
 
 
 class TwinState(Struct, frozen=True, tag="twin-state/2"):
@@ -40,6 +193,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         V, input biases that the last windows showed, the newest last.
     steps : tuple of float
         m, sizes of the reference's steps in the last windows, the newest last.
+    other_controller : int
+        Windows in a row whose voltage is not that of the controller stated for them.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -56,6 +211,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     rests: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
     responses: ResponseState | None = None
+    other_controller: int = 0
 
 
 _encoder = msgspec.msgpack.Encoder()

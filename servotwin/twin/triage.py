@@ -17,13 +17,13 @@ from msgspec.structs import replace
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate, MachineReading
-from servotwin.estimation.trend import Trend
+from servotwin.estimation.learning.trend import Trend
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.quick import NO_SPREAD, MachineSpread, QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.plant.servo import Servo
-from servotwin.twin.estimating import Expectation
 from servotwin.twin.settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from servotwin.estimation.trend import Trend
+from servotwin.estimation.learning.trend import Trend
 from servotwin.messages import Acknowledge, InvalidMessage, Message, WindowMessage
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.lookups import VerificationRequest

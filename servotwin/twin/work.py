@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Message, WindowMessage
-from servotwin.messages.compression import decompress
+from servotwin.messages.codec import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
 from servotwin.twin.evidence import failure_row, rows

@@ -136,7 +136,9 @@ class ServiceConfig:
         ),
     ] = None
     lockstep: Annotated[bool, key(help="Requests give the time, and the service works only on request.")] = False
-    proofs_per_minute: Annotated[float, key(minimum=0.0, help="Largest rate at which verifications are started.")] = 6.0
+    verifications_per_minute: Annotated[
+        float, key(minimum=0.0, help="Largest rate at which verifications are started.")
+    ] = 6.0
     retention_days: Annotated[
         float,
         key(above=0.0, infinite=True, help="Time after which the body of a window that led to no update is deleted."),

@@ -17,7 +17,7 @@ from urllib.parse import parse_qsl
 import msgspec
 
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal
-from servotwin.messages.compression import ENCODINGS
+from servotwin.messages.codec import ENCODINGS
 from servotwin.twin_service.auth import bearer_token
 from servotwin.twin_service.limits import STATUS, Disconnected, Receive, RequestRejected
 from servotwin.twin_service.monitoring import Metrics

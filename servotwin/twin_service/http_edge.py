@@ -26,8 +26,9 @@ from servotwin.twin_service.http_app import (
     operation,
     parameter,
 )
+from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Ingest, acknowledgement
-from servotwin.twin_service.limits import BodyReader, RequestRejected
+from servotwin.twin_service.limits import RequestRejected
 
 Read = Callable[[str, int], Awaitable[Sequence[OutgoingMessage]]]
 """(servo, serial) -> messages with higher serials, rising."""

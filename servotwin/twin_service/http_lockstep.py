@@ -26,10 +26,11 @@ from servotwin.twin_service.http_app import (
     parameter,
 )
 from servotwin.twin_service.http_edge import SERVO_PATH
+from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Ingest, acknowledgement, end_of
-from servotwin.twin_service.limits import BodyReader, RequestRejected
+from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.store_executor import StoreExecutor
-from servotwin.twin_service.worker_pool import WorkerLost
+from servotwin.twin_service.worker import WorkerLost
 
 
 class LockstepApi:

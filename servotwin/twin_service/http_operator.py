@@ -182,7 +182,7 @@ class OperatorApi:
 
     def _counts(self) -> Mapping[str, float]:
         backlog = self._backlog[1]
-        return {} if backlog is None else {"messages": backlog.messages, "proofs": backlog.proofs}
+        return {} if backlog is None else {"messages": backlog.messages, "verifications": backlog.verifications}
 
     def _age(self) -> float:
         backlog = self._backlog[1]
@@ -216,7 +216,7 @@ def trace_as_json(trace: WindowTrace) -> dict[str, Any]:
     """A window's evidence chain for JSON, MessagePack bodies decoded."""
     return {
         "window": trace.window._asdict(),
-        "found": [evidence_as_json(record) for record in trace.evidence],
+        "evidence": [evidence_as_json(record) for record in trace.evidence],
         "steps": [
             {
                 "update": evidence_as_json(step.update),

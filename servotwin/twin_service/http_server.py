@@ -1,4 +1,4 @@
-"""HTTP server: uvicorn with limits on the head of a request, the listening socket and TLS."""
+"""HTTP server: uvicorn with limits on head and body of a request, the listening socket and TLS."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from servotwin.errors import InvalidInput
+from servotwin.messages import Refusal
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import HttpApp
+from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
 _BACKLOG = 2048
 """Connections that wait to be accepted: after an outage all edges connect at once."""
+_BODY_MEMORY = 256 * 1024 * 1024
+"""Bytes of all bodies that are being received at once."""
 _GRACE_S = 20
 """s that running requests may take when the service is told to stop."""
 _CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"
@@ -96,6 +100,80 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
+
+
+class BodyReader:
+    """Receives bodies within limits that hold before anything is parsed.
+
+    Parameters
+    ----------
+    limit : int
+        Bytes of one body, as sent.
+    timeout : float
+        s within which it has to arrive.
+    memory : int
+        Bytes of all bodies that are being received; beyond that bodies are rejected for the moment.
+
+    Attributes
+    ----------
+    buffered : int
+        Bytes of incomplete bodies in memory.
+    """
+
+    def __init__(self, limit: int, timeout: float, memory: int = _BODY_MEMORY) -> None:
+        self.limit, self.timeout, self._memory = limit, timeout, memory
+        self.buffered = 0
+
+    async def read(self, length: str | None, receive: Receive) -> bytes:
+        """Receive the body of one request; `length` is its Content-Length, where it has one.
+
+        Raises
+        ------
+        RequestRejected
+            TOO_LARGE, or UNAVAILABLE where it arrives too slowly or too many bodies are being received.
+        Disconnected
+        """
+        if length is not None and (not length.isdecimal() or len(length) > 12 or int(length) > self.limit):
+            raise self._too_large()
+        try:
+            async with asyncio.timeout(self.timeout):
+                return await self._receive_all(receive)
+        except TimeoutError:
+            detail = f"the body did not come within {self.timeout:g} s"
+            raise RequestRejected(Refusal.UNAVAILABLE, detail, close=True) from None
+
+    async def _receive_all(self, receive: Receive) -> bytes:
+        event = await receive()
+        # Most bodies come in one event: nothing is accumulated then.
+        if event["type"] == "http.request" and not event.get("more_body", False):
+            body: bytes = event.get("body", b"")
+            if len(body) > self.limit:
+                raise self._too_large()
+            return body
+        parts, size = [], 0
+        try:
+            while True:
+                if event["type"] != "http.request":
+                    raise Disconnected
+                part = event.get("body", b"")
+                parts.append(part)
+                size += len(part)
+                self._count(len(part), size)
+                if not event.get("more_body", False):
+                    return b"".join(parts)
+                event = await receive()
+        finally:
+            self.buffered -= size
+
+    def _count(self, part: int, size: int) -> None:
+        self.buffered += part
+        if size > self.limit:
+            raise self._too_large()
+        if self.buffered > self._memory:
+            raise RequestRejected(Refusal.UNAVAILABLE, "too many bodies are being received now", close=True)
+
+    def _too_large(self) -> RequestRejected:
+        return RequestRejected(Refusal.TOO_LARGE, f"the body is larger than {self.limit} bytes", close=True)
 
 
 class HttpServer(uvicorn.Server):

@@ -21,7 +21,7 @@ from servotwin.messages import (
     decode,
     encode,
 )
-from servotwin.messages.compression import decompress
+from servotwin.messages.codec import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.twin_service.limits import RequestRejected, SampleTimeLimiter

@@ -1,8 +1,7 @@
-"""Limits on what a client may send: size and time of a body, message rate, sample time; and the rejection."""
+"""Limits on what a client may send: message rate and sample time; and the rejection."""
 
 from __future__ import annotations
 
-import asyncio
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from typing import Any, NamedTuple
@@ -13,8 +12,6 @@ Receive = Callable[[], Awaitable[MutableMapping[str, Any]]]
 """ASGI's: the next event of a request."""
 MAX_SERVOS = 50_000
 """Servos and boots whose limits are in memory; one that was dropped counts as new."""
-_BODY_MEMORY = 256 * 1024 * 1024
-"""Bytes of all bodies that are being received at once."""
 _MAX_UPTIME_S = 20.0 * 365.25 * 86400.0
 """s; no edge runs longer without a restart."""
 
@@ -56,80 +53,6 @@ class RequestRejected(Exception):
 
 class Disconnected(Exception):
     """The client closed the connection before its body was complete."""
-
-
-class BodyReader:
-    """Receives bodies within limits that hold before anything is parsed.
-
-    Parameters
-    ----------
-    limit : int
-        Bytes of one body, as sent.
-    timeout : float
-        s within which it has to arrive.
-    memory : int
-        Bytes of all bodies that are being received; beyond that bodies are rejected for the moment.
-
-    Attributes
-    ----------
-    buffered : int
-        Bytes of incomplete bodies in memory.
-    """
-
-    def __init__(self, limit: int, timeout: float, memory: int = _BODY_MEMORY) -> None:
-        self.limit, self.timeout, self._memory = limit, timeout, memory
-        self.buffered = 0
-
-    async def read(self, length: str | None, receive: Receive) -> bytes:
-        """Receive the body of one request; `length` is its Content-Length, where it has one.
-
-        Raises
-        ------
-        RequestRejected
-            TOO_LARGE, or UNAVAILABLE where it arrives too slowly or too many bodies are being received.
-        Disconnected
-        """
-        if length is not None and (not length.isdecimal() or len(length) > 12 or int(length) > self.limit):
-            raise self._too_large()
-        try:
-            async with asyncio.timeout(self.timeout):
-                return await self._receive_all(receive)
-        except TimeoutError:
-            detail = f"the body did not come within {self.timeout:g} s"
-            raise RequestRejected(Refusal.UNAVAILABLE, detail, close=True) from None
-
-    async def _receive_all(self, receive: Receive) -> bytes:
-        event = await receive()
-        # Most bodies come in one event: nothing is accumulated then.
-        if event["type"] == "http.request" and not event.get("more_body", False):
-            body: bytes = event.get("body", b"")
-            if len(body) > self.limit:
-                raise self._too_large()
-            return body
-        parts, size = [], 0
-        try:
-            while True:
-                if event["type"] != "http.request":
-                    raise Disconnected
-                part = event.get("body", b"")
-                parts.append(part)
-                size += len(part)
-                self._count(len(part), size)
-                if not event.get("more_body", False):
-                    return b"".join(parts)
-                event = await receive()
-        finally:
-            self.buffered -= size
-
-    def _count(self, part: int, size: int) -> None:
-        self.buffered += part
-        if size > self.limit:
-            raise self._too_large()
-        if self.buffered > self._memory:
-            raise RequestRejected(Refusal.UNAVAILABLE, "too many bodies are being received now", close=True)
-
-    def _too_large(self) -> RequestRejected:
-        return RequestRejected(Refusal.TOO_LARGE, f"the body is larger than {self.limit} bytes", close=True)
 
 
 class RateLimiter:

@@ -7,17 +7,16 @@ import logging
 import math
 import re
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
-from concurrent.futures import Future
 from contextlib import asynccontextmanager, suppress
 from functools import lru_cache, partial
-from typing import Any, TypeVar
+from typing import Any
 from uuid import uuid4
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.group_commit import CommitLimits, GroupCommit
-from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
+from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
+from servotwin.store.records import OutgoingMessage
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.model_registry import ModelRegistry
@@ -28,17 +27,16 @@ from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
+from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Clocks, Ingest
-from servotwin.twin_service.limits import MAX_SERVOS, BodyReader, RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
-from servotwin.twin_service.store_executor import FutureBridge, StoreExecutor
+from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.twin_file import TwinFile
-from servotwin.twin_service.worker_pool import WorkerPool
+from servotwin.twin_service.worker import WorkerPool
 
 log = logging.getLogger(__name__)
-_Record = TypeVar("_Record")
-_Result = TypeVar("_Result")
 
 _REFRESH_S, _RETENTION_S, _DAY = 1.0, 600.0, 86400.0
 _UNHEALTHY_S = 60.0
@@ -65,7 +63,7 @@ class TwinService:
     ) -> None:
         config = twin.service
         self.config, self.store, self.clocks = config, store, clocks or Clocks.of_machine()
-        self.metrics, self.executor, self._futures = Metrics(), StoreExecutor(), FutureBridge()
+        self.metrics, self.executor = Metrics(), StoreExecutor()
         self.pool = pool or WorkerPool(config.workers, twin.start, config.job_timeout_s)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
@@ -74,10 +72,11 @@ class TwinService:
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
         self.polls = LongPolls(self._read_outgoing, config.long_polls, shared=self._shared)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
+        self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
         has_servo = _servo_test(twin.fleet)
         slack = math.inf if config.lockstep else config.future_slack_s
         self.ingest = Ingest(
-            put=self._put,
+            put=self._writes.put,
             has_servo=has_servo,
             sample_times=SampleTimeLimiter(config.speed, slack),
             metrics=self.metrics,
@@ -91,19 +90,18 @@ class TwinService:
             store=store,
             executor=self.executor,
             pool=self.pool,
-            commit=self._commit,
+            commit=self._writes.commit,
             notify=self.polls.notify,
             metrics=self.metrics,
             clocks=self.clocks,
             owner=self._owner,
-            quota=VerificationQuota(config.proofs_per_minute),
+            quota=VerificationQuota(config.verifications_per_minute),
         )
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
             handler = MqttRequestHandler(self.gate, self.ingest, self.polls, self.dispatcher.wake, self.metrics)
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []
-        self._failed_at = -math.inf
         self._add_gauges()
 
     def http_app(self) -> HttpApp:
@@ -154,25 +152,9 @@ class TwinService:
         ok = store and workers > 0 and dispatching
         return {"ok": ok, "store": store, "workers": workers, "dispatching": dispatching}
 
-    async def _put(self, incoming: Incoming) -> PutResult:
-        return await self._write(self.commits.put, incoming)
-
-    async def _commit(self, result: WorkResult) -> bool:
-        return await self._write(self.commits.commit, result)
-
-    async def _write(self, write: Callable[[_Record], Future[_Result]], record: _Record) -> _Result:
-        """Result of a write; a failure is remembered until a write succeeds."""
-        try:
-            result = await self._futures.wrap(write(record))
-        except StoreUnavailable:
-            self._failed_at = self.clocks.monotonic()
-            raise
-        self._failed_at = -math.inf
-        return result
-
     def _store_healthy(self) -> bool:
         """Last read and last write succeeded, or that write failed long ago: none may have been tried since."""
-        return not self.executor.fault and self.clocks.monotonic() - self._failed_at >= _UNHEALTHY_S
+        return not self.executor.fault and self.clocks.monotonic() - self._writes.failed_at >= _UNHEALTHY_S
 
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
         return await self.executor.run(lambda: self.store.outgoing(servo, after))

@@ -1,24 +1,38 @@
-"""Worker process, and the frames (`runtime.frames`) of MessagePack that it exchanges with the service; no pickles.
+"""Worker processes: their pool in the service, which replaces those that die or hang, and the process itself.
 
-Started as `python -m servotwin.twin_service.worker DESCRIPTOR`. It works on what it receives over that one socket and
-ends when the socket closes. It has no access to the store and keeps nothing but caches.
+Both ends exchange frames (`runtime.frames`) of MessagePack over a socket; no pickles. A worker is started as
+`python -m servotwin.twin_service.worker DESCRIPTOR`. It works on what it receives over that one socket and ends when
+the socket closes. It has no access to the store and keeps nothing but caches.
 """
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import os
 import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
-from servotwin.runtime.frames import frame, read_frame
+from servotwin.runtime.child_process import ChildProcess
+from servotwin.runtime.frames import frame, read_frame, receive_frame
+from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import Lease, WorkResult
+from servotwin.twin_service import config
+
+log = logging.getLogger(__name__)
+
+_START_S = 120.0
+"""s that a worker may take until it is ready: it imports and compiles."""
+_STOP_S = 5.0
+_COMMAND = (sys.executable, "-m", "servotwin.twin_service.worker")
 
 
 class WorkerStart(NamedTuple):
@@ -71,6 +85,171 @@ Work = Callable[[Lease, float], WorkResult]
 def encode_frame(message: WorkerStart | WorkerJob | LeaseResult) -> bytes:
     """Frame of a message."""
     return frame(_encoder.encode(message))
+
+
+class WorkerLost(Exception):
+    """A worker died or hung; its job may be repeated."""
+
+
+class WorkerProcess:
+    """One worker.
+
+    Parameters
+    ----------
+    start : WorkerStart
+    timeout : float
+        s that it may take for one lease.
+    command : sequence of str
+        Command line; the number of the socket's descriptor is appended.
+    """
+
+    def __init__(self, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
+        self._start, self._timeout, self._command = start, timeout, tuple(command)
+        self._process: ChildProcess | None = None
+        self._reader: asyncio.StreamReader | None = None
+        self._writer: asyncio.StreamWriter | None = None
+
+    @property
+    def pid(self) -> int | None:
+        """Process id, while the process runs."""
+        return None if self._process is None or self._process.code is not None else self._process.pid
+
+    async def start(self) -> None:
+        """Start the process and wait until it is ready; raises WorkerLost."""
+        ours, theirs = socket.socketpair()
+        # Closed here once the child has a copy: only then does the end of the child close the connection.
+        with theirs:
+            number = theirs.fileno()
+            self._process = ChildProcess((*self._command, str(number)), pass_fds=(number,), env=_environment())
+        self._reader, self._writer = await asyncio.open_connection(sock=ours)
+        self._send(encode_frame(self._start))
+        await self._receive(_START_S)
+
+    async def work(self, leases: Sequence[Lease], now: float) -> AsyncIterator[LeaseResult]:
+        """Process leases; yields their results in order. Raises WorkerLost."""
+        self._send(encode_frame(WorkerJob(tuple(leases), now)))
+        # One timeout per lease, not per job: a job may hold sixteen of them.
+        for _ in leases:
+            yield decode_result(await self._receive(self._timeout))
+
+    async def stop(self) -> None:
+        """Close the socket and wait for the end of the process."""
+        if self._writer is not None:
+            self._writer.close()
+        if self._process is not None:
+            await asyncio.to_thread(self._process.wait, _STOP_S)
+
+    async def kill(self) -> None:
+        """Kill the process."""
+        if self._writer is not None:
+            self._writer.close()
+        if self._process is not None:
+            self._process.kill()
+            await asyncio.to_thread(self._process.wait, _STOP_S)
+
+    def _send(self, data: bytes) -> None:
+        if self._writer is None or self._writer.is_closing():
+            raise WorkerLost("the socket to the worker is closed")
+        self._writer.write(data)
+
+    async def _receive(self, timeout: float) -> bytes:
+        assert self._reader is not None
+        try:
+            async with asyncio.timeout(timeout):
+                return await receive_frame(self._reader)
+        except TimeoutError:
+            raise WorkerLost(f"the worker did not answer within {timeout:g} s") from None
+        except (asyncio.IncompleteReadError, OSError):
+            raise WorkerLost("the worker ended") from None
+
+
+class WorkerPool:
+    """Workers, each used by one task at a time.
+
+    Parameters
+    ----------
+    size : int
+    start : WorkerStart
+    timeout : float
+        s for one lease.
+    command : sequence of str
+
+    Attributes
+    ----------
+    lost : int
+        Number of workers that were replaced.
+    """
+
+    def __init__(self, size: int, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
+        self.size, self.lost = size, 0
+        self._make = partial(WorkerProcess, start, timeout, command)
+        self._workers: set[WorkerProcess] = set()
+        self._idle: asyncio.Queue[WorkerProcess] = asyncio.Queue()
+
+    @property
+    def alive(self) -> int:
+        """Number of workers whose process runs."""
+        return sum(worker.pid is not None for worker in self._workers)
+
+    async def start(self) -> None:
+        """Start all workers.
+
+        Raises
+        ------
+        WorkerLost
+            A worker did not start; the others were stopped.
+        """
+        self._workers = {self._make() for _ in range(self.size)}
+        try:
+            await asyncio.gather(*(worker.start() for worker in self._workers))
+        except WorkerLost:
+            await self.stop()
+            raise
+        for worker in self._workers:
+            self._idle.put_nowait(worker)
+
+    async def acquire(self) -> WorkerProcess:
+        """Wait for an idle worker."""
+        return await self._idle.get()
+
+    def release(self, worker: WorkerProcess) -> None:
+        """Return a worker to the pool."""
+        self._idle.put_nowait(worker)
+
+    async def replace(self, worker: WorkerProcess, why: str) -> None:
+        """Kill a worker and start another one in its place."""
+        log.warning("worker replaced", extra={"pid": worker.pid, "why": why})
+        self.lost += 1
+        self._workers.discard(worker)
+        await worker.kill()
+        # A worker that cannot start (no memory, a broken installation) must not keep the processor busy.
+        backoff = Backoff(Retry(0.1, 2.0, 30.0))
+        while True:
+            fresh = self._make()
+            self._workers.add(fresh)
+            try:
+                await fresh.start()
+            except (WorkerLost, OSError) as error:
+                self._workers.discard(fresh)
+                await fresh.kill()
+                log.error("worker does not start", extra={"why": str(error)})
+                await asyncio.sleep(backoff.failed())
+                continue
+            self._idle.put_nowait(fresh)
+            return
+
+    async def stop(self) -> None:
+        """Stop all workers."""
+        await asyncio.gather(*(worker.stop() for worker in self._workers))
+        self._workers.clear()
+
+
+def _environment() -> Mapping[str, str]:
+    """Environment of a worker: the service's without its passwords."""
+    secrets = config.PASSWORD, config.MQTT_PASSWORD
+    passed = {key: value for key, value in os.environ.items() if key not in secrets}
+    # One thread each: the workers share the cores already.
+    return {**passed, "OPENBLAS_NUM_THREADS": "1"}
 
 
 def main(descriptor: int) -> None:

@@ -16,9 +16,9 @@ from urllib.parse import urlsplit
 import msgspec
 
 from servotwin.cosim.driver import Cosimulation, Progress, Remote
-from servotwin.cosim.edge import CHANNELS
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.drive import Block, DriveLost, SupervisedDrive
+from servotwin.edge.outlet import CHANNELS
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput

@@ -161,7 +161,7 @@ def newest_estimate(traces: list[dict[str, Any]]) -> ServoEstimate | None:
     """Newest estimate with status OK in an evidence chain, newest window first; None: there is none."""
     status = ""
     for trace in traces:
-        evidence = {each["kind"]: each for each in trace["found"]}
+        evidence = {each["kind"]: each for each in trace["evidence"]}
         if "estimate" not in evidence:
             continue
         status = status or evidence["estimate"]["status"]

@@ -17,14 +17,14 @@ SERVO = {
     "receipt": "applied",
     "windows": 42,
     "waiting": 1,
-    "heard": 0.0,
+    "last_message": 0.0,
 }
 UPDATE = {"tolerance": 61.25e-6, "controller": {"Kp": 1377.7, "Ki": 0.0, "Kd": -135.1, "Tf": 0.1, "feedforward": -0.02},
           "proof": {"members": 256}}  # fmt: skip
 
 
 def found(kind: str, status: str = "", **values: Any) -> dict[str, Any]:
-    nothing = {"version": None, "gap": None, "std": None, "tail": None, "made": 0.0, "body": None}
+    nothing = {"version": None, "gap": None, "std": None, "tail": None, "created": 0.0, "body": None}
     return {"kind": kind, "status": status, **nothing, **values}
 
 
@@ -36,7 +36,7 @@ def link(
     number: int, *of: dict[str, Any], boot: str = "b1", done: float | None = 1.0, steps: Any = ()
 ) -> dict[str, Any]:
     window = {"boot": boot, "sequence": number, "received": 60.0 * number, "done": done}
-    return {"window": window, "found": list(of), "steps": list(steps)}
+    return {"window": window, "evidence": list(of), "steps": list(steps)}
 
 
 def step(effect: Any = None, *answers: dict[str, Any]) -> dict[str, Any]:
@@ -62,7 +62,7 @@ def test_the_head_summarises_the_servo() -> None:
         "  windows: 42 stored, 1 messages pending, last message 1970-01-01 00:00:00 UTC",
         "  wear 0.5 ± 0 deg/h (95 %), input bias 20.0 mV, noise 2.0 um",
     ]
-    assert report_of(link(1), gap=None, version=None, receipt="", heard=None)[:2] == [
+    assert report_of(link(1), gap=None, version=None, receipt="", last_message=None)[:2] == [
         "servo ax-1: no gap known, no version sent",
         "  windows: 42 stored, 1 messages pending",
     ]
@@ -100,8 +100,11 @@ def test_a_version_from_its_window_to_its_effect() -> None:
         (link(1, estimate(), found("redesign", "")), "a setting was found and waits to be sent"),
         (link(1, estimate(), found("excitation", "the window shows the gap")), ""),
         (link(1, estimate(), found("request", "windows tell too little")), "request: windows tell too little"),
-        (link(1, estimate(), found("proof", "", version=3)), "version 3 is verified for this evidence"),
-        (link(1, estimate(), found("proof", "two fail", version=3)), "version 3 FAILED its verification: two fail"),
+        (link(1, estimate(), found("verification", "", version=3)), "version 3 is verified for this evidence"),
+        (
+            link(1, estimate(), found("verification", "two fail", version=3)),
+            "version 3 FAILED its verification: two fail",
+        ),
         (link(1, estimate(), found("withdrawn", "two fail", version=3)), "version 3 WITHDRAWN: two fail"),
     ],
 )  # fmt: skip
@@ -129,7 +132,7 @@ def test_a_refused_version_shows_why() -> None:
 )
 def test_a_fallback_is_listed_at_its_time(cause: Cause, measured: float, allowed: float, expected: str) -> None:
     body = {"cause": cause.value, "measured": measured, "allowed": allowed}
-    events = [found("fallback", cause.value, version=3, body=body, made=90.0)]
+    events = [found("fallback", cause.value, version=3, body=body, created=90.0)]
     lines = chain(link(1, estimate()), link(2, estimate()), events=events)
     assert lines[2] == f"1970-01-01 00:01:30  FALLBACK from version 3: {cause.value}, {expected}"
 
@@ -145,7 +148,7 @@ def test_starts_of_the_edge_and_faults_of_the_twin_are_listed() -> None:
     events = [
         found("hello", "b2", version=3, made=70.0),
         found("answer", "taken", made=80.0),
-        found("estimate", "failed: the state is not understood; the twin begins anew", made=90.0),
+        found("estimate", "failed: the state is not understood; the twin begins anew", created=90.0),
     ]
     lines = chain(link(1, estimate()), link(2, estimate(), boot="b2"), events=events)
     assert [line[21:] for line in lines if line.startswith("1970") and "7.5" not in line] == [

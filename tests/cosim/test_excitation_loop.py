@@ -11,7 +11,7 @@ from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import LongerWindow, Probe, Request, RequestOutcome
 from servotwin.plant.noise import Noise

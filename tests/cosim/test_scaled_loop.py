@@ -11,7 +11,7 @@ from servotwin.commissioning.edge_settings import Recording
 from servotwin.cosim import cosimulate
 from servotwin.cosim.loop import Loop
 from servotwin.cosim.scenario import Scenario
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.redesign.certified.uncertainty import Uncertainty

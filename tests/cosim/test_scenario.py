@@ -8,7 +8,7 @@ from scenario_files import PAPER, SHORT, load, refusal
 from servotwin.cosim.scenario import PRESETS, Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation import paper
-from servotwin.estimation.trend import TrendSettings
+from servotwin.estimation.learning.trend import TrendSettings
 from servotwin.link.simulated import LinkSettings
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo

@@ -76,17 +76,6 @@ def test_every_erratum_that_is_referred_to_is_listed():
     assert named <= {entry["id"] for entry in errata()}
 
 
-def test_the_journey_counts_its_hops():
-    """The numbers in the text are the rows of the tables, and no file is counted twice."""
-    text = (ROOT / "docs/journey.md").read_text()
-    rows = re.findall(r"^\| ([C ]) \| ([D ]) \| `(servotwin/[\w/]+\.py)` \|", text, re.MULTILINE)
-    assert len({file for *_, file in rows}) == len(rows)
-    counts = sum(row[0] == "C" for row in rows), sum(row[1] == "D" for row in rows)
-    stated = re.search(r"takes (\d+) hops in the co-simulation and (\d+) hops when deployed", text)
-    assert stated is not None
-    assert tuple(map(int, stated.groups())) == counts
-
-
 def test_every_page_is_reached_from_the_index():
     reached = {(ROOT / "docs" / link).resolve() for link in LINK.findall((ROOT / "docs/index.md").read_text())}
     assert not [page for page in PAGES if page.parent != ROOT and page.name != "index.md" and page not in reached]

@@ -13,7 +13,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox, letter_digest
 from servotwin.link.session import Session
-from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink, SimulatedSender
+from servotwin.link.simulated import Fate, LinkSettings, SimulatedLink, SimulatedSender, VirtualClock
 from servotwin.messages import (
     Acknowledge,
     LetterAcknowledge,
@@ -26,7 +26,6 @@ from servotwin.messages import (
     decode,
     encode,
 )
-from servotwin.runtime.clock import VirtualClock
 from servotwin.runtime.retry import Retry
 
 RATE, STEPS, HOSTILE_S, TAIL_S = 10.0, 10, 20.0, 40.0

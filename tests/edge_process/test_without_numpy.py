@@ -17,13 +17,12 @@ class Absent:
 
 sys.meta_path.insert(0, Absent())
 
-from servotwin.runtime.clock import VirtualClock, WallClock
 from servotwin.control import Controller, start, tick
 from servotwin.edge.agent import Agent
 from servotwin.edge.settings import AgentSettings
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.session import Session
-from servotwin.link.simulated import LinkSettings, SimulatedLink, SimulatedSender
+from servotwin.link.simulated import LinkSettings, SimulatedLink, SimulatedSender, VirtualClock
 from servotwin.messages import Acknowledge, Setting, Update, decode, encode, unpack_channel
 
 controller = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=100.0)

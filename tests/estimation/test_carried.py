@@ -14,8 +14,8 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.estimation import whitened
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.offset import estimate_carrying
-from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.whitened import estimate_carrying, offset
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -137,7 +137,7 @@ def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
 
     known = (0.0, 0.01 * DEG)
     assert estimate_carrying(window, SERVO, None, SETTINGS, known).ok
-    monkeypatch.setattr(whitened, "fit", lost)
+    monkeypatch.setattr(offset, "fit", lost)
     refused = estimate_carrying(window, SERVO, None, SETTINGS, known)
     assert refused.status in REFUSED
     assert "times as much is left over" in refused.reasons[-1]

@@ -9,7 +9,7 @@ import pytest
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.joint.estimator import JointSettings, estimate_jointly
-from servotwin.estimation.trend import Trend
+from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo

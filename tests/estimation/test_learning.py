@@ -13,8 +13,8 @@ from servotwin.estimation import whitened
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.machine import LearningSettings, LearntMachine, nameplate, updated
-from servotwin.estimation.offset import estimate_carrying
+from servotwin.estimation.learning.machine import LearningSettings, LearntMachine, nameplate, updated
+from servotwin.estimation.whitened import estimate_carrying
 from servotwin.estimation.whitened.free_model import FactorPrior, FreeProblem, adapted, contact_evidence
 from servotwin.estimation.whitened.learning import look_around
 from servotwin.estimation.window import Window

@@ -8,8 +8,8 @@ from scaling import scaled
 from scipy.linalg import expm
 
 from servotwin import Servo, SquareWave, Window, simulate
-from servotwin.estimation.machine import LearningSettings
-from servotwin.estimation.motor import BACK_EMF, BIAS, FRICTION, LearntMotor, MotorLearning, motor_rows
+from servotwin.estimation.learning.machine import LearningSettings
+from servotwin.estimation.learning.motor import BACK_EMF, BIAS, FRICTION, LearntMotor, MotorLearning, motor_rows
 from servotwin.plant.signals import Array
 
 PAPER = Servo.preset("paper")

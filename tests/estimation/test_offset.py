@@ -9,8 +9,8 @@ import pytest
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.offset import read_offset
-from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.whitened import read_offset
 from servotwin.estimation.whitened.estimator import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo

@@ -12,14 +12,15 @@ from benchmarks.estimator_windows import cut
 from benchmarks.wrong_models import ModelError, step_windows, worn_run
 from servotwin.estimation import whitened
 from servotwin.estimation.estimate import GapStatus
-from servotwin.estimation.machine import LearningSettings, nameplate
+from servotwin.estimation.learning.machine import LearningSettings, nameplate
+from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.whitened.free_model import COMPLIANCE, FactorPrior, FreeProblem
 from servotwin.estimation.whitened.lag import lag_motion
 from servotwin.estimation.whitened.learning import WindowSoftness
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
-from servotwin.twin.estimating import Wear, estimator_of
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 MODEL = Servo.preset("paper")

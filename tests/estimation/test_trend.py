@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
-from servotwin.estimation.trend import Trend, TrendSettings, process_noise, transition, truncation
+from servotwin.estimation.learning.trend import Trend, TrendSettings, process_noise, transition, truncation
 
 DEG = math.radians(1.0)
 SETTINGS = TrendSettings(

@@ -5,12 +5,14 @@ import os
 import pkgutil
 import subprocess
 import sys
+from typing import Any
 
 import pytest
+from numba import float64
 
 import servotwin
 from servotwin.errors import InvalidInput
-from servotwin.hybrid.compiled import compiled, stamp
+from servotwin.hybrid.compiled import bare, compiled, stamp, subroutine
 
 LIST_STAMPS = """
 import importlib, pkgutil, servotwin.hybrid, servotwin.simulation
@@ -123,3 +125,70 @@ def test_a_cache_that_names_a_renamed_type_is_compiled_anew(tmp_path):
         outputs.append(subprocess.run(run, env=environment, check=True, capture_output=True, text=True).stdout)
     assert outputs == ["2.5\n"] * 3
     assert list((tmp_path / "__pycache__").glob("renamed.first-*.nbi"))
+
+
+@subroutine
+def fma_by_hand(a: float, b: float, c: float) -> float:
+    return a * b + c
+
+
+@bare
+def with_subroutine(a: float, b: float, c: float) -> float:
+    return fma_by_hand(a, b, c)
+
+
+def test_a_subroutine_is_a_part_of_its_callers_and_python_can_call_it() -> None:
+    """Its library holds no function that is executable; what Python calls is compiled for that, and gives the same."""
+    values = 0.1, 0.2, 0.3
+    assert with_subroutine(*values) == fma_by_hand(*values)
+    part: Any = fma_by_hand
+    part.compile((float64,) * 3)
+    (version,) = part.overloads.values()
+    assert not version.library.codegen._engine._ee.get_function_address(version.fndesc.llvm_func_name)
+    assert fma_by_hand(2.0, 3.0, 4.0) == 10.0
+
+
+SUBROUTINE = """
+import sys
+from typing import Any
+
+from numba.core.event import install_recorder
+
+from servotwin.hybrid.compiled import bare, subroutine
+
+
+@subroutine
+def at(values, k):
+    if k >= len(values):
+        raise IndexError
+    return values[k]
+
+
+@bare
+def first(values):
+    return at(values, 0) * 2.0
+
+
+@bare
+def second(values):
+    return at(values, 0) * 3.0
+
+
+import numpy as np
+
+with install_recorder("numba:compile") as recorder:
+    result = (first if sys.argv[1] == "first" else second)(np.array([2.5]))
+names = {event.data["dispatcher"].py_func.__name__ for _, event in recorder.buffer}
+print(result, *sorted(names & {"at", "first", "second"}))
+"""
+
+
+@pytest.mark.slow
+def test_a_subroutine_is_cached_for_other_callers_in_other_processes(tmp_path):
+    (tmp_path / "parts.py").write_text(SUBROUTINE)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *sys.path])}
+    outputs = []
+    for name in ("first", "second", "second"):
+        run = [sys.executable, str(tmp_path / "parts.py"), name]
+        outputs.append(subprocess.run(run, env=environment, check=True, capture_output=True, text=True).stdout.split())
+    assert outputs == [["5.0", "at", "first"], ["7.5", "second"], ["7.5"]]

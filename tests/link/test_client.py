@@ -9,9 +9,8 @@ from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.link.client import Receiver, Sender
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
-from servotwin.link.session import Session
+from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import (

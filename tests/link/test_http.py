@@ -12,8 +12,9 @@ from faketwin import FakeTwin, Handler
 
 from servotwin.errors import InvalidInput
 from servotwin.link.http import HttpTransport
-from servotwin.link.transport import Parcel, Refused, Unreachable, deflated
+from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import Acknowledge, Hello, Refusal, Setting, WindowMessage, checksum, encode, pack_channel
+from servotwin.messages.codec import deflated
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
 HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")

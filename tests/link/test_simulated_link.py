@@ -11,8 +11,15 @@ from hypothesis import strategies as st
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, letter_digest
 from servotwin.link.session import Session
-from servotwin.link.simulated import Fate, LinkDirection, LinkSettings, SimulatedLink, SimulatedSender, derive_seed
-from servotwin.runtime.clock import VirtualClock
+from servotwin.link.simulated import (
+    Fate,
+    LinkDirection,
+    LinkSettings,
+    SimulatedLink,
+    SimulatedSender,
+    VirtualClock,
+    derive_seed,
+)
 from servotwin.runtime.retry import Retry
 
 PROBABILITY = st.sampled_from([0.0, 0.1, 0.5, 1.0])

@@ -28,7 +28,7 @@ from servotwin.edge_process import frames
 from servotwin.edge_process.link_process import FrameHandler
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.estimation.window import Window
 from servotwin.link.sqlite_outbox import SqliteOutbox

@@ -12,7 +12,7 @@ from msgspec import structs
 from servotwin.control.gains import gains_of
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.trend import Trend
+from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo

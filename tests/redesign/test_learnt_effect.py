@@ -127,6 +127,9 @@ def test_a_setting_that_was_looked_up_is_verified_on_the_learnt_machine() -> Non
     plain, known = request_of(None), request_of(learnt(OFF_BY[0]))
     assert b"machine" not in encode_request(plain)
     assert decode_request(encode_request(known)) == known
+    before = encode_request(known).replace(b"\xb6verification-request/1", b"\xa7proof/1")
+    assert before != encode_request(known)
+    assert decode_request(before) == known
     lookups = Lookups(table())
     results = [lookups.verify(LookupState(), each, [each.setting.setting()])[1] for each in (plain, known)]
     assert all(isinstance(one, Certificate) for one in results)

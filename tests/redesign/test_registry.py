@@ -139,14 +139,14 @@ def test_margin_has_no_map_for_a_limited_voltage():
 
 def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_path):
     scenario = load(tmp_path, "")
-    proved = certified_policy(scenario.model, scenario.twin).fallback()
+    verified = certified_policy(scenario.model, scenario.twin).fallback()
     agent = scenario.agent_settings()
     fallback = agent.supervision.fallback
-    assert proved.gap == scenario.twin.uncertainty.gap
-    assert fallback.setting.gains == agent.parameters.setting.gains == gains_of(proved.setting.controller)
-    assert fallback.setting.band == agent.parameters.setting.band == band_of(proved)
+    assert verified.gap == scenario.twin.uncertainty.gap
+    assert fallback.setting.gains == agent.parameters.setting.gains == gains_of(verified.setting.controller)
+    assert fallback.setting.band == agent.parameters.setting.band == band_of(verified)
     assert agent.parameters.fallback
-    assert scenario.start_law == proved.setting.controller
+    assert scenario.start_law == verified.setting.controller
     assert fallback.silence_s == certified_policy(scenario.model, scenario.twin).horizon
 
 

@@ -14,7 +14,7 @@ from servotwin.commissioning.edge_settings import guarding
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.motor import LearntMotor
+from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo

@@ -278,7 +278,7 @@ def test_when_all_is_done_nothing_is_marked_as_waiting(store: Store) -> None:
     (verification_lease,) = claim(store, kinds=(MessageKind.VERIFICATION,))
     store.commit([outcome(verification_lease)], 202.0)
     with transaction(store.engines.reader) as connection:
-        assert connection.execute(sa.select(twins.c.ready, twins.c.asked)).all() == [(None, None)]
+        assert connection.execute(sa.select(twins.c.ready, twins.c.verification_ready)).all() == [(None, None)]
 
 
 class Deadlock(Exception):

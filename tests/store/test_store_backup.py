@@ -136,10 +136,10 @@ def test_a_damaged_or_newer_backup_is_not_restored(url: str, tmp_path: Path, lat
     saved.write_bytes(b"".join((whole[: places[-1]], b"aboot/71", whole[places[-1] + 8 :])))
     with pytest.raises(InvalidInput, match="is damaged"):
         restore(saved, str(to))
-    migrations.migrate(store.engines.writer, "0002", later_scripts)
+    migrations.migrate(store.engines.writer, "0003", later_scripts)
     store.close()
     shutil.copy(tmp_path / "store.db", saved)
-    with pytest.raises(InvalidInput, match="newer than 0001"):
+    with pytest.raises(InvalidInput, match="newer than 0002"):
         restore(saved, str(to))
     assert not to.exists()
     with pytest.raises(InvalidInput, match="there is no such file"):

@@ -19,7 +19,7 @@ from store_cases import MORE, NewAddress, filled, outcome, window
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations
 from servotwin.store.engine import StoreUnavailable, engines_of, parse_address, public_address, transaction
-from servotwin.store.records import PutResult
+from servotwin.store.records import MessageKind, PutResult
 from servotwin.store.results import _locked_serials
 from servotwin.store.schema import REVISION, metadata, twins
 from servotwin.store.store import open_store
@@ -48,12 +48,36 @@ def test_the_newest_migration_is_the_revision_of_the_code() -> None:
     assert ScriptDirectory(str(migrations.SCRIPTS)).get_current_head() == REVISION
 
 
+def test_a_verification_that_waits_in_a_database_of_the_version_before_is_found_under_its_new_kind(
+    new_address: NewAddress,
+) -> None:
+    engines = engines_of(parse_address(url := new_address()))
+    migrations.migrate(engines.writer, "0001")
+    with transaction(engines.writer) as connection:
+        for statement in (
+            "INSERT INTO twins (servo, heard, asked) VALUES ('a', 5.0, 6.0)",
+            "INSERT INTO messages (servo, kind, key, boot, sequence, start, encoding, digest, received) "
+            "VALUES ('a', 'proof', 'k', '', 0, 0.0, '', :body, 6.0)",
+            "INSERT INTO bodies SELECT id, :body FROM messages",
+            "INSERT INTO evidence (servo, kind, status, made, body) VALUES ('a', 'proof', '', 7.0, :body)",
+        ):
+            connection.execute(sa.text(statement), {"body": b"body"} if ":body" in statement else {})
+    engines.dispose()
+    store = open_store(url)
+    [lease] = store.lease("me", 1, 60.0, 10.0, (MessageKind.VERIFICATION,))
+    assert [(one.kind, one.body) for one in lease.messages] == [(MessageKind.VERIFICATION, b"body")]
+    assert store.servo("a").last_message == 5.0
+    assert store.backlog(20.0).verifications == 1
+    assert [(one.kind, one.created) for one in store.events("a")] == [("verification", 7.0)]
+    store.close()
+
+
 @pytest.mark.slow
 def test_an_old_database_is_brought_up_to_date_with_all_it_holds(new_address: NewAddress, later_scripts: Path) -> None:
     url = new_address()
     store = filled(url)
     before = store.audit("a")
-    migrations.migrate(store.engines.writer, "0002", later_scripts)
+    migrations.migrate(store.engines.writer, "0003", later_scripts)
     assert store.audit("a") == before
     with transaction(store.engines.reader) as connection:
         assert connection.execute(sa.text("SELECT colour FROM twins")).scalars().all() == ["grey"]
@@ -63,20 +87,20 @@ def test_an_old_database_is_brought_up_to_date_with_all_it_holds(new_address: Ne
 def test_a_newer_database_is_refused(new_address: NewAddress, later_scripts: Path) -> None:
     url = new_address()
     store = filled(url)
-    migrations.migrate(store.engines.writer, "0002", later_scripts)
+    migrations.migrate(store.engines.writer, "0003", later_scripts)
     store.close()
-    with pytest.raises(InvalidInput, match=r"its schema 0002 is newer than 0001.*install the newer servotwin$"):
+    with pytest.raises(InvalidInput, match=r"its schema 0003 is newer than 0002.*install the newer servotwin$"):
         open_store(url)
 
 
 def test_a_migration_that_fails_leaves_nothing(new_address: NewAddress, later_scripts: Path) -> None:
     url = new_address()
     filled(url).close()
-    broken = later_scripts / "versions" / "0002_more.py"
+    broken = later_scripts / "versions" / "0003_more.py"
     broken.write_text(MORE + '    op.execute("INSERT INTO nowhere VALUES (1)")\n')
     engines = engines_of(parse_address(url))
     with pytest.raises((StoreUnavailable, sa.exc.DBAPIError)):
-        migrations.migrate(engines.writer, "0002", later_scripts)
+        migrations.migrate(engines.writer, "0003", later_scripts)
     engines.dispose()
     store = open_store(url)
     assert "colour" not in {column["name"] for column in sa.inspect(store.engines.reader).get_columns("twins")}

@@ -179,7 +179,7 @@ class Against(RuleBasedStateMachine):
         assert waiting.messages == sum(
             len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER))) for name in self.servos
         )
-        assert waiting.proofs == sum(len(self.undone(name, (MessageKind.VERIFICATION,))) for name in self.servos)
+        assert waiting.verifications == sum(len(self.undone(name, (MessageKind.VERIFICATION,))) for name in self.servos)
 
 
 Against.TestCase.settings = examples(25, stateful_step_count=25)

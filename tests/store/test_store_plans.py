@@ -13,7 +13,7 @@ from servotwin.store.records import EvidenceRecord, MessageKind
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store, open_store
 
-WAITING = re.compile(r"SCAN messages USING (COVERING )?INDEX ix_messages_(work|proofs)")
+WAITING = re.compile(r"SCAN messages USING (COVERING )?INDEX ix_messages_(work|verifications)")
 COUNTED = "count(*)"
 """What is not yet processed is counted, and is all that these indexes hold."""
 SMALL = re.compile(r"SCAN (chosen|anon_\d|\(subquery-\d+\)|\d+ CONSTANT ROWS?|CONSTANT ROW)")

@@ -65,7 +65,7 @@ def test_the_summary_of_a_servo(store: Store) -> None:
     assert [one.servo for one in store.servos()] == ["a", "b"]
     assert [one.servo for one in store.servos(after="a")] == ["b"]
     a = store.servo("a")
-    assert (a.serial, a.windows, a.waiting, a.heard, a.wake, a.posted) == (1, 2, 1, 160.0, 400.0, 1)
+    assert (a.serial, a.windows, a.waiting, a.last_message, a.wake, a.posted) == (1, 2, 1, 160.0, 400.0, 1)
     assert (a.gap, a.std, a.status, a.version, a.receipt) == (0.2, 0.02, "ok", 3, "applied")
     assert store.servo("nobody") is None
 
@@ -189,7 +189,7 @@ def test_events_that_belong_to_no_window(store: Store) -> None:
         store.commit([outcome(first, *result), outcome(second, EvidenceRecord("hello", 0, b"other"))], 201.0)
         == [True] * 2
     )
-    assert [(one.kind, one.status, one.made) for one in store.events("a")] == [
+    assert [(one.kind, one.status, one.created) for one in store.events("a")] == [
         ("estimate", "failed: no state", 201.0), ("fallback", "limit cycle", 201.0), ("hello", "boot", 201.0)
     ]  # fmt: skip
     assert [one.kind for one in store.events("a", limit=1)] == ["estimate"]

@@ -36,6 +36,16 @@ def store(tmp_path: Path) -> Iterator[Store]:
     store.close()
 
 
+def renamed(value: object) -> object:
+    """A document with the keys of today."""
+    if isinstance(value, list):
+        return [renamed(each) for each in value]
+    if isinstance(value, dict):
+        today = {"made": "created", "found": "evidence"}
+        return {today.get(key, key): renamed(each) for key, each in value.items()}
+    return value
+
+
 def newest_window(store: Store) -> WindowMessage:
     last = store.windows(SERVO, 1)[0]
     stored = store.window(SERVO, last.boot, last.sequence)
@@ -57,7 +67,7 @@ def test_a_store_of_version_0_is_at_the_newest_revision_and_tells_the_same(store
         assert connection.exec_driver_sql(f"SELECT version_num FROM {VERSIONS}").scalar() == REVISION
     expected = json.loads(gzip.decompress((DATA / "audit.json.gz").read_bytes()))
     traces = [trace_as_json(trace) for trace in store.audit(SERVO)]
-    assert json.loads(msgspec.json.encode(traces)) == expected
+    assert json.loads(msgspec.json.encode(traces)) == renamed(expected)
     assert sum(len(trace["steps"]) for trace in traces) == 1
 
 

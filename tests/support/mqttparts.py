@@ -10,9 +10,10 @@ from mosquitto import Mosquitto
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.mqtt import MqttTransport
 from servotwin.link.seal import verifier_of
-from servotwin.link.transport import Parcel, Unreachable, deflated
+from servotwin.link.transport import Parcel, Unreachable
 from servotwin.messages import WindowMessage, checksum, encode, pack_channel
-from servotwin.store.group_commit import GroupCommit
+from servotwin.messages.codec import deflated
+from servotwin.store.group_commit import AwaitedCommits, GroupCommit
 from servotwin.store.records import OutgoingMessage, WorkResult
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import AccessControl, EdgeGate, Verifiers
@@ -21,7 +22,6 @@ from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RateLimiter, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
-from servotwin.twin_service.store_executor import FutureBridge
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
 SERVOS = ("axis-1", "axis-2")
@@ -66,11 +66,11 @@ class Twin:
         asyncio.run(self._main())
 
     async def _main(self) -> None:
-        self._loop, self._stop, futures = asyncio.get_running_loop(), asyncio.Event(), FutureBridge()
+        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         self.polls = LongPolls(self._posted, 100, shared=True)
         known = SERVOS.__contains__
         limits = SampleTimeLimiter(1.0, 1e9)
-        ingest = Ingest(lambda incoming: futures.wrap(self.commits.put(incoming)), known, limits, self.metrics)
+        ingest = Ingest(AwaitedCommits(self.commits).put, known, limits, self.metrics)
         gate = EdgeGate(AccessControl(VERIFIERS), known, RateLimiter(1e6, 1e6, self._loop.time))
         handler = MqttRequestHandler(gate, ingest, self.polls, lambda: None, self.metrics)
         server = MqttServer(self._broker, handler, "twins")

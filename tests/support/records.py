@@ -8,7 +8,7 @@ from typing import Any
 from deployment import PATIENCE, Fleet
 
 from servotwin.messages import Receipt, decode
-from servotwin.messages.compression import decompress
+from servotwin.messages.codec import decompress
 
 Key = tuple[str, str, int]
 """(servo, boot, sequence)."""

@@ -19,8 +19,8 @@ NewAddress = Callable[[], str]
 MORE = """
 import sqlalchemy as sa
 from alembic import op
-revision = "0002"
-down_revision = "0001"
+revision = "0003"
+down_revision = "0002"
 def upgrade():
     op.add_column("twins", sa.Column("colour", sa.Text, nullable=False, server_default="grey"))
 """
@@ -54,7 +54,7 @@ def letter(servo: str = "a", body: bytes = b"hello", received: float = 100.0) ->
 
 
 def verification(servo: str = "a", body: bytes = b"prove it", received: float = 100.0) -> Incoming:
-    return incoming(servo, f"proof {body!r}", body, MessageKind.VERIFICATION, received)
+    return incoming(servo, f"verification {body!r}", body, MessageKind.VERIFICATION, received)
 
 
 def outcome(claim: Lease, *evidence: EvidenceRecord, outgoing: tuple[bytes, ...] = (), **other: object) -> WorkResult:

@@ -46,5 +46,5 @@ def later_scripts(tmp_path: Path) -> Path:
     """The migrations of some later servotwin."""
     folder = tmp_path / "migrations"
     shutil.copytree(migrations.SCRIPTS, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "versions" / "0002_more.py").write_text(MORE)
+    (folder / "versions" / "0003_more.py").write_text(MORE)
     return folder

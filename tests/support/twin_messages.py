@@ -4,6 +4,7 @@ import numpy as np
 
 from servotwin import messages
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.window import Window
 from servotwin.messages import (
     Reason,
@@ -13,7 +14,6 @@ from servotwin.messages import (
     pack_finely,
 )
 from servotwin.redesign.policy import Evidence, Redesign
-from servotwin.twin.estimating import Expectation
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin

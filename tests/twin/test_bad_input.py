@@ -9,6 +9,7 @@ from twin_messages import message_of, window_message
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.window import Window
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
@@ -137,6 +138,7 @@ def test_a_nameplate_wrong_by_a_factor_of_two_is_said_and_gives_no_wrong_gap(cha
 def test_a_torque_gain_wrong_by_a_factor_of_two_does_not_move_the_gap(factor):
     seen = Seen(windows_of(MODEL.replace(k_T=factor * MODEL.k_T), 10.0, 3))
     assert seen.gaps() == pytest.approx([10.0] * 3, abs=0.1)
+    assert sum("the motor is not what is stated: its lag J R / k_T" in said for said in seen.alarms) == 1
 
 
 @pytest.mark.slow
@@ -146,6 +148,21 @@ def test_windows_under_another_controller_than_the_models_show_the_gap_and_the_m
     seen = Seen(windows_of(ONE, 10.0, 3, law=law.replace(Kp=0.5 * law.Kp, Ki=0.3 * law.Ki)))
     assert seen.gaps() == pytest.approx([10.0] * 3, abs=0.05)
     assert np.exp(seen.machine.factors[:2]) == pytest.approx([1.04, 0.8], abs=5e-3)
+
+
+@pytest.mark.slow
+def test_another_controller_is_said_and_no_setting_follows_until_the_stated_one_is_back():
+    law = MODEL.controller
+    changed = law.replace(Kp=0.5 * law.Kp, Ki=0.3 * law.Ki)
+    stated = TwinModel.of(MODEL, TwinSettings(policy="margin"), start=Setting(MODEL.tolerance_for(math.radians(10.0))))
+    own, other = list(windows_of(MODEL, 10.0, 3)), list(windows_of(MODEL, 10.0, 3, law=changed))
+    seen = Seen([own[0], *other, *own[1:]], stated)
+    assert [("voltage is not that of the stated controller" in said) for said in seen.alarms] == [
+        False, False, True, False, False, False,
+    ]  # fmt: skip
+    assert "it fits Kp 0.5, Ki 0.3, Kd 1 times the stated" in seen.alarms[2]
+    assert [redesign.setting is not None for redesign in seen.redesigns] == [True, True, False, False, True, True]
+    assert "another controller" in seen.redesigns[2].reason
 
 
 @pytest.mark.slow

@@ -14,12 +14,11 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.messages import Acknowledge, Gains, Setting, Update, pack_channel
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.certificate import Demands, verification_of
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.settings import TwinSettings
-from servotwin.twin.step import verification_of
 
 PAPER = Servo.preset("paper")
 FEW = Demands(machines=16, screened=2, scales=(0.5, 0.7), settled=0.8)
@@ -60,7 +59,7 @@ def answer(gap_deg=(4.9, 5.1), settings=SETTINGS, observed=None, status=GapStatu
 
 
 @pytest.mark.slow
-def test_what_is_proved_is_sent_with_its_proof_and_band():
+def test_what_is_verified_is_sent_with_its_certificate_and_band():
     (update,), redesign = answer()
     assert isinstance(update, Update)
     assert update.setting.gains.feedforward == pytest.approx(-0.05)

@@ -8,11 +8,11 @@ import pytest
 from twin_messages import known_gap, window_message
 
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
-from servotwin.estimation.machine import LearningSettings, LearntMachine
-from servotwin.estimation.motor import BACK_EMF
+from servotwin.estimation.learning.machine import LearningSettings, LearntMachine
+from servotwin.estimation.learning.motor import BACK_EMF
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.messages import WindowMessage, checksum, pack_channel
 from servotwin.plant.servo import Servo
-from servotwin.twin.estimating import Expectation
 from servotwin.twin.evidence import MachineRecord, StoredExpectation, rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings

@@ -12,7 +12,7 @@ import pytest
 from twin_messages import message_of
 
 from benchmarks.estimator_windows import cut
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.plant.servo import Servo

@@ -23,12 +23,13 @@ from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import disturbance, quick_bias
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
-from servotwin.twin.estimating import Expectation, decode_window, estimator_of
+from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings

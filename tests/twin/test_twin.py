@@ -10,7 +10,8 @@ from twin_messages import PITCH, eq_21, known_gap, make, receipt, twin_of, windo
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.estimation.trend import TrendSettings
+from servotwin.estimation.learning.trend import TrendSettings
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.window import Window
 from servotwin.messages import (
     Acknowledge,
@@ -20,7 +21,7 @@ from servotwin.messages import (
     Setting,
     pack_channel,
 )
-from servotwin.twin.estimating import Expectation, decode_channel, decode_window
+from servotwin.twin.estimating import decode_channel, decode_window
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings

@@ -12,6 +12,7 @@ from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.learning.wear import TrendState
 from servotwin.messages import (
     Band,
     Cause,
@@ -22,7 +23,6 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.policy import Evidence, PaperPolicy, Redesign
 from servotwin.simulation import simulate
-from servotwin.twin.estimating import TrendState
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin

@@ -9,7 +9,7 @@ from scaling import Units, scaled
 from servotwin.commissioning.edge_settings import Commissioning, Recording, supervision_of
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision
-from servotwin.estimation.trend_settings import TrendSettings
+from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.messages import Setting
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.certified.uncertainty import Uncertainty

@@ -21,7 +21,8 @@ from servotwin.edge.agent import Agent
 from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95
-from servotwin.estimation.trend import Trend, TrendSettings
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.learning.wear import TrendState
 from servotwin.messages import (
     Acknowledge,
     Cause,
@@ -39,15 +40,13 @@ from servotwin.messages import (
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.estimating import TrendState
 from servotwin.twin.evidence import EvidenceLog
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
-from servotwin.twin.state import decode_state, encode_state
+from servotwin.twin.state import MAX_ENDED_BOOTS, MAX_SETTINGS, Versions, decode_state, encode_state
 from servotwin.twin.step import WindowArrival, step
 from servotwin.twin.twin import Twin
-from servotwin.twin.versions import MAX_ENDED_BOOTS, MAX_SETTINGS, Versions
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")

@@ -1,4 +1,4 @@
-"""The exact proof of what was looked up: queued with the update, kept as evidence, and what fails it is withdrawn."""
+"""Verification of what was looked up: queued with the update, kept as evidence, and what fails it is withdrawn."""
 
 from __future__ import annotations
 
@@ -112,7 +112,7 @@ def begun(fleet: ModelRegistry) -> tuple[Queue, Update, Incoming]:
 
 
 @pytest.mark.slow
-def test_an_update_from_the_table_queues_the_proof_for_its_own_evidence(fleet: ModelRegistry) -> None:
+def test_an_update_from_the_table_queues_the_verification_for_its_own_evidence(fleet: ModelRegistry) -> None:
     _, update, queued = begun(fleet)
     question = decode_request(queued.body)
     assert (queued.servo, queued.kind, queued.encoding) == ("axis", MessageKind.VERIFICATION, "")
@@ -127,7 +127,7 @@ def test_a_verification_that_passes_is_stored_and_changes_nothing(fleet: ModelRe
     queue, update, queued = begun(fleet)
     before = queue.state
     outcome = queue.give(queued)
-    assert kinds(outcome) == ["proof"]
+    assert kinds(outcome) == ["verification"]
     (row,) = outcome.evidence
     assert (row.version, row.status, row.window) == (update.version, "", "{}/{}".format(*update.window))
     body = msgspec.msgpack.decode(row.body)
@@ -145,12 +145,14 @@ def test_equal_questions_are_one_message_and_equal_claims_equal_outcomes(fleet: 
 
 
 @pytest.mark.slow
-def test_a_proof_that_fails_sends_the_fallback_set_with_the_next_window(fleet: ModelRegistry, monkeypatch) -> None:
+def test_a_verification_that_fails_sends_the_fallback_set_with_the_next_window(
+    fleet: ModelRegistry, monkeypatch
+) -> None:
     queue, update, queued = begun(fleet)
     with monkeypatch.context() as patched:
         failing(patched)
         outcome = queue.give(queued)
-    assert kinds(outcome) == ["proof", "withdrawn"]
+    assert kinds(outcome) == ["verification", "withdrawn"]
     assert "settles on 3.0 %" in outcome.evidence[0].status
     assert f"the verification of version {update.version} failed" in outcome.evidence[1].status
     assert not outcome.outgoing  # the edge takes nothing that stands on no newer window
@@ -194,7 +196,7 @@ def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry,
     failing(monkeypatch)
     before = queue.state
     outcome = queue.give(queued._replace(body=msgspec.msgpack.encode(other)))
-    assert kinds(outcome) == ["proof"]
+    assert kinds(outcome) == ["verification"]
     assert outcome.evidence[0].status == "not verified: another setting is in force by now"
     assert queue.state == before
 
@@ -214,13 +216,13 @@ def test_a_fallback_of_the_edge_has_the_next_window_estimated(fleet: ModelRegist
 
 
 @pytest.mark.slow
-def test_an_update_on_its_way_is_not_sent_again_once_its_proof_failed(fleet: ModelRegistry, monkeypatch) -> None:
+def test_an_update_on_its_way_is_not_sent_again_once_its_verification_failed(fleet: ModelRegistry, monkeypatch) -> None:
     queue = Queue(fleet)
     outcome = queue.window(0)
     assert outcome.wake is not None
     failing(monkeypatch)
     after = queue.give(outcome.enqueue[0])
-    assert kinds(after) == ["proof", "withdrawn"]
+    assert kinds(after) == ["verification", "withdrawn"]
     assert after.wake is None
 
 

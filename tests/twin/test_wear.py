@@ -14,9 +14,10 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.machine import LearningSettings
-from servotwin.estimation.trend import Trend, TrendSettings
-from servotwin.twin.estimating import Expectation, Wear, decode_window
+from servotwin.estimation.learning.machine import LearningSettings
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.learning.wear import Expectation, Wear
+from servotwin.twin.estimating import decode_window
 from servotwin.twin.settings import TwinSettings
 
 STD = math.radians(0.02)

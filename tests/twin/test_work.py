@@ -20,7 +20,8 @@ from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
-from servotwin.estimation.machine import LearningSettings
+from servotwin.estimation.learning.machine import LearningSettings
+from servotwin.estimation.learning.wear import TrendState
 from servotwin.messages import (
     Acknowledge,
     Hello,
@@ -33,11 +34,11 @@ from servotwin.messages import (
     decode,
     encode,
 )
-from servotwin.messages.compression import DEFLATE, ZSTD, compress
+from servotwin.messages.codec import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import step as stepping
-from servotwin.twin.estimating import DecodedWindow, TrendState
+from servotwin.twin.estimating import DecodedWindow
 from servotwin.twin.evidence import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
@@ -216,14 +217,14 @@ def test_no_bytes_make_it_fail(body, encoding):
 
 @pytest.mark.slow
 def test_a_twin_that_breaks_midway_is_as_if_the_window_had_not_been_there(monkeypatch):
-    good, right = stepping._draft, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
+    good, right = stepping.draft_update, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
 
     def breaks(message, *others):
         if message.sequence == windows()[1].sequence:
             raise ZeroDivisionError("float division by zero\0" + 1000 * "!")
         return good(message, *others)
 
-    monkeypatch.setattr(stepping, "_draft", breaks)
+    monkeypatch.setattr(stepping, "draft_update", breaks)
     outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.5, 1.0]), 0.0)
     assert kinds(outcome, 2) == ["estimate"]
     status = statuses(outcome)[1]

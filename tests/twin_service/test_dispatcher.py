@@ -8,8 +8,7 @@ from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.store_executor import StoreExecutor
-from servotwin.twin_service.worker import LeaseResult
-from servotwin.twin_service.worker_pool import WorkerLost
+from servotwin.twin_service.worker import LeaseResult, WorkerLost
 
 DIES, FAILS = b"dies", b"fails"
 

@@ -25,7 +25,7 @@ from service_system import (
 
 from servotwin.link.seal import TO_EDGE, key_of, opened, verifier_of
 from servotwin.messages import Acknowledge, Setting, Update, decode, encode
-from servotwin.messages.compression import compress
+from servotwin.messages.codec import compress
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import WorkResult
 from servotwin.twin_service.auth import read_tokens, write_tokens

@@ -12,7 +12,7 @@ from service_system import SERVO, bearer, hello, place, process, served, twin_fi
 
 from servotwin.messages import Refusal, encode
 from servotwin.messages.checks import InvalidMessage
-from servotwin.messages.compression import ENCODINGS, compress, decompress
+from servotwin.messages.codec import ENCODINGS, compress, decompress
 
 ANY = SERVO.replace('"ax-*"', '"*"')
 CODES = {refusal.value for refusal in Refusal}

@@ -20,9 +20,9 @@ from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.auth import Verifiers, read_secret, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
 from servotwin.twin_service.http_edge import LongPolls
+from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.limits import (
     STATUS,
-    BodyReader,
     Disconnected,
     RateLimiter,
     RequestRejected,

@@ -41,7 +41,7 @@ from servotwin.store.store import open_store
 from servotwin.twin_service import command as service
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker_pool import WorkerPool
+from servotwin.twin_service.worker import WorkerPool
 
 PATIENCE = 60.0
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups")
@@ -105,7 +105,7 @@ def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_orde
                     if link["window"]["done"] is not None
                 ]
             )
-            assert {result["kind"] for result in links[0]["found"]} >= {"estimate"}
+            assert {result["kind"] for result in links[0]["evidence"]} >= {"estimate"}
             summary = client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()
             assert (summary["windows"], summary["waiting"], summary["serial"]) == (1, 0, 1)
             assert client.get("/v1/servos/ax-1/events", headers=bearer(OPERATOR)).json() == []
@@ -172,7 +172,7 @@ def test_workers_end_with_a_service_that_is_killed_and_its_work_is_taken_up_agai
     with process(path) as (_running, url), httpx.Client(base_url=url, timeout=PATIENCE) as client:
         until(lambda: client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["waiting"] == 0)
         links = client.get("/v1/servos/ax-1/audit", headers=bearer(OPERATOR)).json()
-    assert [len([f for f in link["found"] if f["kind"] == "estimate"]) for link in links] == [1] * 20
+    assert [len([f for f in link["evidence"] if f["kind"] == "estimate"]) for link in links] == [1] * 20
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from servotwin.cli.audit import Source, audit
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
-from servotwin.twin_service import auth, worker_pool
+from servotwin.twin_service import auth, worker
 from servotwin.twin_service.auth import TokenFile, Verifiers, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import MQTT_PASSWORD, PASSWORD
 
@@ -16,7 +16,7 @@ from servotwin.twin_service.config import MQTT_PASSWORD, PASSWORD
 def test_workers_do_not_get_the_passwords_of_the_service(monkeypatch):
     for name in (PASSWORD, MQTT_PASSWORD):
         monkeypatch.setenv(name, "hunter2")
-    assert "hunter2" not in worker_pool._environment().values()
+    assert "hunter2" not in worker._environment().values()
 
 
 def test_tokens_written_while_the_file_is_read_become_valid_too(tmp_path, monkeypatch):

@@ -198,13 +198,13 @@ def link(boot: str, status: str, gap: float) -> dict[str, Any]:
         {"kind": "estimate", "status": status, "body": {"estimate": estimate}},
         {"kind": "trend", "status": "", "body": trend},
     ]
-    return {"window": {"boot": boot}, "found": result}
+    return {"window": {"boot": boot}, "evidence": result}
 
 
 def test_the_newest_good_estimate_and_the_newest_status() -> None:
-    glanced = {"window": {"boot": "b2"}, "found": [{"kind": "glance", "status": "", "body": {}}]}
+    glanced = {"window": {"boot": "b2"}, "evidence": [{"kind": "glance", "status": "", "body": {}}]}
     none = {"kind": "estimate", "status": "failed: no", "body": {"failed": "no"}}
-    failed = {"window": {"boot": "b2"}, "found": [none]}
+    failed = {"window": {"boot": "b2"}, "evidence": [none]}
     links = [glanced, failed, link("b2", "lower bound", 9.0), link("b1", "ok", 0.2), link("b1", "ok", 0.1)]
     result = newest_estimate(links)
     assert result == ServoEstimate(

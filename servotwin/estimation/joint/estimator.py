@@ -40,7 +40,7 @@ from servotwin.estimation.joint.verdict import (
     mismatched,
     window_estimate,
 )
-from servotwin.estimation.trend import Prior
+from servotwin.estimation.learning.trend import Prior
 from servotwin.estimation.whitened.channels import faults, motor_angle
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window

@@ -17,7 +17,7 @@ from servotwin.estimation.core.whitening import Autoregression, recursion, with_
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, Reduce
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
-from servotwin.estimation.trend import Prior
+from servotwin.estimation.learning.trend import Prior
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
+from servotwin.messages import Verification
 from servotwin.redesign.certified.uncertainty import LARGEST_DELAY
 from servotwin.redesign.design import Design
 
@@ -85,8 +86,8 @@ class Demands:
     machines : int
         Machines of the verification, drawn independently of one another and of those that rank.
     attempts : int
-        Candidates that are verified before the search gives up, each on machines of its own; then as many without
-        integral action and dead zone.
+        Candidates that are verified before the search gives up, each on machines of its own; then as many of each
+        kind that settles most surely.
     """
 
     Ms: Annotated[
@@ -138,7 +139,7 @@ class Demands:
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))
-    integral: tuple[float, ...] = (0.0, 0.01, 0.03)
+    integral: tuple[float, ...] = (0.0, 0.01, 0.02, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     velocity: tuple[float, ...] = (0.3, 0.5)
     known: float = 0.0726
@@ -359,3 +360,22 @@ class NotVerified:
 
     reason: str
     best: Certificate | None = None
+
+
+def verification_of(certificate: Certificate) -> Verification:
+    """Summarise a certificate for an update, without its computing time: equal twins send equal bytes."""
+    return Verification(
+        members=certificate.members,
+        looked_at=certificate.looked_at,
+        settled=certificate.settled,
+        tail=certificate.tail,
+        overshoot=certificate.overshoot,
+        Ms=certificate.Ms,
+        crossover=certificate.crossover,
+        phase_margin=certificate.phase_margin,
+        saturated=certificate.saturated,
+        settled_least=certificate.settled_least,
+        confidence=certificate.confidence if certificate.settled_least else 0.0,
+        Ms_worst=0.0 if certificate.loop is None else certificate.loop.Ms_worst,
+        phase_margin_worst=0.0 if certificate.loop is None else certificate.loop.phase_margin_worst,
+    )

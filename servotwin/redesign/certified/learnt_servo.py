@@ -7,7 +7,7 @@ import math
 import numpy as np
 from scipy.linalg import block_diag
 
-from servotwin.estimation.motor import BACK_EMF, LAG, LearntMotor
+from servotwin.estimation.learning.motor import BACK_EMF, LAG, LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -19,7 +19,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
 _WORTH_TRYING = 0.5
-# The servo's own PD and the constant that proved near the best at every gap with hindsight: so the search is no worse.
+# The servo's own PD and the constant that was near the best at every gap with hindsight: so the search is no worse.
 _ALWAYS = (0.6, 1.0)
 _ROUNDED = 1.0 + 1e-6
 

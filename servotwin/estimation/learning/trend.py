@@ -15,8 +15,8 @@ from scipy.special import log_ndtr
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, CarriedOffset, GapEstimate, GapStatus, Interval, OffsetReading
+from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.estimation.passage import Passage, passage
-from servotwin.estimation.trend_settings import TrendSettings
 from servotwin.plant.signals import Array
 from servotwin.runtime.notebook import html_table
 

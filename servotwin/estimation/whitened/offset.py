@@ -14,12 +14,12 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation import whitened
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, polygon
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.whitened.channels import motor_angle
+from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.scales import scales
@@ -36,7 +36,7 @@ def estimate_carrying(
     window: Window,
     servo: Servo,
     prior: float | GapEstimate | None,
-    settings: whitened.WhitenedSettings,
+    settings: WhitenedSettings,
     carried: tuple[float, float] | None,
     machine: FactorPrior | None = None,
 ) -> GapEstimate:
@@ -51,14 +51,14 @@ def estimate_carrying(
     servo : Servo
     prior : float or GapEstimate, optional
         As for `estimate_gap`.
-    settings : whitened.WhitenedSettings
+    settings : WhitenedSettings
         With an `offset` of its own, none is carried and none is read.
     carried : (float, float), optional
         Mean and standard deviation of the offset, rad.
     machine : FactorPrior, optional
         What is known of the machine's numbers; None: the model is exact.
     """
-    fitted = whitened.fit(window, servo, prior, settings, machine)
+    fitted = fit(window, servo, prior, settings, machine)
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
     # A window of one contact cannot show the gap alone, and judging it takes longer than everything else here.
     alone = None if known and fitted.one_sided() else fitted.concluded()
@@ -68,7 +68,7 @@ def estimate_carrying(
         if not known or alone.status is GapStatus.MODEL_MISMATCH:
             return alone
     assert carried is not None
-    aided = whitened.fit(window, servo, prior, replace(settings, offset=carried), machine)
+    aided = fit(window, servo, prior, replace(settings, offset=carried), machine)
     helped = aided.concluded()
     if helped.ok and not helped.rms > _WORSE * fitted.rms():
         slope = _slope(_columns(window, aided.servo, helped, settings))
@@ -85,7 +85,7 @@ def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
 
 
 def read_offset(
-    window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.WhitenedSettings | None = None
+    window: Window, servo: Servo, estimate: GapEstimate, settings: WhitenedSettings | None = None
 ) -> OffsetReading:
     """The offset (rad) with its standard deviation and its covariance with the gap.
 
@@ -100,7 +100,7 @@ def read_offset(
     if window.theta_m is None or not estimate.ok:
         missing = "theta_m" if window.theta_m is None else "an OK estimate"
         raise InvalidInput(f"{window.where}the encoder's offset needs {missing}")
-    table = _columns(window, servo, estimate, settings or whitened.WhitenedSettings())
+    table = _columns(window, servo, estimate, settings or WhitenedSettings())
     residual, columns = table[0], table[1:]
     gain = response(servo, window.sample_rate).static_gain
     solved = least_squares(np.delete(columns, _GAP, axis=0), residual)
@@ -110,7 +110,7 @@ def read_offset(
     return OffsetReading(offset, math.sqrt(covariance[1, 1]), float(covariance[0, 1]))
 
 
-def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: whitened.WhitenedSettings) -> Array:
+def _columns(window: Window, servo: Servo, estimate: GapEstimate, settings: WhitenedSettings) -> Array:
     """(k, n) residual, its derivatives by gap and constant (per rad of offset), nuisances."""
     model = response(servo, window.sample_rate)
     angle = motor_angle(window, servo.encoder_resolution, settings, scales(servo).time)

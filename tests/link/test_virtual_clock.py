@@ -1,4 +1,4 @@
-"""One event queue for virtual and real time."""
+"""Event queue in virtual time."""
 
 import math
 from functools import partial
@@ -7,22 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.runtime.clock import VirtualClock, WallClock
-
-
-class Wall:
-    """A wall clock that passes only by sleeping, and a little by being read."""
-
-    def __init__(self) -> None:
-        self.time = 1e9
-        self.slept: list[float] = []
-
-    def read(self) -> float:
-        return self.time
-
-    def sleep(self, seconds: float) -> None:
-        self.slept.append(seconds)
-        self.time += seconds
+from servotwin.link.simulated import VirtualClock
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(-1, 1)), max_size=30))
@@ -74,30 +59,3 @@ def test_the_past_is_refused(time: float) -> None:
     clock = VirtualClock(1.0)
     with pytest.raises(ValueError, match="cannot schedule"):
         clock.schedule(time, lambda: None)
-
-
-def test_the_wall_clock_only_sleeps() -> None:
-    wall = Wall()
-    clock = WallClock(wall.read, wall.sleep)
-    seen: list[tuple[str, float]] = []
-    clock.schedule(0.5, lambda: seen.append(("b", clock.now)))
-    clock.schedule(0.25, lambda: seen.append(("a", clock.now)))
-    clock.run_until(1.0)
-    assert seen == [("a", 0.25), ("b", 0.5)]
-    assert wall.slept == [0.25, 0.25, 0.5]
-    assert clock.now == 1.0
-
-
-def test_the_wall_clock_does_late_events_at_once() -> None:
-    wall = Wall()
-    clock = WallClock(wall.read, wall.sleep)
-    seen = []
-    clock.schedule(0.5, lambda: seen.append(clock.now))
-    wall.time += 2.0
-    event = clock.schedule(3.0, lambda: seen.append(-1.0))
-    clock.schedule(1.0, lambda: seen.append(clock.now))
-    assert clock.next_time == 0.5
-    assert clock.cancel(event)
-    clock.run_until(2.0)
-    assert seen == [2.0, 2.0]
-    assert wall.slept == []

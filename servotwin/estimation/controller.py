@@ -1,0 +1,255 @@
+"""Comparison of a recorded voltage with the voltage that a stated controller would have given.
+
+The law is run over the recorded reference and position. A window does not show the law's state at its beginning: that
+part of the voltage is fitted. What is left unexplained says that another controller turned the motor.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.control import law
+from servotwin.control.controller import Controller
+from servotwin.control.law import LawParameters, LawState
+from servotwin.estimation.window import Window
+from servotwin.hybrid.automaton import Array
+from servotwin.hybrid.compiled import compiled, verbatim
+
+tick = verbatim(law.tick)
+
+_BLOCKS = 250  # means of voltages that are compared: noise, delays and jitter of a few samples average out
+_TOLERATED = 0.1  # share of the voltage's swing: a discretisation or a rate that differs leaves less
+_ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, as volts, that are tolerated
+_LARGEST = 0.5  # share of the voltage's swing: a window whose noise needs more tolerance shows nothing
+_FILTERED = 5.0  # time constants of the loop filter after which the measurement before the window is forgotten
+_AT_LIMIT, _FEWEST = 0.999, 20  # of the limit; samples before the first one at the limit that show the initial state
+_DELAYS = 4  # samples, from none on, by which the voltage may be recorded later than it was computed
+_ROUNDS = 3  # fits of the initial state: a limit of the voltage makes it nonlinear
+
+
+@dataclass(frozen=True)
+class ControllerComparison:
+    """Comparison of a window's voltage with that of a stated controller.
+
+    Attributes
+    ----------
+    unexplained : float
+        Root mean square of the part of the voltage that the stated controller does not give, V.
+    swing : float
+        Root mean square of the recorded voltage about its mean, V.
+    tolerated : float
+        Largest `unexplained` (V) that noise, rounding and discretisation account for.
+    factors : dict of str to float
+        Gains that explain the voltage, in stated ones; empty where the stated controller does, or where no gains do.
+    """
+
+    unexplained: float
+    swing: float
+    tolerated: float
+    factors: dict[str, float]
+
+    @property
+    def agrees(self) -> bool:
+        """True where the stated controller explains the voltage."""
+        return self.unexplained <= self.tolerated
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong; empty where the controllers agree."""
+        if self.agrees:
+            return ""
+        share = f"{100.0 * self.unexplained / self.swing:.0f} % of the voltage's swing" if self.swing > 0.0 else "it"
+        fitting = ", ".join(f"{name} {factor:.2g}" for name, factor in self.factors.items())
+        like = f"; it fits {fitting} times the stated" if fitting else ", and so do other gains"
+        return f"the voltage is not that of the stated controller, which leaves {share} unexplained{like}"
+
+
+class _Terms(NamedTuple):
+    """Parts of a law's voltage over a window, each (n,): 0 or 1 where it acts, and the unit responses of its gains."""
+
+    acting: Array
+    proportional: Array
+    integral: Array
+    derivative: Array
+
+
+def compare_controller(window: Window, controller: Controller, tolerance: float) -> ControllerComparison | None:
+    """Compare the voltage of a window with that of a controller at the window's rate.
+
+    Parameters
+    ----------
+    window : Window
+    controller : Controller
+        As stated; it may be continuous.
+    tolerance : float
+        Half-width of its dead zone, m; 0: none.
+
+    Returns
+    -------
+    ControllerComparison or None
+        None: voltage or reference were not recorded, or the voltage moves too little beside noise and rounding.
+    """
+    if window.voltage is None or window.reference is None:
+        return None
+    parameters = controller.replace(sample_rate=window.sample_rate).law(tolerance)
+    made = None
+    for delay in range(_DELAYS):
+        voltage, rest = window.voltage[delay:], window.voltage.size - delay
+        later = _compared(parameters, voltage, window.reference[:rest], window.position[:rest])
+        if later is None or later.agrees:
+            return later
+        made = later if made is None or (later.factors and not made.factors) else made
+    return made
+
+
+def _compared(
+    parameters: LawParameters, voltage: Array, reference: Array, position: Array
+) -> ControllerComparison | None:
+    """Compare a voltage with that of a law, sample by sample."""
+    first = _forgotten(parameters)
+    if position.size - first < 2 * _BLOCKS:
+        return None
+    given = _voltage_from_best_start(parameters, voltage, reference, position)
+    left, swinging = _means(voltage - given, first), _means(voltage - voltage.mean(), first)
+    swing = _rms(swinging - swinging.mean())
+    stiff = abs(parameters.Kp) + abs(parameters.derivative_gain)
+    rounding = _rounding(voltage) + stiff * _rounding(position)
+    tolerated = _TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
+    if tolerated >= _LARGEST * swing:
+        return None
+    unexplained = _rms(left)
+    factors = {} if unexplained <= tolerated else _factors(parameters, voltage, reference, position, first, tolerated)
+    return ControllerComparison(unexplained, swing, tolerated, factors)
+
+
+def _voltage_from_best_start(parameters: LawParameters, voltage: Array, reference: Array, position: Array) -> Array:
+    """Voltage (n,) of the law from the initial state that fits the recorded one best."""
+    start = law.start(float(position[0]))._replace(reference=float(reference[0]), voltage=float(voltage[0]))
+    best, least = np.zeros(0), math.inf
+    for active in (1.0, 0.0) if parameters.enter < parameters.leave else (1.0,):
+        state = start._replace(active=active)
+        for _ in range(_ROUNDS):
+            given, acting = run_law(parameters, state, reference, position)
+            limited = np.abs(voltage) >= _AT_LIMIT * parameters.voltage_limit
+            # A voltage at its limit corrects the integral: what is left of its first value shows before that.
+            first = int(np.argmax(limited)) if limited.any() else limited.size
+            free = np.arange(limited.size) < first if first >= _FEWEST else ~limited
+            state = _corrected(parameters, state, voltage - given, acting, free)
+        given, _ = run_law(parameters, state, reference, position)
+        if (error := _rms(voltage - given)) < least:
+            best, least = given, error
+    return best
+
+
+def _corrected(
+    parameters: LawParameters, state: LawState, left: Array, acting: Array, free: NDArray[np.bool_]
+) -> LawState:
+    """Correct the initial state by what it would have to be for the voltage left (n,) to vanish where it is free."""
+    count = np.arange(left.size)
+    columns = {"offset": (1.0 - parameters.release_step) ** count}
+    if parameters.integral_step != 0.0:
+        columns["integral"] = acting
+    if parameters.derivative_gain != 0.0:
+        columns["derivative"] = -parameters.derivative_gain * acting * (1.0 - parameters.filter_step) ** count
+    if parameters.velocity_gain != 0.0:
+        columns["ahead"] = parameters.velocity_gain * (1.0 - parameters.velocity_step) ** (count + 1)
+    matrix = np.stack([column[free] for column in columns.values()], axis=1)
+    size = np.linalg.norm(matrix, axis=0)
+    size[size == 0.0] = 1.0
+    values = np.linalg.lstsq(matrix / size, left[free], rcond=1e-9)[0] / size
+    return state._replace(
+        **{name: getattr(state, name) + float(value) for name, value in zip(columns, values, strict=True)}
+    )
+
+
+def _factors(
+    parameters: LawParameters, voltage: Array, reference: Array, position: Array, first: int, tolerated: float
+) -> dict[str, float]:
+    """Gains in stated ones with which the law without limits explains the voltage; empty: none do."""
+    terms = law_terms(parameters, law.start(float(position[0])), reference, position)
+    stated = {
+        "Kp": parameters.Kp * terms.proportional,
+        "Ki": parameters.integral_step * terms.integral,
+        "Kd": parameters.derivative_gain * terms.derivative,
+    }
+    stated = {name: term for name, term in stated.items() if np.any(term != 0.0)}
+    count = np.arange(voltage.size)
+    fades = (1.0 - np.array([[parameters.release_step], [parameters.filter_step]])) ** count
+    initial = (terms.acting, *fades)
+    columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
+    measured = _means(voltage - parameters.feedforward, first)
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    values = np.linalg.lstsq(columns / size, measured, rcond=1e-9)[0] / size
+    if _rms(measured - columns @ values) > tolerated:
+        return {}
+    return {name: float(value) for name, value in zip(stated, values, strict=False)}
+
+
+@compiled
+def run_law(parameters: LawParameters, start: LawState, reference: Array, position: Array) -> tuple[Array, Array]:
+    """Run the law over recorded inputs.
+
+    Parameters
+    ----------
+    parameters, start : LawParameters, LawState
+    reference, position : (n,) ndarray
+        m.
+
+    Returns
+    -------
+    voltage, acting : (n,) ndarray
+        V, and 1.0 where proportional and integral action reach the voltage, 0.0 where they do not.
+    """
+    voltage, acting = np.empty(position.size), np.empty(position.size)
+    state = start
+    for k in range(position.size):
+        state = tick(parameters, state, reference[k], position[k])
+        voltage[k] = state.voltage
+        acting[k] = max(state.active, parameters.acting_inside)
+    return voltage, acting
+
+
+def law_terms(parameters: LawParameters, start: LawState, reference: Array, position: Array) -> _Terms:
+    """Unit responses of the gains over a window, each (n,): the law is linear in them beside its dead zone."""
+    unlimited = parameters._replace(
+        voltage_limit=math.inf, rate_step=math.inf, feedforward=0.0, velocity_gain=0.0, integral_step=0.0,
+        tracking_step=0.0, Kp=0.0, derivative_gain=0.0,
+    )  # fmt: skip
+    _, acting = run_law(unlimited, start, reference, position)
+    proportional, _ = run_law(unlimited._replace(Kp=1.0), start, reference, position)
+    integral, _ = run_law(unlimited._replace(integral_step=1.0), start, reference, position)
+    derivative, _ = run_law(unlimited._replace(derivative_gain=1.0), start, reference, position)
+    return _Terms(acting, proportional, integral, derivative)
+
+
+def _forgotten(parameters: LawParameters) -> int:
+    """Samples after which the loop filter has forgotten its state before the window."""
+    if parameters.loop_step >= 1.0:
+        return 0
+    return math.ceil(_FILTERED / -math.log1p(-parameters.loop_step))
+
+
+def _means(values: Array, first: int) -> Array:
+    """Means over equal blocks from a sample on."""
+    length = (values.size - first) // _BLOCKS
+    return values[first : first + _BLOCKS * length].reshape(_BLOCKS, length).mean(axis=1)
+
+
+def _rounding(values: Array) -> float:
+    """Standard deviation of the rounding of a channel to 16 bits."""
+    return float(np.ptp(values)) / 65535.0 / math.sqrt(12.0)
+
+
+def _noise(values: Array) -> float:
+    """Standard deviation of white noise, from second differences, which a slow motion hardly has."""
+    return _rms(np.diff(values, 2)) / math.sqrt(6.0)
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))

@@ -1,0 +1,1 @@
+"""What windows teach across time: gap and wear, and the numbers of machine and motor; `wear.Wear` is the entry."""
