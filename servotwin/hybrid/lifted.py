@@ -16,7 +16,7 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, subroutine
-from servotwin.hybrid.flow import SIGNIFICANT, dot, dot_sizes, product, tall_product
+from servotwin.hybrid.flow import SIGNIFICANT, tall_product
 from servotwin.hybrid.tables import VECTOR, padded, zeros
 
 FINE = 8
@@ -104,7 +104,7 @@ def row_count(states: int, watches: int, intervals: int) -> int:
 
 
 @inlined
-def _stride(t: LiftedTables, intervals: int) -> int:
+def level_stride(t: LiftedTables, intervals: int) -> int:
     return (t.watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
 
 
@@ -214,7 +214,7 @@ def _fill_level(
     w: LiftedWorkspace,
 ) -> None:
     """Rows of one watch at one scale, and its deviation's matrix from `sums`; `length` of an interval in ticks."""
-    n, stride, starts = t.states, _stride(t, intervals), (COARSE + 1) * t.states
+    n, stride, starts = t.states, level_stride(t, intervals), (COARSE + 1) * t.states
     at = slot * n * stride + watch * (3 * intervals + 1 + n)
     for i in range(intervals + 1):
         for j in range(n):
@@ -325,7 +325,7 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
 @subroutine
 def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """States from which the matrix in `product` makes others on which a watch deviates by more than rounding."""
-    n, stride = t.states, _stride(t, COARSE)
+    n, stride = t.states, level_stride(t, COARSE)
     sizes, row = w.powers[:n], w.powers[n : 2 * n]
     for j in range(n):
         t.uneven[slot * n + j] = 0.0
@@ -372,17 +372,15 @@ def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> Non
             d[i] = new[i]
     for i in range(n * n):
         t.settling[slot * n * n + i] = d[i]
-    for i in range(n):
-        d[i * n + i] += 1.0
-    for i in range(n * n):
-        d[i] = d[i] if abs(d[i]) > _GONE else 0.0
+        whole = d[i] + (1.0 if i // n == i % n else 0.0)
+        d[i] = whole if abs(whole) > _GONE else 0.0
     _find_uneven(t, slot, watches, w)
 
 
 @subroutine
 def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
     """The tables of the vast scale and of settling, from those of the coarse one and the watches in `w`."""
-    n, stride, block = t.states, _stride(t, COARSE), (COARSE + 1) * t.states
+    n, stride, block = t.states, level_stride(t, COARSE), (COARSE + 1) * t.states
     for i in range(n):
         for k in range(n):
             w.powers[i * COARSE * n + k] = t.jump_coarse[((slot * n + k + 1) * COARSE - 1) * n + i]
@@ -399,100 +397,3 @@ def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) ->
         _add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
     _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
     _settle(t, slot, watches, w)
-
-
-@inlined
-def clean_part(
-    t: LiftedTables, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array, slack: Array,
-    less: float, squares: Array, z: Array, out: Array,
-) -> int:  # fmt: skip
-    """Number of intervals, at most `wanted`, before the first in which some watch may leave its bounds."""
-    clean = wanted
-    for watch in range(watches):
-        size = dot_sizes(t.sizes, (slot * t.watches + watch) * t.states, z)
-        room = (slack[watch] - less) * (SIGNIFICANT * size) - math.sqrt(max(squares[watch], 0.0))
-        top, bottom = high[watch] + room, low[watch] - room
-        a = np.uint64(watch * (3 * intervals + 1 + t.states))
-        b = a + np.uint64(intervals + 1)
-        c = b + np.uint64(intervals)
-        beyond = 0
-        for k in range(np.uint64(clean)):
-            begin, end = out[a + k], out[a + k + np.uint64(1)]
-            second, third = begin + out[b + k], end - out[c + k]
-            beyond += (max(max(begin, second), max(third, end)) > top) | (
-                min(min(begin, second), min(third, end)) < bottom
-            )
-        if beyond > 0:
-            for k in range(np.uint64(clean)):
-                begin, end = out[a + k], out[a + k + np.uint64(1)]
-                second, third = begin + out[b + k], end - out[c + k]
-                if max(max(begin, second), max(third, end)) > top or min(min(begin, second), min(third, end)) < bottom:
-                    clean = int(k)
-                    break
-    return clean
-
-
-@subroutine
-def settled_squares(
-    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, z: Array, way: Array, squares: Array
-) -> bool:
-    """Squares of every watch's deviation, from the state's way to rest, which goes into `way`: at rest nothing
-    deviates. False where the state does not come to rest."""
-    n, stride = t.states, _stride(t, intervals)
-    if dot_sizes(t.uneven, slot * n, z) > 0.0:
-        return False
-    for i in range(n):
-        way[i] = dot(t.settling, (slot * n + i) * n, z)
-    for watch in range(watches):
-        square, at = 0.0, slot * n * stride + watch * (3 * intervals + 1 + n) + 3 * intervals + 1
-        for j in range(n):
-            # The matrix is symmetric.
-            square += way[j] * dot(table, at + j * stride, way)
-        squares[watch] = square
-    return True
-
-
-@inlined
-def clean_ticks(
-    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array,
-    slack: Array, settles: bool, squares: Array, change: Array, z: Array, out: Array,
-) -> int:  # fmt: skip
-    """Number of intervals of a block, at most `wanted`, before the first in which some watch may leave its bounds.
-
-    With `settles` the squares of the deviations are taken a second time where they are too large, from the state's way
-    to where it rests or moves evenly: near rest those of the state are rounding, whose root is far above that of a
-    watch.
-    """
-    stride = _stride(t, intervals)
-    used = (watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
-    tall_product(table, slot * t.states * stride, stride, used, z, out)
-    clean, less, n = 0, 0.0, np.uint64(t.states)
-    for watch in range(watches):
-        square, at = 0.0, np.uint64(watch * (3 * intervals + 1 + t.states) + 3 * intervals + 1)
-        for i in range(n):
-            square += out[at + i] * z[i]
-        squares[watch] = square
-    for attempt in range(2):
-        if attempt == 1:
-            if not settled_squares(t, table, slot, watches, intervals, z, change, squares):
-                break
-            # What rests deviates by rounding only.
-            less = 1.0
-        clean = clean_part(t, slot, watches, intervals, wanted, low, high, slack, less, squares, z, out)
-        if clean == wanted or not settles:
-            break
-    return clean
-
-
-@inlined
-def jump(n: int, jumps: Array, slot: int, intervals: int, clean: int, z: Array, change: Array) -> None:
-    """Advance by some intervals of a scale, at least one."""
-    product(jumps, (slot * n * intervals + clean - 1) * n, intervals * n, n, z, change)
-    for i in range(np.uint64(n)):
-        z[i] += change[i]
-
-
-@inlined
-def changes_at_ends(n: int, jumps: Array, slot: int, z: Array, out: Array) -> None:
-    """Changes of the state up to the end of each interval of the vast scale, one after the other."""
-    tall_product(jumps, slot * n * COARSE * n, COARSE * n, COARSE * n, z, out)

@@ -13,7 +13,8 @@ from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, subroutine, verbatim
 from servotwin.hybrid.flow import LINGERING, Scratch
 from servotwin.hybrid.kernel import DONE, EVENTS_PER_STEP, FULL, ZENO, RunRecord, step_once
-from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, clean_ticks, jump
+from servotwin.hybrid.lifted import BLOCK, COARSE, FINE
+from servotwin.hybrid.lifted_blocks import clean_ticks, jump
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.lifted_tables import (
     LIMITED,

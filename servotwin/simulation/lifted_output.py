@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import dot, product, tall_product
-from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables, LiftedWorkspace, changes_at_ends
+from servotwin.hybrid.lifted import BLOCK, COARSE, FINE, LiftedTables, LiftedWorkspace
+from servotwin.hybrid.lifted_blocks import changes_at_ends
 from servotwin.simulation.lifted import TICKED, VAST, Segments
 from servotwin.simulation.lifted_tables import LiftedMemory, Places
 
