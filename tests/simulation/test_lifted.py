@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from random_sampled import DEGREE, SampledCase, largest_difference, random_case
 
+from servotwin.hybrid.lifted import COARSE, level_stride
+from servotwin.hybrid.lifted_blocks import settled_squares
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave, as_pieces
 from servotwin.simulation import Simulation, simulate
@@ -193,3 +195,22 @@ def test_long_rests_are_passed_on_the_vast_scale(
     expected, found = ticked.events(), blocks.events()
     assert [event[1:] for event in expected] == [event[1:] for event in found]
     assert np.allclose([event[0] for event in expected], [event[0] for event in found], rtol=0.0, atol=1e-7)
+
+
+def test_deviations_near_rest_are_those_of_what_moves() -> None:
+    """Squares of the whole state are rounding there: they would be a million times as large."""
+    law = PAPER.controller.replace(sample_rate=5e3, Ki=0.0)
+    inputs = RunInputs(PiecewiseCubic.constant(1e-3), PiecewiseCubic.constant(10.0 * DEGREE), None, 1e3)
+    blocks = SampledCase(PAPER, law, inputs, 0.0, 20_001, 0).in_blocks()
+    t, slots = blocks.memory.lifted, blocks.segments.slot[: blocks.segments.size[0]]
+    slot, n, watches = VAST - int(slots[slots <= VAST][-1]), t.states, len(blocks.memory.squares)
+    stride, width = level_stride(t, COARSE), 3 * COARSE + 1 + n
+    table = t.vast[slot * n * stride : (slot + 1) * n * stride].reshape(n, stride)
+    matrices = [table[:, (watch + 1) * width - n : (watch + 1) * width] for watch in range(watches)]
+    moving = np.zeros(n)
+    moving[[blocks.plant.automaton.names.index(name) for name in ("current", "speed")]] = 1e-9
+    squares, state = np.empty(watches), blocks.state + moving
+    assert settled_squares(t, t.vast, slot, watches, COARSE, state, np.empty(n), squares)
+    expected = [moving @ matrix @ moving for matrix in matrices]
+    assert max(expected) > 0.0
+    assert np.allclose(squares, expected, rtol=1e-3)
