@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from benchmarks import accuracy, compensation, endurance, glances, tick
 from benchmarks import windows as from_windows
@@ -17,57 +18,33 @@ from servotwin.errors import InvalidInput
 QUICK_SIZE = 0.02
 
 
-def _estimator(date: str, output: Path | None, quick: bool) -> None:
-    accuracy.accuracy(date, output, QUICK_SIZE if quick else 1.0)
+class QualityBenchmark(NamedTuple):
+    """A benchmark that runs alone.
+
+    Attributes
+    ----------
+    run : callable
+        (date, output file or None, scale)
+    quick, whole : object
+        Scale of a check, and of the documented figures.
+    """
+
+    run: Callable[..., object]
+    quick: Any
+    whole: Any
 
 
-def _hostile(date: str, output: Path | None, quick: bool) -> None:
-    endurance.endurance(date, output, endurance.QUICK if quick else endurance.MACHINES)
-
-
-def _policies(date: str, output: Path | None, quick: bool) -> None:
-    side_by_side.policies(date, output, side_by_side.QUICK if quick else side_by_side.MACHINES)
-
-
-def _loops(date: str, output: Path | None, quick: bool) -> None:
-    in_the_loop.loops(date, output, in_the_loop.QUICK if quick else in_the_loop.MACHINES)
-
-
-def _compensation(date: str, output: Path | None, quick: bool) -> None:
-    compensation.compensation(date, output, compensation.QUICK if quick else compensation.MACHINES)
-
-
-def _novelty(date: str, output: Path | None, quick: bool) -> None:
-    worth_sending.novelty(date, output, worth_sending.QUICK if quick else None)
-
-
-def _fleet(date: str, output: Path | None, quick: bool) -> None:
-    whole.fleet(date, output, QUICK if quick else FleetScale())
-
-
-def _triage(date: str, output: Path | None, quick: bool) -> None:
-    glances.triage(date, output, glances.QUICK if quick else glances.GAPS)
-
-
-def _windows(date: str, output: Path | None, quick: bool) -> None:
-    from_windows.windows(date, output, from_windows.QUICK if quick else from_windows.WINDOWS)
-
-
-def _tick(date: str, output: Path | None, quick: bool) -> None:
-    tick.ticks(date, output, tick.QUICK if quick else tick.SECONDS)
-
-
-ALONE: Mapping[str, Callable[[str, Path | None, bool], None]] = {
-    accuracy.NAME: _estimator,
-    endurance.NAME: _hostile,
-    whole.NAME: _fleet,
-    glances.NAME: _triage,
-    side_by_side.NAME: _policies,
-    in_the_loop.NAME: _loops,
-    compensation.NAME: _compensation,
-    tick.NAME: _tick,
-    from_windows.NAME: _windows,
-    worth_sending.NAME: _novelty,
+ALONE: Mapping[str, QualityBenchmark] = {
+    accuracy.NAME: QualityBenchmark(accuracy.accuracy, QUICK_SIZE, 1.0),
+    endurance.NAME: QualityBenchmark(endurance.endurance, endurance.QUICK, endurance.MACHINES),
+    whole.NAME: QualityBenchmark(whole.fleet, QUICK, FleetScale()),
+    glances.NAME: QualityBenchmark(glances.triage, glances.QUICK, glances.GAPS),
+    side_by_side.NAME: QualityBenchmark(side_by_side.policies, side_by_side.QUICK, side_by_side.MACHINES),
+    in_the_loop.NAME: QualityBenchmark(in_the_loop.loops, in_the_loop.QUICK, in_the_loop.MACHINES),
+    compensation.NAME: QualityBenchmark(compensation.compensation, compensation.QUICK, compensation.MACHINES),
+    tick.NAME: QualityBenchmark(tick.ticks, tick.QUICK, tick.SECONDS),
+    from_windows.NAME: QualityBenchmark(from_windows.windows, from_windows.QUICK, from_windows.WINDOWS),
+    worth_sending.NAME: QualityBenchmark(worth_sending.novelty, worth_sending.QUICK, None),
 }
 
 
@@ -98,10 +75,10 @@ def run_alone(
         return False
     if len(names) > 1 or others:
         raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
-    if full:
-        whole.fleet(date, output, FleetScale().full())
-    elif seed is not None:
-        from_windows.windows(date, output, from_windows.QUICK if quick else from_windows.WINDOWS, seed)
+    chosen = ALONE[name]
+    scale = FleetScale().full() if full else chosen.quick if quick else chosen.whole
+    if seed is None:
+        chosen.run(date, output, scale)
     else:
-        ALONE[name](date, output, quick)
+        chosen.run(date, output, scale, seed)
     return True

@@ -42,11 +42,14 @@ def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
     """
     policy = CertifiedPolicy(model, known)
     demands = replace(policy.demands, Ms=_NOT_BOUND, Ms_worst=_NOT_BOUND, shapes=((1.0, 1.0),))
-    own, policies = model.controller, {}
-    for setting in candidates_of(model, known, demands, disturbed=True, noisy=False):
+    own, policies = model.controller, dict[str, Design]()
+    every = candidates_of(model, known, demands, disturbed=True, noisy=False)
+    for setting in every:
         law = setting.controller
         fed = f", velocity x {law.velocity_feedforward * model.p / model.k_B:g}" if law.velocity_feedforward else ""
-        policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}{fed}"] = setting
+        stops = f", stops within {setting.tolerance * 1e6:g} um" if law.integral_only else ""
+        policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}{stops}{fed}"] = setting
+    assert len(policies) == len(every)
     for share in (1.0 / 6.0, 0.5, 1.0):
         width = model.tolerance_for(share * known.gap[1], 1.5)
         policies[f"own gains, dead zone {width * 1e3:.3g} mm"] = Design(own, width)

@@ -16,11 +16,12 @@ from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachi
 from servotwin.analysis.maps.pool import shared, workplace
 from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.redesign.certified.margins import scaled_law
+from servotwin.redesign.registry import certified_policy
 from servotwin.simulation import Run
 
 SCHEMA, NAME = "servotwin-bench-loops/1", "loops"
 MACHINES, QUICK, SEED = 40, 1, 2027
-TWIN, OWN, SLOWER = "twin", "own PD", "0.6 x PD"
+TWIN, OWN, SLOWER, FALLBACK = "twin", "own PD", "0.6 x PD", "fallback set, held"
 # Constants: factors on the servo's Kp and Kd, and on its Ki.
 _SCALES, _INTEGRAL = (0.6, 0.7, 0.85, 1.0), (0.0, 0.01, 0.03)
 _GAP_OFF = math.radians(0.05)
@@ -124,19 +125,23 @@ def loops(
 
 
 def _block(block: str, count: int, seed: int) -> list[LoopRow]:
-    """Rows of the twin, of two constants, and of the best constant with hindsight."""
+    """Rows of the twin, of the constant that is verified, of two others, and of the best constant with hindsight."""
     tasks = [_Task(place, machine) for place, machine in enumerate(worn_machines(block, count, seed))]
     found = dict(sorted((task.place, scores) for task, scores in shared(_compared, tasks)))
     rows = {name: LoopRow(block, name, tuple(scores[name] for scores in found.values())) for name in found[0]}
-    constants = [row for row in rows.values() if row.name != TWIN]
+    constants = [row for row in rows.values() if row.name not in (TWIN, FALLBACK)]
     best = min(constants, key=lambda row: row.at("cost", 95.0))
     best = best._replace(name=f"best constant: {best.name}")
-    return [rows[TWIN], rows[OWN], rows[SLOWER], best]
+    return [rows[TWIN], rows[FALLBACK], rows[OWN], rows[SLOWER], best]
 
 
 def _compared(task: _Task) -> dict[str, LoopScores]:
     machine, own = task.machine, task.machine.model.controller
-    scores = {TWIN: with_twin(machine)}
+    fallback = certified_policy(machine.model, machine.scenario.twin).fallback().setting
+    scores = {
+        TWIN: with_twin(machine),
+        FALLBACK: scored(machine, machine.under(fallback.controller, fallback.tolerance)),
+    }
     for scale in _SCALES:
         for share in _INTEGRAL:
             name = {(1.0, 0.0): OWN, (0.6, 0.0): SLOWER}.get((scale, share), f"Kp, Kd x {scale:g}, Ki x {share:g}")

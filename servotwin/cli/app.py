@@ -1,13 +1,14 @@
 """The command line. Nothing heavy is imported until a command runs, so that help and errors come at once.
 
 A new command is a function in `commands` that imports what it needs in its body, and a line in the table below. User
-errors are raised as `InvalidInput` anywhere below; `_Commands` turns them into one sentence and exit code 2, and an
-interrupt into 130.
+errors are raised as `InvalidInput` anywhere below; `_Commands` turns them, and errors of usage, into one sentence and
+exit code 2, and an interrupt into 130.
 """
 
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, cast
@@ -27,6 +28,11 @@ _INTERRUPT = "interrupted; no partly written file is left"
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 
+# Typer exports its subclass only. An unknown option, a missing argument, a value of another type.
+_UsageError: Any = typer.BadParameter.__base__
+_SUGGESTION = re.compile(r"\.? \(?(?:Possible options:|Did you mean:?) (.*?)[?)]*$")
+
+
 class _Commands(TyperGroup):
     """The group of all commands, with the one error handler."""
 
@@ -35,6 +41,8 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except InvalidInput as error:
             _end(f"error: {error}", INVALID)
+        except _UsageError as error:
+            _end(_usage(error), INVALID)
         except ModuleNotFoundError as error:
             if (error.name or "").partition(".")[0] not in EXTRAS:
                 raise
@@ -42,9 +50,14 @@ class _Commands(TyperGroup):
         except KeyboardInterrupt as interrupt:
             _end(str(interrupt) or _INTERRUPT, INTERRUPTED)
 
-    def make_context(self, *args: Any, **options: Any) -> Any:
+    def make_context(self, info_name: str | None, args: list[str], *others: Any, **options: Any) -> Any:
+        alone = not args  # shows the help
         try:
-            return super().make_context(*args, **options)
+            return super().make_context(info_name, args, *others, **options)
+        except _UsageError as error:
+            if alone:
+                raise
+            _end(_usage(error), INVALID)
         except KeyboardInterrupt:
             _end(_INTERRUPT, INTERRUPTED)
 
@@ -61,6 +74,13 @@ app = typer.Typer(
 def _end(message: str, code: int) -> None:
     print(message, file=sys.stderr)
     raise typer.Exit(code) from None
+
+
+def _usage(error: Any) -> str:
+    """Make one sentence of an error of usage."""
+    command = "servotwin" if error.ctx is None else error.ctx.command_path
+    text = _SUGGESTION.sub(r" (did you mean \1?)", " ".join(error.format_message().split())).rstrip(".")
+    return f"error: {command}: {text[:1].lower()}{text[1:]}; see {command} --help"
 
 
 def _version(requested: bool) -> None:

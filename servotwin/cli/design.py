@@ -7,17 +7,39 @@ from typing import Annotated
 
 import typer
 
+_Enter = Annotated[float | None, typer.Option(help="Error at which the loop opens, in tolerances.")]
+_Leave = Annotated[float | None, typer.Option(help="Error above which the loop closes again, in tolerances.")]
+_Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")]
+_Duration = Annotated[
+    float | None, typer.Option(help="Length of every run, s; 120 of the servo's own by default.", show_default=False)
+]
+_Window = Annotated[
+    float | None,
+    typer.Option(
+        help="Last part of a run, in which it must rest, s; 40 of the servo's own by default.", show_default=False
+    ),
+]
+_Stillness = Annotated[
+    float | None,
+    typer.Option(
+        help="Rest: half the peak-to-peak is below this, um; by default 1 on the preset paper with a gap of 10 deg, "
+        "and as much of another screw and gap.",
+        show_default=False,
+    ),
+]
+_Servo = Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")]
+
 
 def limit_cycle(
-    servo: Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")] = "paper",
+    servo: _Servo = "paper",
     gap_deg: Annotated[float, typer.Option(help="Total gap, deg.")] = 10.0,
     tolerance_mm: Annotated[
         float | None, typer.Option(help="Half-width of the dead zone, mm; none by default.")
     ] = None,
     step_mm: Annotated[float, typer.Option(help="Reference step from rest, mm; the result may depend on it.")] = 1.0,
-    enter: Annotated[float | None, typer.Option(help="Error at which the loop opens, in tolerances.")] = None,
-    leave: Annotated[float | None, typer.Option(help="Error above which the loop closes again, in tolerances.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+    enter: _Enter = None,
+    leave: _Leave = None,
+    json: _Json = False,
 ) -> None:
     """Compute the exact limit cycle, stable or not, beside the describing function's prediction."""
     from servotwin.cli.limit_cycle import print_limit_cycle
@@ -37,7 +59,7 @@ def tune(
     delay_ms: Annotated[float, typer.Option(help="Delay in series with the plant, ms.")] = 0.0,
     b: Annotated[float, typer.Option(help="Setpoint weight of the proportional term.")] = 1.0,
     c: Annotated[float | None, typer.Option(help="Setpoint weight of the derivative term; as b by default.")] = None,
-    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+    json: _Json = False,
 ) -> None:
     """Find gains for a crossover and a phase margin, and compare them with the present controller."""
     from servotwin.cli.tune import TuneOptions, print_tuning
@@ -57,7 +79,7 @@ def tune(
 
 
 def map_(
-    servo: Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")] = "paper",
+    servo: _Servo = "paper",
     out: Annotated[Path, typer.Option(help="Folder of the map and of its finished pieces.")] = Path("servotwin-map"),
     tolerance: Annotated[
         str | None, typer.Option(help="Dead zone / (p b), b half the gap: LOW:HIGH:COUNT[:log] or VALUE,VALUE,...")
@@ -69,29 +91,14 @@ def map_(
     ] = None,
     k_dz: Annotated[str | None, typer.Option(help="With --gap-deg: dead zone / (p estimate).")] = None,
     amplitude_mm: Annotated[str | None, typer.Option(help="With --gap-deg: reference step, mm.")] = None,
-    enter: Annotated[float | None, typer.Option(help="Error at which the loop opens, in tolerances.")] = None,
-    leave: Annotated[float | None, typer.Option(help="Error above which the loop closes again, in tolerances.")] = None,
+    enter: _Enter = None,
+    leave: _Leave = None,
     members: Annotated[int, typer.Option(help="Initial states in each cell.")] = 16,
     motion: Annotated[float, typer.Option(help="Extent of the motion in which half of them start.")] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
-    duration: Annotated[
-        float | None,
-        typer.Option(help="Length of every run, s; 120 of the servo's own by default.", show_default=False),
-    ] = None,
-    window: Annotated[
-        float | None,
-        typer.Option(
-            help="Last part of a run, in which it must rest, s; 40 of the servo's own by default.", show_default=False
-        ),
-    ] = None,
-    still_um: Annotated[
-        float | None,
-        typer.Option(
-            help="Rest: half the peak-to-peak is below this, um; by default 1 on the preset paper with a gap of 10 "
-            "deg, and as much of another screw and gap.",
-            show_default=False,
-        ),
-    ] = None,
+    duration: _Duration = None,
+    window: _Window = None,
+    still_um: _Stillness = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers do the work: tcp://host:8786.")

@@ -198,22 +198,22 @@ def flow_until(
             return FULL, step, fraction, mode
         if fraction == 0.0 and calm >= NODES_FINE and end_step - step >= NODES_FINE:
             # Only after a while without events: they may excite motions that are fast, and gone within a coarse step.
-            wanted = min(NODES_COARSE, (end_step - step) // NODES_FINE)
-            clean = advance_clean(t, t.coarse, t.jump_coarse, NODES_COARSE, wanted, mode, x, scratch)
+            intervals = min(NODES_COARSE, (end_step - step) // NODES_FINE)
+            clean = advance_clean(t, t.coarse, t.jump_coarse, NODES_COARSE, intervals, mode, x, scratch)
             if clean > 0:
                 step += clean * NODES_FINE
                 note_segment(record, step, 0.0, mode, x)
-            if clean == wanted:
+            if clean == intervals:
                 continue
         # The tables hold whole search steps, so they serve only a state on the grid of search steps.
         if fraction == 0.0 and step < end_step:
-            wanted = min(NODES_FINE, end_step - step)
-            clean = advance_clean(t, t.fine, t.jump_fine, NODES_FINE, wanted, mode, x, scratch)
+            intervals = min(NODES_FINE, end_step - step)
+            clean = advance_clean(t, t.fine, t.jump_fine, NODES_FINE, intervals, mode, x, scratch)
             if clean > 0:
                 step += clean
                 calm += clean
                 note_segment(record, step, 0.0, mode, x)
-            if clean == wanted:
+            if clean == intervals:
                 continue
         stop = 1.0 if step < end_step else end_fraction
         mode, events = cross(t, mode, x, step, fraction, stop, record, scratch)

@@ -296,9 +296,11 @@ def simulate(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
     run = _run_in_blocks(simulation, theta_d0) if noise is None else None
-    run = _run_plant_in_blocks(simulation) if run is None else run
-    if run is not None:
-        return run
+    return run or _run_plant_in_blocks(simulation) or _run_by_steps(simulation)
+
+
+def _run_by_steps(simulation: Simulation) -> Run:
+    """The whole run, sample by sample or event by event."""
     simulation.advance(simulation.samples - 1)
     return simulation.run()
 

@@ -16,8 +16,10 @@ from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.learning.wear import Wear
-from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage
+from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite
 from servotwin.messages.legacy import upgrade
+from servotwin.redesign.certified.certificate import verification_of
+from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.requests import Attempts, RequestState
 from servotwin.twin.responses import ResponseState
@@ -150,6 +152,27 @@ def noted_setting(known: Settings, version: int, setting: Setting, base: int, in
     # The edge starts with version 0: later updates without gains go back to its gains.
     keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
     return {number: each for number, each in sorted(after.items()) if number in keep}
+
+
+def draft_update(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
+    """Make an update without version and base; it may be applied until `validity` (s) after the window's start."""
+    assert redesign.setting is not None
+    estimate = evidence.estimate
+    low, high = estimate.interval
+    return Update(
+        servo=message.servo,
+        version=1,
+        base_version=0,
+        window=(message.boot, message.sequence),
+        data_time=message.start,
+        gap=finite(estimate.gap),
+        std=finite(estimate.std_total),
+        interval=(finite(low), finite(high)),
+        status=estimate.status.value,
+        setting=redesign.setting,
+        not_after=message.start + validity,
+        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
+    )
 
 
 class TwinState(Struct, frozen=True, tag="twin-state/2"):

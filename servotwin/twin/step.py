@@ -15,8 +15,8 @@ from typing import NamedTuple
 from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import (
     Answer,
     Fallback,
@@ -28,9 +28,7 @@ from servotwin.messages import (
     Receipt,
     Update,
     WindowMessage,
-    finite,
 )
-from servotwin.redesign.certified.certificate import verification_of
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
@@ -50,7 +48,7 @@ from servotwin.twin.evidence import (
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.requests import Attempts
-from servotwin.twin.state import TwinState, noted_setting
+from servotwin.twin.state import TwinState, draft_update, noted_setting
 from servotwin.twin.triage import Glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
@@ -149,76 +147,105 @@ def next_wake(model: TwinModel, state: TwinState) -> float | None:
     return min((due for due in (update, request) if due is not None), default=None)
 
 
+class _Learnt(NamedTuple):
+    """Estimate and disturbance of a window; the reason why no update may follow; True where it moves nothing."""
+
+    estimate: GapEstimate
+    disturbance: Disturbance
+    rejection: str
+    stale: bool
+
+
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
     """Process a window: estimate, redesign, and request."""
-    message, arrived, trends = event.window, event.time, model.settings.trend
-    learning = model.settings.learning
+    message, arrived = event.window, event.time
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
-    decoded, records = DecodedWindow.of(message), list[Record]()
+    decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
     state, glance = _glance(model, state, decoded, arrived)
     if glance is not None:
         records.append(GlanceRecord(message, glance, decoded.tail))
         if not glance.moved:
             state, taught = _teach(model, state, decoded, arrived)
             return StepResult(state, taught, (*records, *taught))
-    expected = state.wear.expect(trends, message.boot, message.middle, arrived, learning)
-    estimate = decoded.estimate(model.estimator, expected)
-    disturbed = decoded.disturbance(model.observer)
-    records += [GapEstimateRecord(message, estimate, expected, decoded.tail), DisturbanceRecord(message, disturbed)]
-    before = state.wear
-    # A stale window is estimated for the record, but moves nothing: windows may come in any order.
-    stale = not state.versions.admits(message)
-    rejection = _STALE
+    state, learnt, learnt_records = _learn(model, state, decoded, arrived)
+    records += learnt_records
+    estimate, stale = learnt.estimate, learnt.stale
     if not stale:
-        wear, rejection = before.update(
-            trends,
-            message.boot,
-            estimate,
-            arrived,
-            learning,
-            stated_machine(model.settings),
-            decoded.window,
-            model.motor,
-        )
-        state = replace(state, wear=wear)
-    trend = state.wear.trend(trends)
-    records += [TrendRecord(message, trend), *_learnt(message, before, state.wear)]
-    records += [AlarmRecord(message, sentence) for sentence in state.wear.alarms(before, estimate, trends, learning)]
-    if not stale:
-        state, differs = _compare(model, state, decoded)
-        records += [AlarmRecord(message, sentence) for sentence in differs]
-    if model.triage is not None and state.triage is not None and not stale:
-        known = state.wear.known_machine(learning, arrived)
-        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
-        state = replace(state, triage=triage)
-    others: tuple[Message, ...] = ()
-    if not stale:
-        state, taught = _teach(model, state, decoded, arrived, None if rejection else estimate)
-        others, records = taught, [*records, *taught]
-    in_force = state.known.get(state.versions.in_force)
-    machine = None if state.wear.machine is None else state.wear.machine.prior(learning, arrived)
-    motor = None if model.motor is None else model.motor.current(state.wear.motor, arrived)
+        state, taught = _teach(model, state, decoded, arrived, None if learnt.rejection else estimate)
+        others, records = [*taught], [*records, *taught]
     if decoded.step > 0.0 and not stale:
         state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
-    evidence = Evidence(
-        estimate, disturbed, trend, in_force, state.tuned_for, rejection, machine, motor, state.rests, state.steps
-    )
+    evidence = _evidence(model, state, learnt, arrived)
     state, redesign = _redesign(model, state, evidence, stale)
-    if disturbed.known and not stale:
-        state = replace(state, rests=(*state.rests, disturbed.bias)[-_RESTS:])
+    if learnt.disturbance.known and not stale:
+        state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
     if not stale:
         state, requested, decided = _ask(model, state, message, estimate, arrived, now)
-        others, records = (*others, *requested), [*records, *decided]
+        others, records = [*others, *requested], [*records, *decided]
     if redesign.setting is None:
-        return StepResult(state, others, tuple(records))
-    versions = state.versions.with_update(_draft(message, evidence, redesign, model.settings.validity))
+        return StepResult(state, tuple(others), tuple(records))
+    versions = state.versions.with_update(draft_update(message, evidence, redesign, model.settings.validity))
     state = replace(state, versions=versions, tuned_for=float(redesign.gap))
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
-    return StepResult(sent.state, sent.messages + others, all_records)
+    return StepResult(sent.state, (*sent.messages, *others), all_records)
+
+
+def _learn(
+    model: TwinModel, state: TwinState, decoded: DecodedWindow, arrived: float
+) -> tuple[TwinState, _Learnt, list[Record]]:
+    """Estimate a window and learn from it.
+
+    A stale window is estimated for the record, but moves nothing: windows may come in any order.
+    """
+    message, trends, learning, before = decoded.message, model.settings.trend, model.settings.learning, state.wear
+    expected = before.expect(trends, message.boot, message.middle, arrived, learning)
+    estimate, disturbed = decoded.estimate(model.estimator, expected), decoded.disturbance(model.observer)
+    stale, rejection = not state.versions.admits(message), _STALE
+    if not stale:
+        stated, window = stated_machine(model.settings), decoded.window
+        wear, rejection = before.update(trends, message.boot, estimate, arrived, learning, stated, window, model.motor)
+        state = replace(state, wear=wear)
+    after = state.wear
+    trend = after.trend(trends)
+    if model.triage is not None and state.triage is not None and not stale:
+        known = after.known_machine(learning, arrived)
+        triage = model.triage.estimated(state.triage, message, decoded.window, estimate, trend, rejection, known)
+        state = replace(state, triage=triage)
+    records: list[Record] = [
+        GapEstimateRecord(message, estimate, expected, decoded.tail),
+        DisturbanceRecord(message, disturbed),
+        TrendRecord(message, trend),
+    ]
+    if after.machine is not None and after.machine != before.machine:
+        records.append(MachineRecord(message, after.machine))
+    if after.motor is not None and after.motor != before.motor:
+        records.append(MotorRecord(message, after.motor))
+    records += [AlarmRecord(message, sentence) for sentence in after.alarms(before, estimate, trends, learning)]
+    if not stale:
+        state, differs = _compare(model, state, decoded)
+        records += [AlarmRecord(message, sentence) for sentence in differs]
+    return state, _Learnt(estimate, disturbed, rejection, stale), records
+
+
+def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: float) -> Evidence:
+    """Make what the policy is consulted with."""
+    wear, learning = state.wear, model.settings.learning
+    return Evidence(
+        learnt.estimate,
+        learnt.disturbance,
+        wear.trend(model.settings.trend),
+        state.known.get(state.versions.in_force),
+        state.tuned_for,
+        learnt.rejection,
+        None if wear.machine is None else wear.machine.prior(learning, arrived),
+        None if model.motor is None else model.motor.current(wear.motor, arrived),
+        state.rests,
+        state.steps,
+    )
 
 
 def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tuple[TwinState, list[str]]:
@@ -267,16 +294,6 @@ def _teach(
     machine = state.wear.known_machine(model.settings.learning, arrived)
     responses, sent = model.responses.after(state.responses, decoded, arrived, estimate, machine)
     return replace(state, responses=responses), () if sent is None else (sent,)
-
-
-def _learnt(message: WindowMessage, before: Wear, after: Wear) -> list[Record]:
-    """Make the records of what a window told of machine and motor."""
-    records = list[Record]()
-    if after.machine is not None and after.machine != before.machine:
-        records.append(MachineRecord(message, after.machine))
-    if after.motor is not None and after.motor != before.motor:
-        records.append(MotorRecord(message, after.motor))
-    return records
 
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
@@ -365,24 +382,3 @@ def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) ->
     triage = state.triage and state.triage.doubted(why)
     state = replace(state, lookups=lookups, versions=state.versions.without_pending(), triage=triage)
     return StepResult(state, (), (record, WithdrawalRecord(request, why)))
-
-
-def _draft(message: WindowMessage, evidence: Evidence, redesign: Redesign, validity: float) -> Update:
-    """Make an update without version and base; it may be applied until `validity` (s) after the window's start."""
-    assert redesign.setting is not None
-    estimate = evidence.estimate
-    low, high = estimate.interval
-    return Update(
-        servo=message.servo,
-        version=1,
-        base_version=0,
-        window=(message.boot, message.sequence),
-        data_time=message.start,
-        gap=finite(estimate.gap),
-        std=finite(estimate.std_total),
-        interval=(finite(low), finite(high)),
-        status=estimate.status.value,
-        setting=redesign.setting,
-        not_after=message.start + validity,
-        verification=None if redesign.certificate is None else verification_of(redesign.certificate),
-    )

@@ -91,6 +91,35 @@ def test_a_user_error_is_one_sentence_and_exit_code_2(scenario, monkeypatch, arg
 
 
 @pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--bogus",), "no such option: --bogus"),
+        (("mapp",), "no such command 'mapp' (did you mean 'map'?)"),
+        (("map", "--worker", "2"), "map: no such option: --worker (did you mean --workers?)"),
+        (("map", "paper", "other"), "(other)"),
+        (("map", "--members", "many"), "invalid value for '--members'"),
+        (("map", "--workers", "0"), "greater than or equal to 1"),
+        (("map", "--out"), "'--out' requires an argument"),
+        (("simulate",), "simulate: missing argument 'scenario'; see "),
+        (("bench", "--run", "1"), "(did you mean --runs?)"),
+    ],
+)
+def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(arguments, message):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("error: ")
+    assert result.stdout == ""
+
+
+def test_without_arguments_the_help_is_shown():
+    result = run()
+    assert result.exit_code == 2
+    assert "identify" in result.stdout + result.stderr
+
+
+@pytest.mark.parametrize(
     ("change", "message"),
     [
         ("duraton_s = 3.0\n" + SMALL, "duraton_s"),

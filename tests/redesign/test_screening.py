@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import islice
 
 import numpy as np
@@ -13,8 +14,8 @@ from servotwin.redesign.certified import screening as module
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import ROUNDED, Question
 from servotwin.redesign.certified.certificate import Demands
-from servotwin.redesign.certified.certify import candidates_of
-from servotwin.redesign.certified.screening import Screening, is_plain
+from servotwin.redesign.certified.certify import _shortlist, candidates_of
+from servotwin.redesign.certified.screening import Screening, is_plain, leaves_too_much, stops_widest
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw
 from servotwin.redesign.design import Design
@@ -82,6 +83,41 @@ def test_candidates_that_are_not_plain_can_be_dropped_on_the_way() -> None:
     expected, screening = fully_ranked(question, candidates), Screening(question)
     ranked = screening.ranked(candidates)
     first = [next(ranked)]
-    screening.plain_only = True
+    screening.only = is_plain
     assert [*first, *ranked] == [*expected[:1], *(each for each in expected[1:] if is_plain(each))]
     assert 0 < sum(is_plain(each) for each in expected[1:]) < len(expected) - 1
+
+
+def settings_of_each_kind() -> tuple[list[Design], list[Design], list[Design]]:
+    """Settings whose integral stops near the reference, far from it, and those without integral action."""
+    _, candidates = question_and_candidates()
+    stops = [each for each in candidates if each.controller.integral_only]
+    widest = max(each.tolerance for each in stops)
+    far = [each for each in stops if each.tolerance == widest]
+    return [each for each in stops if each not in far], far, [each for each in candidates if is_plain(each)]
+
+
+def test_after_the_first_the_settings_that_settle_most_surely_are_verified() -> None:
+    question, _ = question_and_candidates()
+    near, far, plain = (kind[:8] for kind in settings_of_each_kind())
+    screening = Screening(question)
+    tried = list(_shortlist(screening, iter([*near, *far, *plain]), stops_widest([*near, *far, *plain]), 3))
+    assert tried == [*near[:3], *far[:3], *plain[:3]]
+    assert screening.only is not None
+    assert not screening.only(near[0])
+    mixed = list(_shortlist(Screening(question), iter([*plain, *far]), stops_widest(far), 3))
+    assert mixed == [*plain[:3], *far[:3]]
+
+
+def test_what_friction_leaves_at_most_counts_and_not_where_a_few_machines_stop() -> None:
+    """Friction of 40 mV holds a motor up to 29 um off under the servo's own Kp; 25 um are allowed."""
+    friction = 0.04 * SERVO.k_T / SERVO.R
+    known = UNCERTAINTY.replace(input_bias=(0.0, 0.0), friction=(0.5 * friction, friction), usual_step=(2e-3, 2.4e-3))
+    demands = replace(DEMANDS, tail=25e-6)
+    question = Question(SERVO, known, demands, trial_for(SERVO, UNCERTAINTY, DEMANDS), noise=0.0)
+    calm, lively = (Design(SERVO.controller.replace(Kp=s * SERVO.controller.Kp, Ki=0.0)) for s in (1.0, 1.2))
+    assert leaves_too_much(question, calm)
+    assert not leaves_too_much(question, lively)
+    assert Screening(question).fails(calm)
+    integral = Design(SERVO.controller.replace(Ki=0.01 * SERVO.controller.Ki))
+    assert not leaves_too_much(question, integral)

@@ -217,14 +217,14 @@ def test_no_bytes_make_it_fail(body, encoding):
 
 @pytest.mark.slow
 def test_a_twin_that_breaks_midway_is_as_if_the_window_had_not_been_there(monkeypatch):
-    good, right = stepping._draft, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
+    good, right = stepping.draft_update, work(fleet(), claim(windows()[0], windows()[2]), 0.0)
 
     def breaks(message, *others):
         if message.sequence == windows()[1].sequence:
             raise ZeroDivisionError("float division by zero\0" + 1000 * "!")
         return good(message, *others)
 
-    monkeypatch.setattr(stepping, "_draft", breaks)
+    monkeypatch.setattr(stepping, "draft_update", breaks)
     outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.5, 1.0]), 0.0)
     assert kinds(outcome, 2) == ["estimate"]
     status = statuses(outcome)[1]

@@ -126,7 +126,7 @@ class Structures(NamedTuple):
         now, after = _hold(poles, interval)
         decay = np.exp(poles * interval)
         position, velocity = weight * np.array([np.ones_like(poles), poles])
-        held = {
+        outputs = {
             "position": (position * (now + decay * after), self.direct + np.sum(position * after, axis=1).real),
             "velocity": (velocity * (now + decay * after), np.sum(position + velocity * after, axis=1).real),
         }
@@ -135,7 +135,7 @@ class Structures(NamedTuple):
             Response(
                 poles=poles[i, upper],
                 decay=_parts(decay[i, upper]),
-                **{name: Readout(_parts(gain[i, upper]), float(direct[i])) for name, (gain, direct) in held.items()},
+                **{name: Readout(_parts(gain[i, upper]), float(direct[i])) for name, (gain, direct) in outputs.items()},
                 interval=interval,
                 static_gain=float(still[i]),
                 unseen=float(self.unseen[i]),

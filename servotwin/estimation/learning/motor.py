@@ -78,6 +78,10 @@ class LearntMotor(Struct, frozen=True):
         """Standard deviation of one of the four numbers."""
         return math.sqrt(self.covariance[5 * index])
 
+    def surely(self, index: int) -> float:
+        """Least distance of one of the four numbers from the model's, at 95 %."""
+        return max(0.0, abs(self.mean[index]) - NORMAL_95 * self.std(index))
+
     @property
     def friction(self) -> tuple[float, float]:
         """95 % interval of the friction, V, cut at 0."""
@@ -190,9 +194,9 @@ class MotorLearning:
         short = np.diag(np.maximum(0.0, floor**2 - np.diag(made[1])))
         fresh = LearntMotor(tuple(made[0].tolist()), tuple((made[1] + short).ravel().tolist()), now)
         if before is None:
-            return fresh
+            return replace(fresh, alarm=self._outside(None, fresh))
         if not _surprising(mean, covariance, *made):
-            return replace(fresh, windows=before.windows + 1)
+            return replace(fresh, windows=before.windows + 1, alarm=self._outside(before, fresh))
         return self._contradicted(before, fresh, window, now)
 
     def current(self, motor: LearntMotor | None, now: float) -> LearntMotor | None:
@@ -210,6 +214,17 @@ class MotorLearning:
             return replace(before, surprises=count, alarm=alarm)
         anew = self.updated(None, window, now)
         return anew and replace(anew, alarm=f"{alarm}; it is learnt anew after {count} such windows")
+
+    def _outside(self, before: LearntMotor | None, after: LearntMotor) -> str:
+        """Sentence on a number that has turned out to be outside of what is stated of it; empty without one."""
+        for name, index, std in (("back EMF k_B", BACK_EMF, self.back_emf), ("lag J R / k_T", LAG, self.lag)):
+            stated = math.sqrt(3.0) * std
+            if after.surely(index) > stated and (before is None or before.surely(index) <= stated):
+                return (
+                    f"the motor is not what is stated: its {name} is at least {100.0 * after.surely(index):.3g} % off "
+                    f"the model's, and {100.0 * stated:.3g} % are stated; check the nameplate, and the motor's load"
+                )
+        return ""
 
     def _nameplate(self, rows: MotorRows, delay: float) -> tuple[Array, Array]:
         wide = _WIDE * float(np.sqrt(np.mean(rows.voltage**2)))

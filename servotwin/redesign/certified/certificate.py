@@ -86,8 +86,8 @@ class Demands:
     machines : int
         Machines of the verification, drawn independently of one another and of those that rank.
     attempts : int
-        Candidates that are verified before the search gives up, each on machines of its own; then as many without
-        integral action and dead zone.
+        Candidates that are verified before the search gives up, each on machines of its own; then as many of each
+        kind that settles most surely.
     """
 
     Ms: Annotated[
@@ -139,7 +139,7 @@ class Demands:
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))
-    integral: tuple[float, ...] = (0.0, 0.01, 0.03)
+    integral: tuple[float, ...] = (0.0, 0.01, 0.02, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     velocity: tuple[float, ...] = (0.3, 0.5)
     known: float = 0.0726

@@ -9,7 +9,7 @@ point value.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from itertools import islice
 from time import perf_counter
@@ -20,7 +20,7 @@ from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import laws_within, widened, with_margins
-from servotwin.redesign.certified.screening import Screening, is_plain
+from servotwin.redesign.certified.screening import Screening, is_plain, stops_widest
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
@@ -82,7 +82,7 @@ def certify(
     attempts: list[Attempt] = []
     screening = Screening(question)
     ranked = _ranked_in_stages(question, screening, candidates, in_force)
-    for setting in _shortlist(screening, ranked, demands.attempts):
+    for setting in _shortlist(screening, ranked, stops_widest(candidates), demands.attempts):
         attempt = Attempt(question, setting)
         attempts.append(attempt)
         if attempt.cannot_pass():
@@ -123,16 +123,28 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
-def _shortlist(screening: Screening, ranked: Iterator[Design], attempts: int) -> Iterator[Design]:
-    """The first candidates, then as many without integral action and dead zone, which settle most surely."""
-    plain = 0
+def _shortlist(
+    screening: Screening, ranked: Iterator[Design], widest: Callable[[Design], bool], attempts: int
+) -> Iterator[Design]:
+    """The first candidates, then as many of each kind that settles most surely: those whose integral stops the furthest
+    from the reference, and those without integral action and dead zone."""
+    kinds = (widest, is_plain)
+    found = [0, 0]
     for place, setting in enumerate(ranked):
-        if place < attempts or (is_plain(setting) and plain < attempts):
+        kind = next((k for k, of_kind in enumerate(kinds) if of_kind(setting)), None)
+        if place < attempts or (kind is not None and found[kind] < attempts):
             yield setting
-        plain += is_plain(setting)
-        screening.plain_only = place + 1 >= attempts
-        if screening.plain_only and plain >= attempts:
-            return
+        if kind is not None:
+            found[kind] += 1
+        if place + 1 >= attempts:
+            left = [of_kind for of_kind, count in zip(kinds, found, strict=True) if count < attempts]
+            if not left:
+                return
+            screening.only = _any_of(left)
+
+
+def _any_of(kinds: Sequence[Callable[[Design], bool]]) -> Callable[[Design], bool]:
+    return lambda setting: any(of_kind(setting) for of_kind in kinds)
 
 
 def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:

@@ -35,6 +35,8 @@ _SAME = 1e-3
 _SAME_FEEDFORWARD, _BIAS_FLOOR, _BIAS_MOVED = 7e-3, 1.5e-3, 0.035
 # Friction holds the motor at up to so much more than half the difference of two rests.
 _HOLDS = 1.25
+# Share of the voltage at rest, up to which friction and bias of the turning motor must be known to tell it apart.
+_TELLS = 0.25
 
 
 class Verifier(Protocol):
@@ -268,16 +270,28 @@ class CertifiedPolicy:
         if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
             return True
         sticks = self._friction(evidence)[1] > 0.0
+        if evidence.tuned_for is None and sticks and self._motor(evidence) is not None:
+            # The fallback set is verified for the stated friction only.
+            return True
         return (gains.Ki != 0.0) != sticks and len(evidence.rests) > 0
 
     def _motor(self, evidence: Evidence) -> LearntMotor | None:
-        """The learnt motor, where it tells friction and bias well enough to act on them."""
-        motor, small = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
-        known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= small
+        """The learnt motor, where it tells friction and bias well enough to act on them: to a small voltage, or to a
+        share of the one at rest, which is then of one or of the other."""
+        motor, enough, rest = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer, evidence.disturbance.bias
+        if math.isfinite(rest):
+            enough = max(enough, _TELLS * abs(rest))
+        known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= enough
         return motor if known else None
 
     def _friction(self, evidence: Evidence) -> Range:
-        """Range of friction torques (N m): as learnt, otherwise as stated or as the last feedforward left at rest."""
+        """Range of friction torques (N m): as learnt, otherwise as stated or as the rests show.
+
+        A voltage at rest is that of the bias, less at most the friction's either way. So rests that are alike show no
+        friction, and those that differ show at least half of their difference, unless the bias moved. A feedforward
+        stands for the rests that it was made from: what it leaves at rest counts too, but only one that is in force,
+        and that its limit did not cut.
+        """
         disturbance, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
         motor, torque = self._motor(evidence), self.servo.k_T / self.servo.R
@@ -287,6 +301,8 @@ class CertifiedPolicy:
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
         high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
+            return low, high
+        if not 0.0 < abs(now.feedforward) < self.feedforward_limit:
             return low, high
         left = abs(disturbance.bias + now.feedforward)
         return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high

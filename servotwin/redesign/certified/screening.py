@@ -7,7 +7,8 @@ Next come the machines on which other candidates failed: one that fails there is
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +32,24 @@ def is_plain(setting: Design) -> bool:
     return not setting.controller.Ki and not setting.tolerance
 
 
+def stops_widest(candidates: Sequence[Design]) -> Callable[[Design], bool]:
+    """Predicate of the settings whose integral stops the furthest from the reference: of those with integral action
+    they settle most surely."""
+    widest = max((each.tolerance for each in candidates if each.controller.integral_only), default=math.inf)
+    return lambda each: each.controller.integral_only and each.tolerance >= widest
+
+
+def leaves_too_much(question: Question, setting: Design) -> bool:
+    """True where nothing integrates, and bias and friction may leave a larger error than is allowed.
+
+    The few machines that rank may stop nearer by chance.
+    """
+    known, servo, law = question.uncertainty, question.servo, setting.controller
+    bias = max(abs(end + law.feedforward) for end in known.input_bias)
+    left = (bias + known.friction[1] * servo.R / servo.k_T) / abs(law.Kp)
+    return law.Ki == 0.0 and left > ROUNDED * question.largest_error(setting)
+
+
 @dataclass(frozen=True, order=True)
 class _Rank:
     """Place of a candidate, or the best that it may have; candidates that are alike stand as they were listed."""
@@ -45,13 +64,14 @@ class Screening:
 
     Attributes
     ----------
-    plain_only : bool
-        Set to True while candidates are ranked, it drops those with integral action or a dead zone.
+    only : callable, optional
+        Set to a predicate while candidates are ranked, it drops those that do not satisfy it.
     """
 
     def __init__(self, question: Question) -> None:
         demands, known = question.demands, question.uncertainty
-        self.question, self.plain_only = question, False
+        self.question = question
+        self.only: Callable[[Design], bool] | None = None
         self._moves = known.replace(step=known.usual_step or known.step)
         self._members = draw(question.servo, self._moves, demands.screened, demands.conditions, demands.seed)
         self._largest = float(self._members.step.max())
@@ -67,8 +87,8 @@ class Screening:
         self._start(candidates)
         waiting = [(self._rank(setting, place), setting) for place, setting in enumerate(candidates)]
         while waiting:
-            if self.plain_only:
-                waiting = [each for each in waiting if is_plain(each[1])]
+            if self.only is not None:
+                waiting = [each for each in waiting if self.only(each[1])]
             waiting.sort()
             if passing and waiting and waiting[0][0].fails:
                 return
@@ -168,6 +188,7 @@ class Screening:
         demands, few = self.question.demands, self._known[setting]
         most = self._members.count - int(np.sum(~few.settled))
         fails = most / self._members.count < demands.settled or bool(self._is_off(setting, few).any())
+        fails = fails or leaves_too_much(self.question, setting)
         missing = self._members.count - few.cost.size
         costs = np.concatenate([few.cost.ravel(), np.zeros(missing)])
         return _Rank(fails, self.question.cost(setting, costs), place)

@@ -1,0 +1,138 @@
+"""Friction and bias told apart by voltages at rest, on simulated motors with true Coulomb friction."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from servotwin.control.gains import gains_of
+from servotwin.estimation.disturbance import Disturbance, disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.learning.motor import LearntMotor
+from servotwin.estimation.window import Window
+from servotwin.messages import Setting
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.uncertainty import Range, Uncertainty
+from servotwin.redesign.policy import Evidence
+from servotwin.simulation import simulate
+
+DEG = math.pi / 180.0
+SERVO = Servo.preset("paper")
+CALM = SERVO.controller.replace(Kp=0.7 * SERVO.controller.Kp, Kd=0.7 * SERVO.controller.Kd, Ki=0.0)
+POLICY = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)))
+ESTIMATE = GapEstimate(10.0 * DEG, 0.01 * DEG, 0.01 * DEG, (9.9 * DEG, 10.1 * DEG), GapStatus.OK, 1.0)
+STALL = SERVO.k_T / SERVO.R
+HALF = 20.0
+
+
+def rests(friction: float, bias: float, feedforward: float = 0.0) -> list[Disturbance]:
+    """Read four rests after moves to and fro; friction and bias in V."""
+    run = simulate(
+        SERVO,
+        4.0 * HALF,
+        controller=CALM.replace(feedforward=feedforward),
+        reference=SquareWave(1e-3, 2.0 * HALF),
+        gap=10.0 * DEG,
+        sample_rate=500.0,
+        friction=friction * STALL,
+        input_bias=bias,
+    )
+    ends = [HALF * (move + 1) - 0.01 for move in range(4)]
+    read = [disturbance(Window.from_run(run, start=end - 1.0, duration=1.0), SERVO) for end in ends]
+    assert all(each.known for each in read)
+    return read
+
+
+def evidence(read: list[Disturbance], feedforward: float = 0.0, tuned_for: float | None = 10.0 * DEG) -> Evidence:
+    setting = Setting(0.0, gains_of(CALM.replace(feedforward=feedforward)))
+    before = tuple(each.bias for each in read[:-1])[-3:]
+    return Evidence(ESTIMATE, read[-1], None, setting, tuned_for, rests=before)
+
+
+def friction_of(seen: Evidence) -> Range:
+    """Friction for which the policy verifies, V."""
+    low, high = POLICY._friction(seen)
+    return low / STALL, high / STALL
+
+
+@pytest.mark.parametrize("bias", [0.0, 0.04, -0.07])
+def test_rests_from_both_sides_differ_by_friction_and_those_from_one_side_do_not(bias: float) -> None:
+    """None is further off the bias than the friction; a move that ends fast stops short of that."""
+    friction = 0.03
+    read = [each.bias for each in rests(friction, bias)]
+    assert all(abs(each - bias) <= 1.001 * friction for each in read)
+    forth, back, again, back_again = read
+    assert 1.5 * friction < back - forth <= 2.002 * friction
+    assert (again, back_again) == pytest.approx((forth, back), abs=0.1 * friction)
+
+
+@pytest.mark.parametrize("friction", [0.02, 0.06])
+@pytest.mark.parametrize("bias", [0.0, 0.05, -0.05])
+def test_two_rests_from_both_sides_tell_friction_and_bias(friction: float, bias: float) -> None:
+    seen = evidence(rests(friction, bias)[:2])
+    low, high = friction_of(seen)
+    assert low == 0.0
+    assert friction <= high <= 1.5 * friction
+    fed, (least, most) = POLICY._input_bias(seen)
+    assert least < bias < most
+    assert fed == pytest.approx(-bias, abs=0.1 * friction)
+
+
+@pytest.mark.parametrize("bias", [0.05, -0.08])
+@pytest.mark.parametrize("count", [2, 3, 4])
+def test_rests_that_are_alike_speak_of_a_bias(bias: float, count: int) -> None:
+    """Nothing is fed forward yet, so that nothing of it can be left."""
+    seen = evidence(rests(0.0, bias)[:count])
+    assert friction_of(seen) == (0.0, 0.0)
+    fed, (least, most) = POLICY._input_bias(seen)
+    assert fed == pytest.approx(-bias, abs=1e-3)
+    assert least < bias < most
+
+
+def test_a_first_rest_tells_neither() -> None:
+    fed, (least, most) = POLICY._input_bias(evidence(rests(0.0, 0.05)[:1]))
+    assert fed == 0.0
+    assert least <= 0.0 < 0.05 <= most
+
+
+def test_friction_after_moves_one_way_looks_like_a_bias_until_the_motor_comes_back() -> None:
+    """Rests from one side are alike with friction as with a bias: the first one from the other side corrects it."""
+    friction = 0.05
+    forth, back, again, _ = rests(friction, 0.0)
+    one_way = evidence([forth, again])
+    assert friction_of(one_way) == (0.0, 0.0)
+    assert POLICY._input_bias(one_way)[0] == pytest.approx(friction, rel=0.1)
+    both = evidence([forth, again, back], feedforward=friction)
+    assert friction <= friction_of(both)[1] <= 2.1 * friction
+    assert POLICY._input_bias(both)[0] == pytest.approx(0.0, abs=0.1 * friction)
+
+
+def test_a_feedforward_in_force_that_is_left_at_rest_shows_friction() -> None:
+    """The bias that it stands for is not there any more, or was never one."""
+    read = rests(0.0, 0.01, feedforward=-0.05)[:2]
+    assert friction_of(evidence(read, feedforward=-0.05)) == pytest.approx((0.0, 0.04), rel=0.02)
+    assert friction_of(evidence(read, feedforward=-0.05, tuned_for=None)) == (0.0, 0.0)
+    assert friction_of(evidence(read, feedforward=-0.01)) == (0.0, 0.0)
+
+
+def test_a_feedforward_that_its_limit_cut_shows_no_friction() -> None:
+    limit = POLICY.feedforward_limit
+    read = rests(0.0, 0.5, feedforward=-limit)[:2]
+    assert friction_of(evidence(read, feedforward=-limit)) == (0.0, 0.0)
+
+
+def test_a_motor_whose_friction_is_told_from_its_bias_counts_before_it_is_known_exactly() -> None:
+    """Known to 4 mV, it explains a voltage at rest of 54 mV, and none of 10 mV."""
+    std = 1.9e-3
+    motor = LearntMotor((0.0, 0.0, 0.054, 0.0), (*[0.0] * 10, std**2, *[0.0] * 4, std**2), 0.0)
+    held, small = Disturbance(-0.054, 1e-5, 0.0, 0.3, 0.0), Disturbance(-0.01, 1e-5, 0.0, 0.3, 0.0)
+    first = replace(evidence([held]), motor=motor)
+    fed, (least, most) = POLICY._input_bias(first)
+    assert fed == 0.0
+    assert (least, most) == pytest.approx((-1.96 * std, 1.96 * std), rel=0.01)
+    assert friction_of(first) == pytest.approx((0.054 - 1.96 * std, 0.054 + 1.96 * std), rel=0.01)
+    assert friction_of(replace(evidence([small]), motor=motor)) == (0.0, 0.0)
