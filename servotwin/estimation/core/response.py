@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.hybrid.compiled import bare, subroutine
+from servotwin.hybrid.compiled import bare
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -194,7 +194,7 @@ def _respond(inputs: Array, decay: Array, readout: Readout) -> Array:
     return out
 
 
-@subroutine
+@bare
 def run_pair(signal: Array, decay: Array, gain: Array, one: int, two: int, share: float, out: Array) -> None:
     """Add the output of mode `one`, and `share` times that of mode `two`."""
     ar, ai, br, bi = decay[one, 0], decay[one, 1], decay[two, 0], decay[two, 1]
