@@ -78,9 +78,9 @@ def _spiked(rng: Random, values: Array) -> Array:
 
 
 def _held(rng: Random, values: Array) -> Array:
-    held, first = values.copy(), int(rng.integers(100, values.size - 300))
-    held[first : first + int(rng.integers(5, 60))] = held[first]
-    return held
+    stuck, first = values.copy(), int(rng.integers(100, values.size - 300))
+    stuck[first : first + int(rng.integers(5, 60))] = stuck[first]
+    return stuck
 
 
 def _lagging(seconds: float) -> Fault:

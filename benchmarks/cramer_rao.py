@@ -97,8 +97,8 @@ def motor_unknowns(servo: Servo, voltage: Array, rate: float, zero_order_hold: b
         V.
     rate : float
         Hz.
-    held : bool
-        Whether it is constant between samples, or linear.
+    zero_order_hold : bool
+        True where the voltage is constant between samples; False: linear.
     """
     times = np.arange(voltage.size) / rate
 

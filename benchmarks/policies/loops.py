@@ -137,8 +137,11 @@ def _block(block: str, count: int, seed: int) -> list[LoopRow]:
 
 def _compared(task: _Task) -> dict[str, LoopScores]:
     machine, own = task.machine, task.machine.model.controller
-    held = certified_policy(machine.model, machine.scenario.twin).fallback().setting
-    scores = {TWIN: with_twin(machine), FALLBACK: scored(machine, machine.under(held.controller, held.tolerance))}
+    fallback = certified_policy(machine.model, machine.scenario.twin).fallback().setting
+    scores = {
+        TWIN: with_twin(machine),
+        FALLBACK: scored(machine, machine.under(fallback.controller, fallback.tolerance)),
+    }
     for scale in _SCALES:
         for share in _INTEGRAL:
             name = {(1.0, 0.0): OWN, (0.6, 0.0): SLOWER}.get((scale, share), f"Kp, Kd x {scale:g}, Ki x {share:g}")

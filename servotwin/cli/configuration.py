@@ -9,6 +9,7 @@ from pathlib import Path
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.config.reference import TableSpec, markdown, schema
 from servotwin.control.controller import Controller
+from servotwin.cosim import scenario_file as tables
 from servotwin.cosim.scenario import Scenario
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.drives.table import SUPERVISED
@@ -74,28 +75,30 @@ FILES = {
         TableSpec(
             (Scenario,),
             tables={
-                "controller": _CHANGED,
-                "recording": TableSpec((Recording,), "Windows that the edge records and sends."),
-                "edge": TableSpec(
+                tables.CONTROLLER: _CHANGED,
+                tables.RECORDING: TableSpec((Recording,), "Windows that the edge records and sends."),
+                tables.EDGE: TableSpec(
                     (Supervision,),
                     "Supervision by the edge; with this table updates may also set gains.",
                     {
                         "fallback": _SCENARIO_FALLBACK,
-                        "probe": TableSpec((ProbeLimits,), "Probing moves of the reference that the twin may request."),
+                        tables.PROBE: TableSpec(
+                            (ProbeLimits,), "Probing moves of the reference that the twin may request."
+                        ),
                     },
                 ),
-                "novelty": TableSpec(
+                tables.NOVELTY: TableSpec(
                     (NoveltyRules,), "Rules that select the windows to send; where absent the edge sends all."
                 ),
-                "link": TableSpec(
+                tables.LINK: TableSpec(
                     (LinkSettings,),
                     "Both directions of the link.",
                     {
-                        "up": TableSpec((LinkSettings,), "Changes for edge to twin.", partial=True),
-                        "down": TableSpec((LinkSettings,), "Changes for twin to edge.", partial=True),
+                        tables.UP: TableSpec((LinkSettings,), "Changes for edge to twin.", partial=True),
+                        tables.DOWN: TableSpec((LinkSettings,), "Changes for twin to edge.", partial=True),
                     },
                 ),
-                "twin": _TWIN,
+                tables.TWIN: _TWIN,
             },
         ),
     ),

@@ -70,8 +70,8 @@ def print_limit_cycle(
     servo = servo if enter is None else servo.replace(enter=enter)
     servo = servo if leave is None else servo.replace(leave=leave)
     tolerance = None if tolerance_mm is None else tolerance_mm / _MM
-    if not (math.isfinite(gap_deg) and gap_deg >= 0.0):
-        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be finite and 0 or more")
+    if not 0.0 <= gap_deg <= 360.0:
+        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be from 0 to 360, one turn")
     computed = findings(servo, math.radians(gap_deg), tolerance, step_mm / _MM)
     if as_json:
         print(json.dumps(as_dict(computed), indent=2))

@@ -14,6 +14,7 @@ from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.controller import Controller
 from servotwin.design import tune, tuned_system
+from servotwin.errors import InvalidInput
 from servotwin.plant.margins import Margins
 from servotwin.plant.servo import Servo
 
@@ -38,6 +39,8 @@ class TuneOptions:
 
 def print_tuning(request: TuneOptions, as_json: bool) -> None:
     """Print a table, or one JSON object, on the standard output."""
+    if not 0.0 < request.phase_margin_deg < 180.0:
+        raise InvalidInput(f"phase margin {request.phase_margin_deg:g} deg: must be above 0 and below 180 deg")
     servo = Servo.resolve(request.servo)
     servo = servo.replace(sample_rate=None)
     delay = 1e-3 * request.delay_ms

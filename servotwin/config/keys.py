@@ -257,7 +257,7 @@ def items_of(maker: Any) -> tuple[Item, ...]:
     return known
 
 
-def _name_of(described: Any) -> str:
+def name_of(described: Any) -> str:
     """Name of a declared class, or of its object, in messages."""
     return str(getattr(described, "settings_name", ""))
 
@@ -295,7 +295,7 @@ def check(described: Any, but: Collection[str] = ()) -> None:
             index = next(i for i, each in enumerate(given) if not _number_fits(item, each))
             shown, given, words = f"{item.name}[{index}]", given[index], str(item.key.range)
         unit = f" {item.unit}" if item.unit else ""
-        raise InvalidInput(f"{_name_of(described)} {shown} = {given!r}{unit}: must be {words}".lstrip())
+        raise InvalidInput(f"{name_of(described)} {shown} = {given!r}{unit}: must be {words}".lstrip())
 
 
 def allowed(item: Item) -> str:

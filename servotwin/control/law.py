@@ -139,8 +139,8 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     slope = driven - state.derivative
     pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
     ahead = (1.0 - parameters.velocity_step) * state.ahead + (reference - state.reference)
-    wanted = pidf + (parameters.feedforward + state.offset + parameters.velocity_gain * ahead)
-    voltage = wanted
+    unlimited = pidf + (parameters.feedforward + state.offset + parameters.velocity_gain * ahead)
+    voltage = unlimited
     if voltage > parameters.voltage_limit:
         voltage = parameters.voltage_limit
     elif voltage < -parameters.voltage_limit:
@@ -151,7 +151,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     elif voltage < state.voltage - parameters.rate_step:
         voltage = state.voltage - parameters.rate_step
     # Back-calculation (anti-windup); inside the dead zone the integral must hold.
-    correction = parameters.tracking_step * (voltage - wanted) * active
+    correction = parameters.tracking_step * (voltage - unlimited) * active
     integral = state.integral + parameters.integral_step * driven * active + correction
     derivative = state.derivative + parameters.filter_step * slope
     offset = state.offset * (1.0 - parameters.release_step)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from servotwin.commissioning.edge_settings import Recording
-from servotwin.config.keys import Maker, key
+from servotwin.config.keys import Maker, key, name_of
 from servotwin.config.table import Table, named, read_inner
 from servotwin.config.toml import changes, part, read
 from servotwin.control.controller import Controller
@@ -22,7 +22,13 @@ from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.twin.settings import read_twin_settings
+from servotwin.twin.settings import TwinSettings, read_twin_settings
+
+CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
+    name_of(each) for each in (Controller, Recording, ProbeLimits, NoveltyRules, LinkSettings, TwinSettings)
+)
+EDGE, UP, DOWN = "edge", "up", "down"
+"""Tables of the file, beside those that `Scenario` declares."""
 
 _TURN = 2.0 * math.pi
 
@@ -105,25 +111,25 @@ def read_parts(table: Table, folder: Path, servo: Servo) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    controller = read_inner(table, "controller", lambda inner: _changed(inner, servo.controller))
-    edge = table.table("edge")
-    edge.known("probe")
-    probe = part(edge, "probe", ProbeLimits) if "probe" in edge.values else None
+    controller = read_inner(table, CONTROLLER, lambda inner: _changed(inner, servo.controller))
+    edge = table.table(EDGE)
+    edge.known(PROBE)
+    probe = part(edge, PROBE, ProbeLimits) if PROBE in edge.values else None
     supervision = _supervision(edge, controller or servo.controller)
     edge.done()
-    novelty = part(table, "novelty", NoveltyRules) if "novelty" in table.values else None
-    link = table.table("link")
+    novelty = part(table, NOVELTY, NoveltyRules) if NOVELTY in table.values else None
+    link = table.table(LINK)
     both: LinkSettings = read(link, LinkSettings)
-    uplink, downlink = part(link, "up", LinkSettings, base=both), part(link, "down", LinkSettings, base=both)
+    uplink, downlink = part(link, UP, LinkSettings, base=both), part(link, DOWN, LinkSettings, base=both)
     link.done()
-    table.known("novelty")
+    table.known(NOVELTY)
     return {
         "controller": controller,
         "supervision": supervision,
-        "recording": replace(part(table, "recording", Recording), probe=probe, novelty=novelty),
+        "recording": replace(part(table, RECORDING, Recording), probe=probe, novelty=novelty),
         "uplink": uplink,
         "downlink": downlink,
-        "twin": read_inner(table, "twin", lambda inner: read_twin_settings(inner, folder)),
+        "twin": read_inner(table, TWIN, lambda inner: read_twin_settings(inner, folder)),
     }
 
 
@@ -138,7 +144,7 @@ def _supervision(edge: Table, controller: Controller) -> Supervision | None:
 
     Its table `probe` changes nothing of this.
     """
-    if not edge.values.keys() - {"probe"}:
+    if not edge.values.keys() - {PROBE}:
         return None
 
     def gains(inner: Table) -> Gains:

@@ -14,10 +14,11 @@ from types import CodeType
 from typing import Any, TypeVar, cast
 
 from numba import njit
+from numba.core.compiler import CompilerBase
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compile_progress import show_compilation
-from servotwin.hybrid.subroutine import SubroutineCompiler
+from servotwin.hybrid.subroutine import SubroutineCompiler, UnoptimisedCompiler
 
 show_compilation()
 
@@ -37,29 +38,36 @@ def bare(function: _Function) -> _Function:
 
 def subroutine(function: _Function) -> _Function:
     """Compile like `bare`, a function that compiled functions call, and Python only in tests: a part of its callers,
-    without machine code of its own, which would be as much work again."""
-    return _compile_part(function, fastmath={"contract"}, _nrt=False)
+    optimised with them, without machine code of its own: in a chain of calls all of that would be done again and again.
+    """
+    return _compile_part(function, UnoptimisedCompiler, fastmath={"contract"}, _nrt=False)
+
+
+def merged(function: _Function) -> _Function:
+    """Compile a subroutine inline."""
+    return _compile_part(function, UnoptimisedCompiler, fastmath={"contract"}, _nrt=False, forceinline=True)
 
 
 def inlined(function: _Function) -> _Function:
-    """Compile a subroutine inline, for helpers of a hot loop: a call would copy the array header of every argument."""
-    return _compile_part(function, fastmath={"contract"}, _nrt=False, forceinline=True)
+    """Compile inline, for helpers of a hot loop: a call would copy the array header of every argument. Optimised alone
+    first, which makes better loops of small functions."""
+    return _compile_part(function, SubroutineCompiler, fastmath={"contract"}, _nrt=False, forceinline=True)
 
 
 def summed(function: _Function) -> _Function:
-    """Compile a subroutine inline, additions in any order: a vector of partial sums and no chain of additions."""
-    return _compile_part(function, fastmath={"contract", "reassoc"}, _nrt=False, forceinline=True)
+    """Compile inline, additions in any order: a vector of partial sums and no chain of additions."""
+    return _compile_part(function, SubroutineCompiler, fastmath={"contract", "reassoc"}, _nrt=False, forceinline=True)
 
 
 def verbatim(function: _Function) -> _Function:
-    """Compile a subroutine inline, every operation rounded as written: the same bits as the interpreter's."""
+    """Compile inline, every operation rounded as written: the same bits as the interpreter's."""
     # Explicit, because numba compiles a callee with its caller's fastmath where the callee sets none.
-    return _compile_part(function, fastmath=False, _nrt=False, forceinline=True)
+    return _compile_part(function, SubroutineCompiler, fastmath=False, _nrt=False, forceinline=True)
 
 
-def _compile_part(function: _Function, **options: Any) -> _Function:
+def _compile_part(function: _Function, compiler: type[CompilerBase], **options: Any) -> _Function:
     """Compile a part of other functions; a test that calls it from Python compiles it once more."""
-    part: Any = _compile(function, **options, no_cpython_wrapper=True, pipeline_class=SubroutineCompiler)
+    part: Any = _compile(function, **options, no_cpython_wrapper=True, pipeline_class=compiler)
 
     @cache
     def callable_from_python() -> Any:

@@ -180,12 +180,12 @@ def advance_fraction(t: Tables, mode: int, x: Array, fraction: float, scratch: S
 
 
 @inlined
-def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, wanted: int) -> int:
-    """Number of intervals, at most `wanted`, before the first in which some guard may become positive.
+def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, limit: int) -> int:
+    """Number of intervals, at most `limit`, before the first in which some guard may become positive.
 
     More than rounding, that is: a loop at rest would otherwise be looked at step by step for ever.
     """
-    clean, thirds = wanted, t.guard_count[mode] * rows
+    clean, thirds = limit, t.guard_count[mode] * rows
     for g in range(t.guard_count[mode]):
         least = LINGERING * rounding(t, mode, g, 0, x)
         for k in range(clean):
@@ -199,9 +199,9 @@ def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, wante
 
 @inlined
 def advance_clean(
-    t: Tables, table: Array, jumps: Array, nodes: int, wanted: int, mode: int, x: Array, scratch: Scratch
+    t: Tables, table: Array, jumps: Array, nodes: int, limit: int, mode: int, x: Array, scratch: Scratch
 ) -> int:
-    """Advance through the first intervals of a block, at most `wanted`, in which no guard may become positive.
+    """Advance through the first intervals of a block, at most `limit`, in which no guard may become positive.
 
     `table` and `jumps` are those of one scale; returns the number of intervals advanced.
     """
@@ -213,7 +213,7 @@ def advance_clean(
     positive = 0
     for r in range(np.uint64(values)):
         positive += out[r] + abs(out[np.uint64(values) + r]) > 0.0
-    clean = wanted if positive == 0 else clean_intervals(t, mode, x, out, nodes + 1, wanted)
+    clean = limit if positive == 0 else clean_intervals(t, mode, x, out, nodes + 1, limit)
     if clean > 0:
         advance(jumps, (t.flow_of[mode] * nodes + clean - 1) * t.states * t.states, x, scratch.change)
     return clean

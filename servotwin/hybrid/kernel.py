@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.build import fill_entered
-from servotwin.hybrid.compiled import bare, inlined, subroutine
+from servotwin.hybrid.compiled import bare, inlined, merged, subroutine
 from servotwin.hybrid.crossing import is_leaving, next_crossing
 from servotwin.hybrid.flow import Scratch, advance, advance_clean, advance_fraction, product
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, Tables
@@ -75,7 +75,7 @@ def note_segment(record: RunRecord, step: int, fraction: float, mode: int, x: Ar
     record.size[0] = at + 1
 
 
-@inlined
+@merged
 def fire(
     t: Tables,
     mode: int,
@@ -100,7 +100,7 @@ def fire(
     return entered
 
 
-@inlined
+@merged
 def follow_guards(
     t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: RunRecord, scratch: Scratch
 ) -> int:
@@ -121,7 +121,7 @@ def follow_guards(
     return -1
 
 
-@inlined
+@merged
 def cross(
     t: Tables, mode: int, x: Array, step: int, start: float, end: float, record: RunRecord, scratch: Scratch
 ) -> tuple[int, int]:
@@ -151,7 +151,7 @@ def cross(
     return -1, record.size[1] - before
 
 
-@inlined
+@merged
 def step_once(t: Tables, mode: int, x: Array, step: int, record: RunRecord, scratch: Scratch) -> int:
     """Advance `x` in place by one search step; return the mode, -1 when Zeno. One product when nothing happens."""
     n = np.uint64(t.states)
@@ -198,22 +198,22 @@ def flow_until(
             return FULL, step, fraction, mode
         if fraction == 0.0 and calm >= NODES_FINE and end_step - step >= NODES_FINE:
             # Only after a while without events: they may excite motions that are fast, and gone within a coarse step.
-            wanted = min(NODES_COARSE, (end_step - step) // NODES_FINE)
-            clean = advance_clean(t, t.coarse, t.jump_coarse, NODES_COARSE, wanted, mode, x, scratch)
+            intervals = min(NODES_COARSE, (end_step - step) // NODES_FINE)
+            clean = advance_clean(t, t.coarse, t.jump_coarse, NODES_COARSE, intervals, mode, x, scratch)
             if clean > 0:
                 step += clean * NODES_FINE
                 note_segment(record, step, 0.0, mode, x)
-            if clean == wanted:
+            if clean == intervals:
                 continue
         # The tables hold whole search steps, so they serve only a state on the grid of search steps.
         if fraction == 0.0 and step < end_step:
-            wanted = min(NODES_FINE, end_step - step)
-            clean = advance_clean(t, t.fine, t.jump_fine, NODES_FINE, wanted, mode, x, scratch)
+            intervals = min(NODES_FINE, end_step - step)
+            clean = advance_clean(t, t.fine, t.jump_fine, NODES_FINE, intervals, mode, x, scratch)
             if clean > 0:
                 step += clean
                 calm += clean
                 note_segment(record, step, 0.0, mode, x)
-            if clean == wanted:
+            if clean == intervals:
                 continue
         stop = 1.0 if step < end_step else end_fraction
         mode, events = cross(t, mode, x, step, fraction, stop, record, scratch)

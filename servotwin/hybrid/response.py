@@ -33,7 +33,7 @@ class BlockResponses(NamedTuple):
     pulse: Array  # M * 32: the position -16 .. 15 ticks after an input's tick, zero up to one tick after it
     next: Array  # M: the position one tick after it
     watch: Array  # M * (n + 8) * (L * 8): lanes, tick after tick, as many as the mode has, of its columns
-    held: Array  # M * 8 * n: change of the state in a block, of the inputs
+    input_change: Array  # M * 8 * n: change of the state in a block, of the inputs
     step: Array  # M * 8 * (n + 8) * n: change of the state after 1 .. 8 ticks
     columns: NDArray[np.int64]  # M * n: states on which lanes depend, then the others
     column_count: NDArray[np.int64]  # (M,) of the former and the inputs, a multiple of eight
@@ -61,16 +61,16 @@ class _Mode(NamedTuple):
     pulses: list[Array]  # states that a pulse leaves after 1 .. 15 ticks
     lanes: Array  # rows (lanes, n) of the state after the tick
     owners: list[int]  # the guard of every lane
-    held: int  # index of the input
+    input_index: int  # index of the input
 
     def seen(self, rows: Array, ticks: int = TICKS) -> Array:
         """(ticks, R, n + 8): rows of the state after the tick, of the state at the start and the block's inputs."""
         n = rows.shape[1]
         out = np.zeros((ticks, len(rows), n + TICKS))
-        delayed = [rows[:, self.held], *(rows @ pulse for pulse in self.pulses)]
+        delayed = [rows[:, self.input_index], *(rows @ pulse for pulse in self.pulses)]
         for j in range(ticks):
             out[j, :, :n] = rows + (rows @ self.powers[j - 1] if j else 0.0)
-            out[j, :, self.held] = 0.0
+            out[j, :, self.input_index] = 0.0
             for i in range(min(j + 1, TICKS)):
                 out[j, :, n + i] = delayed[j - i]
         return out
@@ -89,11 +89,11 @@ def new_response_memory(r: BlockResponses, states: int) -> ResponseMemory:
 
 
 def build_responses(
-    automaton: Automaton, t: Tables, step: float, searches: int, held: int, position: int
+    automaton: Automaton, t: Tables, step: float, searches: int, input_index: int, position: int
 ) -> BlockResponses:
-    """All responses to the input that is the state `held`, with so many search steps (s) a tick."""
+    """All responses to the input that is the state `input_index`, with so many search steps (s) a tick."""
     n, row = t.states, np.eye(t.states)[[position]]
-    modes = [_mode(automaton, t, m, step, searches, held) for m in range(len(automaton.modes))]
+    modes = [_mode(automaton, t, m, step, searches, input_index) for m in range(len(automaton.modes))]
     lanes = max([1] + [len(mode.owners) for mode in modes])
     positions = [mode.seen(row, 2 * TICKS)[:, 0, :n].T for mode in modes]
     pulses = [np.array([row[0] @ pulse for pulse in mode.pulses]) for mode in modes]
@@ -112,7 +112,7 @@ def build_responses(
         pulse=_flat([np.concatenate([np.zeros(2 * TICKS + 2), each[1:]]) for each in pulses]),
         next=np.array([each[0] for each in pulses]),
         watch=_flat([each[0] for each in watched]),
-        held=_flat([np.array(mode.pulses[TICKS - 1 :: -1]) for mode in modes]),
+        input_change=_flat([np.array(mode.pulses[TICKS - 1 :: -1]) for mode in modes]),
         step=_flat([_step(mode, ticks) for mode in modes for ticks in range(1, TICKS + 1)]),
         columns=np.concatenate([each[1] for each in watched]),
         column_count=np.array([each[2] for each in watched]),
@@ -122,13 +122,13 @@ def build_responses(
     )
 
 
-def output_responses(r: BlockResponses, row: Array, held: int) -> tuple[Array, Array]:
+def output_responses(r: BlockResponses, row: Array, input_index: int) -> tuple[Array, Array]:
     """(M, 8, n) and (M, 8): an output at the ticks of a block, of the state at its start, and after an input's tick."""
     n = row.size
     step = r.step.reshape(-1, TICKS, n + TICKS, n)
     free = np.broadcast_to(row, (len(step), TICKS, n)).copy()
     free[:, 1:] += step[:, :-1, :n] @ row
-    late = np.full((len(step), TICKS), row[held])
+    late = np.full((len(step), TICKS), row[input_index])
     late[:, 1:] = step[:, :-1, n] @ row
     return free, late
 
@@ -137,7 +137,7 @@ def _flat(parts: list[Array]) -> Array:
     return aligned(np.concatenate([np.ravel(part) for part in parts]))
 
 
-def _mode(automaton: Automaton, t: Tables, m: int, step: float, searches: int, held: int) -> _Mode:
+def _mode(automaton: Automaton, t: Tables, m: int, step: float, searches: int, input_index: int) -> _Mode:
     """A mode with its lanes; the flow of a search step is that of the tables."""
     n = t.states
     at = t.flow_of[m] * NODES_FINE * n * n
@@ -148,24 +148,24 @@ def _mode(automaton: Automaton, t: Tables, m: int, step: float, searches: int, h
         third = value @ flow * (step / 3.0)
         rows.append(value)
         # An input that enters a guard moves it at the tick; any other guard begins where it ended.
-        own = [value] if value[held] != 0.0 else []
+        own = [value] if value[input_index] != 0.0 else []
         for _ in range(searches):
             second = value + third
             value, third = value + value @ search, third + third @ search
             own += [second, value - third, value]
         lanes.append(np.array(own))
         owners += [g] * len(own)
-    return _Mode(tuple(rows), *_powers(search, searches, held), np.vstack(lanes), owners, held)
+    return _Mode(tuple(rows), *_powers(search, searches, input_index), np.vstack(lanes), owners, input_index)
 
 
-def _powers(search: Array, searches: int, held: int) -> tuple[list[Array], list[Array]]:
+def _powers(search: Array, searches: int, input_index: int) -> tuple[list[Array], list[Array]]:
     """Powers of a tick's map without its input, less one, and the states that a pulse of the input leaves."""
     tick = np.zeros_like(search)
     for _ in range(searches):
         tick = tick + search + search @ tick
-    pulse = tick[:, held].copy()
-    pulse[held] = 0.0
-    tick[:, held] = tick[held] = 0.0
+    pulse = tick[:, input_index].copy()
+    pulse[input_index] = 0.0
+    tick[:, input_index] = tick[input_index] = 0.0
     powers, pulses = [tick], [pulse]
     for _ in range(2 * TICKS - 2):
         powers.append(powers[-1] + tick + tick @ powers[-1])
@@ -216,10 +216,10 @@ def _product(table: Array, base: int, stride: int, rows: int, x: Array, out: Arr
 
 
 @inlined
-def begin_block(r: BlockResponses, mode: int, held: int, fresh: bool, x: Array, memory: ResponseMemory) -> None:
+def begin_block(r: BlockResponses, mode: int, input_index: int, fresh: bool, x: Array, memory: ResponseMemory) -> None:
     """The free response from `x`, whose input becomes zero; `fresh` where the block before ended early."""
     n = x.size
-    x[held] = 0.0
+    x[input_index] = 0.0
     for i in range(np.uint64(n)):
         memory.start[i] = x[i]
     now = memory.position[:TICKS]
@@ -290,7 +290,7 @@ def end_block(r: BlockResponses, mode: int, ticks: int, x: Array, memory: Respon
     """Advance `x` by the first ticks of the block that began with it."""
     n = x.size
     if ticks == TICKS:
-        tall_product(r.held, mode * TICKS * n, n, n, memory.start[n:], memory.change)
+        tall_product(r.input_change, mode * TICKS * n, n, n, memory.start[n:], memory.change)
         for i in range(np.uint64(n)):
             x[i] += memory.ahead[np.uint64(TICKS) + i] + memory.change[i]
     elif ticks > 0:

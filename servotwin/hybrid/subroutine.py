@@ -36,13 +36,28 @@ class SubroutineLibrary(JITCodeLibrary):
         return llvmlite.binding.parse_assembly(str(module))
 
 
+class UnoptimisedLibrary(SubroutineLibrary):
+    """Intermediate code as it was translated."""
+
+    def _optimize_final_module(self) -> None:
+        """Leave it to the callers."""
+
+
 class SubroutineCompiler(CompilerBase):
     """numba's passes, into a `SubroutineLibrary`."""
+
+    library = SubroutineLibrary
 
     def define_pipelines(self) -> list[Any]:
         """The one pipeline there is."""
         state = self.state
         if state.library is None:
-            state.library = SubroutineLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+            state.library = self.library(state.targetctx.codegen(), state.func_id.func_qualname)
             state.library.enable_object_caching()
         return [DefaultPassBuilder.define_nopython_pipeline(state)]
+
+
+class UnoptimisedCompiler(SubroutineCompiler):
+    """numba's passes, into an `UnoptimisedLibrary`."""
+
+    library = UnoptimisedLibrary

@@ -1,1 +1,1 @@
-"""The link between edge and twin: outbox, session, simulated link."""
+"""The link between edge and twin: outbox, session, seals, transports, and a simulated link in virtual time."""

@@ -87,8 +87,8 @@ class PlantSet:
         if rate is not None:
             flows = np.zeros((len(A), B.shape[1] + 1, B.shape[1] + 1))
             flows[:, :-1, :-1], flows[:, :-1, -1] = A, B
-            held = rate * np.array([expm1(flow, 1.0 / rate) for flow in flows])
-            A, B = held[:, :-1, :-1], held[:, :-1, -1]
+            discrete = rate * np.array([expm1(flow, 1.0 / rate) for flow in flows])
+            A, B = discrete[:, :-1, :-1], discrete[:, :-1, -1]
         return PlantSet(A, B, C, rate)
 
     @property

@@ -101,9 +101,9 @@ class PiecewiseCubic:
         """`value` at increasing times ``(n,)``, piece by piece: quicker where there are many times in few pieces."""
         if times.size == 0:
             return np.empty(0)
-        held = self.constant_between(float(times[0]), float(times[-1]))
-        if held is not None:
-            return np.full(times.size, held)
+        constant = self.constant_between(float(times[0]), float(times[-1]))
+        if constant is not None:
+            return np.full(times.size, constant)
         result = np.empty(times.size)
         bounds = np.concatenate([[0], np.searchsorted(_rounded_up(times), self.times[1:], side="left"), [times.size]])
         for piece in np.flatnonzero(np.diff(bounds)):

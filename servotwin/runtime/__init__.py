@@ -1,1 +1,1 @@
-"""Plumbing without servos: clocks, files, locks, pipes and child processes; standard library and msgspec only."""
+"""Plumbing without servos: retries, frames, processes, locks and atomic files; standard library and msgspec only."""

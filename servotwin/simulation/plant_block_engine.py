@@ -30,8 +30,8 @@ _LEAST_TICKS, _MOST_SEARCHES = 20_000, 8
 
 
 @lru_cache(maxsize=64)
-def _responses_for(automaton: Automaton, step: float, searches: int, held: int, position: int) -> BlockResponses:
-    return build_responses(automaton, tables_for(automaton, step), step, searches, held, position)
+def _responses_for(automaton: Automaton, step: float, searches: int, input_index: int, position: int) -> BlockResponses:
+    return build_responses(automaton, tables_for(automaton, step), step, searches, input_index, position)
 
 
 def fits_plant_blocks(engine: SampledEngine) -> bool:

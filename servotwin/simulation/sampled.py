@@ -153,8 +153,12 @@ class SampledEngine:
 
     def _on_ticks(self, signal: PiecewiseCubic, first: int, count: int) -> Array:
         """Values at ticks; one value where it is constant."""
-        held = signal.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
-        return np.array([held]) if held is not None else signal.on(np.arange(first, first + count) / self.tick_rate)
+        constant = signal.constant_between(first / self.tick_rate, (first + count - 1) / self.tick_rate)
+        return (
+            np.array([constant])
+            if constant is not None
+            else signal.on(np.arange(first, first + count) / self.tick_rate)
+        )
 
     def _thresholds(self, first: int, count: int) -> tuple[Array, Array]:
         """Thresholds of the dead zone at ticks; one pair where they are constant."""

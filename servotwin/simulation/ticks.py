@@ -118,9 +118,9 @@ def to_hold(i: int, voltage: float, port: Port) -> float:
     if port.delayed.size == 0:
         return voltage
     place = i % port.delayed.size
-    held = port.delayed[place]
+    delayed = port.delayed[place]
     port.delayed[place] = voltage
-    return held
+    return delayed
 
 
 @inlined

@@ -267,9 +267,12 @@ def test_the_command_as_json():
     assert json.loads(run(4.2, 60, "--delay-ms", 5, "--json").output)["overshoot"] is None
 
 
-@pytest.mark.parametrize("arguments", [(10, 60), (10, 60, "--type", "PD"), (-1, 60), (4.2, 60, "--ms-max", 1.1)])
+@pytest.mark.parametrize(
+    "arguments", [(10, 60), (10, 60, "--type", "PD"), (-1, 60), (4.2, 60, "--ms-max", 1.1), (4, 600)]
+)
 def test_a_user_error_is_one_sentence_and_exit_code_2(arguments):
     result = run("--", *arguments) if arguments[0] == -1 else run(*arguments)
     assert result.exit_code == 2
     assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("error: ")
+    assert "rad" not in result.stderr.replace("rad/s", "")  # the arguments are in degrees

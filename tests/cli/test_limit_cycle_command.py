@@ -45,8 +45,8 @@ def test_hysteresis_is_passed_on():
     ("arguments", "message"),
     [
         (("papre",), "papre"),
-        (("--gap-deg", -1), "--gap-deg -1 deg: must be finite and 0 or more"),
-        (("--gap-deg", "nan"), "--gap-deg nan deg: must be finite and 0 or more"),
+        (("--gap-deg", -1), "--gap-deg -1 deg: must be from 0 to 360, one turn"),
+        (("--gap-deg", "nan"), "--gap-deg nan deg: must be from 0 to 360, one turn"),
         (("--step-mm", 0), "step = 0.0 m"),
         (("--tolerance-mm", -1), "tolerance"),
         (("--tolerance-mm", 1, "--enter", 2), "leave = 1.0 tolerances"),

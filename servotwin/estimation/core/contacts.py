@@ -67,11 +67,11 @@ def follow(theta_m: Array, gap: float, theta_d0: float, rate: float, out: Array)
     middle = 0.5 * (theta_m.size - 1)
     for i in range(theta_m.size):
         half = 0.5 * (gap + rate * (i - middle))
-        pushed, held = theta_m[i] - half, theta_m[i] + half
-        if pushed > screw:
-            screw, by_gap, by_start, by_rate = pushed, -0.5, 0.0, -0.5 * (i - middle)
-        elif held < screw:
-            screw, by_gap, by_start, by_rate = held, 0.5, 0.0, 0.5 * (i - middle)
+        lower, upper = theta_m[i] - half, theta_m[i] + half
+        if lower > screw:
+            screw, by_gap, by_start, by_rate = lower, -0.5, 0.0, -0.5 * (i - middle)
+        elif upper < screw:
+            screw, by_gap, by_start, by_rate = upper, 0.5, 0.0, 0.5 * (i - middle)
         out[0, i], out[1, i], out[2, i], out[3, i] = screw, by_gap, by_start, by_rate
 
 

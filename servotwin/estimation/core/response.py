@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.hybrid.compiled import bare, subroutine
+from servotwin.hybrid.compiled import bare
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -126,7 +126,7 @@ class Structures(NamedTuple):
         now, after = _hold(poles, interval)
         decay = np.exp(poles * interval)
         position, velocity = weight * np.array([np.ones_like(poles), poles])
-        held = {
+        outputs = {
             "position": (position * (now + decay * after), self.direct + np.sum(position * after, axis=1).real),
             "velocity": (velocity * (now + decay * after), np.sum(position + velocity * after, axis=1).real),
         }
@@ -135,7 +135,7 @@ class Structures(NamedTuple):
             Response(
                 poles=poles[i, upper],
                 decay=_parts(decay[i, upper]),
-                **{name: Readout(_parts(gain[i, upper]), float(direct[i])) for name, (gain, direct) in held.items()},
+                **{name: Readout(_parts(gain[i, upper]), float(direct[i])) for name, (gain, direct) in outputs.items()},
                 interval=interval,
                 static_gain=float(still[i]),
                 unseen=float(self.unseen[i]),
@@ -194,7 +194,7 @@ def _respond(inputs: Array, decay: Array, readout: Readout) -> Array:
     return out
 
 
-@subroutine
+@bare
 def run_pair(signal: Array, decay: Array, gain: Array, one: int, two: int, share: float, out: Array) -> None:
     """Add the output of mode `one`, and `share` times that of mode `two`."""
     ar, ai, br, bi = decay[one, 0], decay[one, 1], decay[two, 0], decay[two, 1]

@@ -124,8 +124,8 @@ class WindowFit:
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings, self.second)
         status, reasons = judge(evidence, self.settings)
-        told = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
-        if self.learnt is not None and self.learnt.beyond and told:
+        usable = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
+        if self.learnt is not None and self.learnt.beyond and usable:
             status, reasons = GapStatus.MODEL_MISMATCH, (self.learnt.beyond,)
         teaches = self._teaches(evidence, status)
         if teaches or status in (GapStatus.OK, GapStatus.LOWER_BOUND):
