@@ -11,6 +11,8 @@ unexport PYTHONDONTWRITEBYTECODE
 # A file's tests run in one process, in the order of tests/conftest.py: what they share is computed once. Three processes on two
 # cores, because some tests wait for machines that run by the clock.
 PYTEST := $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
+# The fast tests hardly ever wait, and every process imports all of them once more.
+PYTEST_FAST := $(PYTEST) -n 2
 
 .PHONY: help demo reproduce reference check test fuzz bench lint format lock clean packages
 
@@ -33,7 +35,7 @@ reproduce: $(STAMP)
 	$(BIN)/servotwin reproduce
 
 check: lint
-	$(PYTEST) -m "not slow"
+	$(PYTEST_FAST) -m "not slow"
 
 test: lint packages
 	$(PYTEST)

@@ -157,6 +157,7 @@ def test_without_dead_zone_an_idle_law_wakes_up(tolerance: float | None) -> None
     assert (state.active, state.voltage) == (1.0, 5.0)
 
 
+@pytest.mark.slow
 def test_limits_hold_and_the_integral_does_not_wind_up() -> None:
     law = PAPER.replace(voltage_limit=2.0).law()
     saturated = run(law, [2e-3] * 20_000)

@@ -74,6 +74,7 @@ def looped(factors: tuple[float, ...], learn: bool, novelty: bool = True) -> tup
     return loop, loop.loop(plant.run())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factors", OFF_BY)
 def test_an_edge_whose_machine_is_off_sends_the_first_window_and_the_change(factors: tuple[float, ...]) -> None:
     loop, result = looped(factors, learn=True)
@@ -87,6 +88,7 @@ def test_an_edge_whose_machine_is_off_sends_the_first_window_and_the_change(fact
     )
 
 
+@pytest.mark.slow
 def test_without_learning_no_response_is_sent() -> None:
     loop, result = looped(OFF_BY[0], learn=False)
     assert not loop.store.responses
@@ -94,6 +96,7 @@ def test_without_learning_no_response_is_sent() -> None:
     assert not any(estimate.ok for estimate in result.estimates)
 
 
+@pytest.mark.slow
 def test_an_edge_without_a_filter_is_sent_none() -> None:
     loop, result = looped(OFF_BY[0], learn=True, novelty=False)
     assert not loop.store.responses

@@ -259,6 +259,7 @@ def test_machines_in_two_parts_have_the_measures_of_all() -> None:
         assert np.array_equal(getattr(both, name), getattr(whole, name)), name
 
 
+@pytest.mark.slow
 def test_an_attempt_is_given_up_only_where_its_certificate_fails() -> None:
     """Parts refuse early; the certificate of the whole agrees, whichever part it was."""
     demands = replace(SMALL, machines=90, settled=0.9)

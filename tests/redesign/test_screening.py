@@ -53,6 +53,7 @@ def test_the_order_is_that_of_all_candidates_on_all_machines() -> None:
     assert ranked == fully_ranked(question, candidates)
 
 
+@pytest.mark.slow
 def test_the_first_candidates_cost_fewer_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     question, candidates = question_and_candidates()
     runs = 0
