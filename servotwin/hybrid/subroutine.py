@@ -11,8 +11,12 @@ from typing import Any
 
 import llvmlite.binding
 import llvmlite.ir
+from numba import version_info
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
+
+TRIED = version_info.short == (0, 68)
+"""True with a version of numba whose insides this file has been tried on; others compile as numba does, more slowly."""
 
 _ENVIRONMENT = "_ZN08NumbaEnv"
 

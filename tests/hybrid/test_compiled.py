@@ -148,6 +148,14 @@ def test_a_subroutine_is_a_part_of_its_callers_and_python_can_call_it() -> None:
     assert fma_by_hand(2.0, 3.0, 4.0) == 10.0
 
 
+def test_with_another_version_of_numba_a_subroutine_is_compiled_as_any_function(monkeypatch) -> None:
+    monkeypatch.setattr("servotwin.hybrid.compiled.TRIED", False)
+    part: Any = subroutine(fma_by_hand.py_func)
+    assert part(2.0, 3.0, 4.0) == 10.0
+    (version,) = part.overloads.values()
+    assert version.library.codegen._engine._ee.get_function_address(version.fndesc.llvm_func_name)
+
+
 SUBROUTINE = """
 import sys
 from typing import Any
