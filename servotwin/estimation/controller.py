@@ -7,6 +7,7 @@ part of the voltage is fitted. What is left unexplained says that another contro
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ _ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, a
 _LARGEST = 0.5  # share of the voltage's swing: a window whose noise needs more tolerance shows nothing
 _FILTERED = 5.0  # time constants of the loop filter after which the measurement before the window is forgotten
 _AT_LIMIT, _FEWEST = 0.999, 20  # of the limit; samples before the first one at the limit that show the initial state
+_VAST = 1e-20 * math.sqrt(sys.float_info.max)  # V: sums of squares of such integrals are beyond the range of floats
 _DELAYS = 4  # samples, from none on, by which the voltage may be recorded later than it was computed
 _ROUNDS = 3  # fits of the initial state: a limit of the voltage makes it nonlinear
 
@@ -92,11 +94,16 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
     Returns
     -------
     ControllerComparison or None
-        None: voltage or reference were not recorded, or the voltage moves too little beside noise and rounding.
+        None: voltage or reference were not recorded, the voltage moves too little beside noise and rounding, or the
+        squares of such numbers are beyond the range of floats.
     """
     if window.voltage is None or window.reference is None:
         return None
     parameters = controller.replace(sample_rate=window.sample_rate).law(tolerance)
+    stiff = abs(parameters.Kp) + abs(parameters.derivative_gain)
+    largest = max(float(np.max(np.abs(values))) for values in window.channels.values())
+    if max(1.0, stiff) * largest > _VAST:
+        return None
     made = None
     for delay in range(_DELAYS):
         voltage, rest = window.voltage[delay:], window.voltage.size - delay
@@ -159,9 +166,7 @@ def _corrected(
     if parameters.velocity_gain != 0.0:
         columns["ahead"] = parameters.velocity_gain * (1.0 - parameters.velocity_step) ** (count + 1)
     matrix = np.stack([column[free] for column in columns.values()], axis=1)
-    size = np.linalg.norm(matrix, axis=0)
-    size[size == 0.0] = 1.0
-    values = np.linalg.lstsq(matrix / size, left[free], rcond=1e-9)[0] / size
+    values = _least_squares(matrix, left[free])
     return state._replace(
         **{name: getattr(state, name) + float(value) for name, value in zip(columns, values, strict=True)}
     )
@@ -183,9 +188,7 @@ def _factors(
     initial = (terms.acting, *fades)
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    values = np.linalg.lstsq(columns / size, measured, rcond=1e-9)[0] / size
+    values = _least_squares(columns, measured)
     if _rms(measured - columns @ values) > tolerated:
         return {}
     return {name: float(value) for name, value in zip(stated, values, strict=False)}
@@ -226,6 +229,13 @@ def law_terms(parameters: LawParameters, start: LawState, reference: Array, posi
     integral, _ = run_law(unlimited._replace(integral_step=1.0), start, reference, position)
     derivative, _ = run_law(unlimited._replace(derivative_gain=1.0), start, reference, position)
     return _Terms(acting, proportional, integral, derivative)
+
+
+def _least_squares(columns: Array, target: Array) -> Array:
+    """Coefficients (k,) of the columns (n, k), whose units differ by orders of magnitude."""
+    size = np.linalg.norm(columns, axis=0)
+    size[size == 0.0] = 1.0
+    return np.asarray(np.linalg.lstsq(columns / size, target, rcond=1e-9)[0] / size)
 
 
 def _forgotten(parameters: LawParameters) -> int:
