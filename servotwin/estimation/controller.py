@@ -62,22 +62,20 @@ class ControllerComparison:
 
     @property
     def sentence(self) -> str:
-        """What is wrong; empty where the controllers agree."""
+        """Sentence for the operator; empty where the controllers agree."""
         if self.agrees:
             return ""
-        share = f"{100.0 * self.unexplained / self.swing:.0f} % of the voltage's swing" if self.swing > 0.0 else "it"
+        share = f"{100.0 * self.unexplained / self.swing:.0f} % of the voltage's swing"
         fitting = ", ".join(f"{name} {factor:.2g}" for name, factor in self.factors.items())
         like = f"; it fits {fitting} times the stated" if fitting else ", and so do other gains"
         return f"the voltage is not that of the stated controller, which leaves {share} unexplained{like}"
 
 
 class _Terms(NamedTuple):
-    """Parts of a law's voltage over a window, each (n,): 0 or 1 where it acts, and the unit responses of its gains."""
+    """Parts of a law's voltage over a window, each (n,): 0 or 1 where it acts, and those of its gains, V."""
 
     acting: Array
-    proportional: Array
-    integral: Array
-    derivative: Array
+    gains: dict[str, Array]
 
 
 def compare_controller(window: Window, controller: Controller, tolerance: float) -> ControllerComparison | None:
@@ -100,9 +98,7 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
     if window.voltage is None or window.reference is None:
         return None
     parameters = controller.replace(sample_rate=window.sample_rate).law(tolerance)
-    stiff = abs(parameters.Kp) + abs(parameters.derivative_gain)
-    largest = max(float(np.max(np.abs(values))) for values in window.channels.values())
-    if max(1.0, stiff) * largest > _VAST:
+    if _largest(parameters, window.voltage, window.reference, window.position) > _VAST:
         return None
     made = None
     for delay in range(_DELAYS):
@@ -122,14 +118,13 @@ def _compared(
     if position.size - first < 2 * _BLOCKS:
         return None
     given = _voltage_from_best_start(parameters, voltage, reference, position)
-    left, swinging = _means(voltage - given, first), _means(voltage - voltage.mean(), first)
-    swing = _rms(swinging - swinging.mean())
-    stiff = abs(parameters.Kp) + abs(parameters.derivative_gain)
+    means = _means(voltage, first)
+    swing, unexplained = _rms(means - means.mean()), _rms(_means(voltage - given, first))
+    stiff = _stiffness(parameters)
     rounding = _rounding(voltage) + stiff * _rounding(position)
     tolerated = _TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
     if tolerated >= _LARGEST * swing:
         return None
-    unexplained = _rms(left)
     factors = {} if unexplained <= tolerated else _factors(parameters, voltage, reference, position, first, tolerated)
     return ControllerComparison(unexplained, swing, tolerated, factors)
 
@@ -176,16 +171,11 @@ def _factors(
     parameters: LawParameters, voltage: Array, reference: Array, position: Array, first: int, tolerated: float
 ) -> dict[str, float]:
     """Gains in stated ones with which the law without limits explains the voltage; empty: none do."""
-    terms = law_terms(parameters, law.start(float(position[0])), reference, position)
-    stated = {
-        "Kp": parameters.Kp * terms.proportional,
-        "Ki": parameters.integral_step * terms.integral,
-        "Kd": parameters.derivative_gain * terms.derivative,
-    }
-    stated = {name: term for name, term in stated.items() if np.any(term != 0.0)}
-    count = np.arange(voltage.size)
-    fades = (1.0 - np.array([[parameters.release_step], [parameters.filter_step]])) ** count
-    initial = (terms.acting, *fades)
+    terms = _law_terms(parameters, reference, position)
+    stated = {name: term for name, term in terms.gains.items() if np.any(term != 0.0)}
+    steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
+    # What the law's state before the window leaves in it.
+    initial = (terms.acting, *(1.0 - steps) ** np.arange(voltage.size))
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
     values = _least_squares(columns, measured)
@@ -218,17 +208,33 @@ def run_law(parameters: LawParameters, start: LawState, reference: Array, positi
     return voltage, acting
 
 
-def law_terms(parameters: LawParameters, start: LawState, reference: Array, position: Array) -> _Terms:
-    """Unit responses of the gains over a window, each (n,): the law is linear in them beside its dead zone."""
-    unlimited = parameters._replace(
-        voltage_limit=math.inf, rate_step=math.inf, feedforward=0.0, velocity_gain=0.0, integral_step=0.0,
-        tracking_step=0.0, Kp=0.0, derivative_gain=0.0,
+def _law_terms(parameters: LawParameters, reference: Array, position: Array) -> _Terms:
+    """Parts of the voltage without limits: the law is linear in its gains beside its dead zone."""
+    start = law.start(float(position[0]))._replace(reference=float(reference[0]))
+    stated = {
+        "Kp": {"Kp": parameters.Kp},
+        "Ki": {"integral_step": parameters.integral_step},
+        "Kd": {"derivative_gain": parameters.derivative_gain},
+        "velocity feedforward": {"velocity_gain": parameters.velocity_gain},
+    }
+    nothing = parameters._replace(
+        voltage_limit=math.inf, rate_step=math.inf, tracking_step=0.0, feedforward=0.0,
+        Kp=0.0, integral_step=0.0, derivative_gain=0.0, velocity_gain=0.0,
     )  # fmt: skip
-    _, acting = run_law(unlimited, start, reference, position)
-    proportional, _ = run_law(unlimited._replace(Kp=1.0), start, reference, position)
-    integral, _ = run_law(unlimited._replace(integral_step=1.0), start, reference, position)
-    derivative, _ = run_law(unlimited._replace(derivative_gain=1.0), start, reference, position)
-    return _Terms(acting, proportional, integral, derivative)
+    _, acting = run_law(nothing, start, reference, position)
+    runs = {name: run_law(nothing._replace(**gain), start, reference, position)[0] for name, gain in stated.items()}
+    return _Terms(acting, runs)
+
+
+def _stiffness(parameters: LawParameters) -> float:
+    """Voltage per metre at once, V/m."""
+    return abs(parameters.Kp) + abs(parameters.derivative_gain)
+
+
+def _largest(parameters: LawParameters, voltage: Array, reference: Array, position: Array) -> float:
+    """Largest size of a voltage recorded or computed at once, V."""
+    moved = max(float(np.max(np.abs(position))), float(np.max(np.abs(reference))))
+    return max(float(np.max(np.abs(voltage))), _stiffness(parameters) * moved)
 
 
 def _least_squares(columns: Array, target: Array) -> Array:

@@ -15,11 +15,11 @@ from servotwin.hybrid.tables import VECTOR
 
 @inlined
 def clean_part(
-    t: LiftedTables, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array, slack: Array,
+    t: LiftedTables, slot: int, watches: int, intervals: int, limit: int, low: Array, high: Array, slack: Array,
     less: float, squares: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
-    """Number of intervals, at most `wanted`, before the first in which some watch may leave its bounds."""
-    clean = wanted
+    """Number of intervals, at most `limit`, before the first in which some watch may leave its bounds."""
+    clean = limit
     for watch in range(watches):
         size = dot_sizes(t.sizes, (slot * t.watches + watch) * t.states, z)
         room = (slack[watch] - less) * (SIGNIFICANT * size) - math.sqrt(max(squares[watch], 0.0))
@@ -66,10 +66,10 @@ def settled_squares(
 
 @inlined
 def clean_ticks(
-    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, wanted: int, low: Array, high: Array,
+    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, limit: int, low: Array, high: Array,
     slack: Array, settles: bool, squares: Array, change: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
-    """Number of intervals of a block, at most `wanted`, before the first in which some watch may leave its bounds.
+    """Number of intervals of a block, at most `limit`, before the first in which some watch may leave its bounds.
 
     With `settles` the squares of the deviations are taken a second time where they are too large, from the state's way
     to where it rests or moves evenly: near rest those of the state are rounding, whose root is far above that of a
@@ -90,8 +90,8 @@ def clean_ticks(
                 break
             # What rests deviates by rounding only.
             less = 1.0
-        clean = clean_part(t, slot, watches, intervals, wanted, low, high, slack, less, squares, z, out)
-        if clean == wanted or not settles:
+        clean = clean_part(t, slot, watches, intervals, limit, low, high, slack, less, squares, z, out)
+        if clean == limit or not settles:
             break
     return clean
 

@@ -183,16 +183,16 @@ def vast_blocks(
 ) -> bool:
     """Advance by intervals of 128 ticks, one start recorded for all; return True where a whole block was clean."""
     lifted = memory.lifted
-    wanted = min(COARSE, (end - place.at[0]) // BLOCK)
+    limit = min(COARSE, (end - place.at[0]) // BLOCK)
     clean = clean_ticks(
-        lifted, lifted.vast, slot, watches, COARSE, wanted, memory.low, memory.high, memory.slack, True,
+        lifted, lifted.vast, slot, watches, COARSE, limit, memory.low, memory.high, memory.slack, True,
         memory.squares, memory.change, z, memory.out,
     )  # fmt: skip
     if clean > 0:
         note(segments, place.at[0], VAST - slot, z)
         jump(lifted.states, lifted.jump_vast, slot, COARSE, clean, z, memory.change)
         place.at[0], place.at[5] = place.at[0] + clean * BLOCK, place.at[5] + clean * BLOCK
-    return clean == wanted
+    return clean == limit
 
 
 @subroutine
@@ -214,26 +214,26 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
             # What is near its bound now is so for a while.
             again, k = place.at[0] + 4 * BLOCK, place.at[0]
         if place.at[5] >= FINE and end - k >= FINE:
-            wanted = min(COARSE, (end - k) // FINE)
+            limit = min(COARSE, (end - k) // FINE)
             clean = clean_ticks(
-                lifted, lifted.coarse, slot, watches, COARSE, wanted, low, high, slack, settles, squares, change, z, out
+                lifted, lifted.coarse, slot, watches, COARSE, limit, low, high, slack, settles, squares, change, z, out
             )
             if clean > 0:
                 note(segments, k, slot, z)
                 jump(n, lifted.jump_coarse, slot, COARSE, clean, z, change)
                 k += clean * FINE
                 place.at[0], place.at[5] = k, place.at[5] + clean * FINE
-            if clean == wanted:
+            if clean == limit:
                 continue
-        wanted = min(FINE, end - k)
+        limit = min(FINE, end - k)
         clean = clean_ticks(
-            lifted, lifted.fine, slot, watches, FINE, wanted, low, high, slack, settles, squares, change, z, out
+            lifted, lifted.fine, slot, watches, FINE, limit, low, high, slack, settles, squares, change, z, out
         )
         if clean > 0:
             note(segments, k, slot, z)
             jump(n, lifted.jump_fine, slot, FINE, clean, z, change)
             place.at[0], place.at[5] = k + clean, place.at[5] + clean
-        if clean < wanted:
+        if clean < limit:
             break
     return place.at[0] - begin
 

@@ -74,8 +74,8 @@ class LiftedMemory(NamedTuple):
 class Place(NamedTuple):
     """Progress of a run.
 
-    ``at = [tick, mode, active, kind, side of the error, ticks since a switch, vast scale wanted]``; `sign` of the limit
-    that acts.
+    ``at = [tick, mode, active, kind, side of the error, ticks since a switch, need of the vast scale]``; `sign` of the
+    limit that acts.
     """
 
     at: NDArray[np.int64]
@@ -90,12 +90,12 @@ def _clear(row: Array) -> None:
 
 @subroutine
 def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory: LiftedMemory) -> None:
-    """Fill the tick's map; the rows of the error and of the voltage wanted remain in `change` and `sizes`."""
+    """Fill the tick's map; the rows of the error and of the voltage demanded remain in `change` and `sizes`."""
     p, n, m = loop.parameters, places.states, memory.tick_map
     acting = active or p.acting_inside > 0.5
-    error, wanted = memory.change, memory.sizes
+    error, demand = memory.change, memory.sizes
     _clear(error)
-    _clear(wanted)
+    _clear(demand)
     _clear(m)
     error[places.reference] = 1.0
     error[places.position] -= p.loop_step
@@ -105,16 +105,16 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
         m[places.filtered * n + places.filtered] = -p.loop_step
     if acting:
         for i in range(n):
-            wanted[i] = (p.Kp + p.derivative_gain) * error[i]
-        wanted[places.integral] += 1.0
-        wanted[places.derivative] -= p.derivative_gain
+            demand[i] = (p.Kp + p.derivative_gain) * error[i]
+        demand[places.integral] += 1.0
+        demand[places.derivative] -= p.derivative_gain
     if places.feedforward >= 0:
-        wanted[places.feedforward] += 1.0
+        demand[places.feedforward] += 1.0
     if places.ahead >= 0:
         past, ahead = places.past, places.ahead
-        wanted[places.reference] += p.velocity_gain
-        wanted[past] -= p.velocity_gain
-        wanted[ahead] += p.velocity_gain * (1.0 - p.velocity_step)
+        demand[places.reference] += p.velocity_gain
+        demand[past] -= p.velocity_gain
+        demand[ahead] += p.velocity_gain * (1.0 - p.velocity_step)
         m[ahead * n + places.reference] += 1.0
         m[ahead * n + past] -= 1.0
         m[ahead * n + ahead] -= p.velocity_step
@@ -123,7 +123,7 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
     last = places.waiting + places.delay - 1 if places.delay > 0 else places.voltage
     # The law's own voltage, in place of the last one.
     for i in range(n):
-        m[last * n + i] = wanted[i] if kind == LINEAR else 0.0
+        m[last * n + i] = demand[i] if kind == LINEAR else 0.0
     if kind == LINEAR:
         m[last * n + last] -= 1.0
     elif kind == RATE_LIMITED:
@@ -131,7 +131,7 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
     if active:
         for i in range(n):
             new = m[last * n + i] + (1.0 if i == last else 0.0)
-            m[places.integral * n + i] += p.integral_step * error[i] + p.tracking_step * (new - wanted[i])
+            m[places.integral * n + i] += p.integral_step * error[i] + p.tracking_step * (new - demand[i])
     if acting:
         for i in range(n):
             m[places.derivative * n + i] += p.filter_step * error[i]
@@ -147,7 +147,7 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
 @subroutine
 def _law_watches(loop: LiftedLoop, places: Places, memory: LiftedMemory, first: int) -> int:
     """Fill the rows of the law's watches from watch `first` on; return the number of watches."""
-    p, n, error, wanted = loop.parameters, places.states, memory.change, memory.sizes
+    p, n, error, demand = loop.parameters, places.states, memory.change, memory.sizes
     last = places.waiting + places.delay - 1 if places.delay > 0 else places.voltage
     count = first
     values = memory.workspace.values
@@ -157,11 +157,11 @@ def _law_watches(loop: LiftedLoop, places: Places, memory: LiftedMemory, first: 
         count += 1
     if p.voltage_limit < np.inf:
         for i in range(n):
-            values[count * n + i] = wanted[i]
+            values[count * n + i] = demand[i]
         count += 1
     if places.rate >= 0:
         for i in range(n):
-            values[count * n + i] = wanted[i]
+            values[count * n + i] = demand[i]
         values[count * n + last] -= 1.0
         count += 1
         for i in range(n):
@@ -312,7 +312,7 @@ def slot_of(mode: int, active: bool, kind: int) -> int:
 
 @bare
 def fill_here(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory: LiftedMemory) -> None:
-    """Fill the slot of the plant's mode and the law's branch where a run is; the vast scale where it is wanted."""
+    """Fill the slot of the plant's mode and the law's branch where a run is; the vast scale where it is needed."""
     mode, active, kind = place.at[1], place.at[2] == 1, place.at[3]
     n, w, slot = places.states, memory.workspace, slot_of(mode, active, kind)
     guards, new = t.guard_count[mode], memory.filled[slot] == 0

@@ -72,6 +72,18 @@ def test_gains_that_were_changed_are_said_in_stated_ones(factors):
     assert f"it fits Kp {factors[0]:.2g}, Ki {factors[1]:.2g}" in made.sentence
 
 
+def test_an_edge_that_ignores_the_velocity_feedforward_is_said_so():
+    """An older one does; its gains are the stated ones."""
+    stated = LAW.replace(velocity_feedforward=400.0)
+    made = compare_controller(by_hand(LAW, 0.0), stated, 0.0)
+    assert not made.agrees
+    assert [made.factors[name] for name in ("Kp", "Ki", "Kd")] == pytest.approx([1.0] * 3, abs=0.02)
+    assert made.factors["velocity feedforward"] == pytest.approx(0.0, abs=0.02)
+    halved = by_hand(stated.replace(velocity_feedforward=200.0, Kp=0.6 * LAW.Kp), 0.0)
+    factors = compare_controller(halved, stated, 0.0).factors
+    assert [factors[name] for name in ("Kp", "velocity feedforward")] == pytest.approx([0.6, 0.5], abs=0.02)
+
+
 @pytest.mark.parametrize("stated", [0.0, 3.0 * ZONE])
 def test_another_dead_zone_is_recognised_and_no_gains_are_named_for_it(stated):
     made = compare_controller(loop(LAW), LAW, stated)

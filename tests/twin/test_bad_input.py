@@ -138,7 +138,9 @@ def test_a_nameplate_wrong_by_a_factor_of_two_is_said_and_gives_no_wrong_gap(cha
 def test_a_torque_gain_wrong_by_a_factor_of_two_does_not_move_the_gap(factor):
     seen = Seen(windows_of(MODEL.replace(k_T=factor * MODEL.k_T), 10.0, 3))
     assert seen.gaps() == pytest.approx([10.0] * 3, abs=0.1)
-    assert sum("the motor is not what is stated: its lag J R / k_T" in said for said in seen.alarms) == 1
+    [alarm] = [said for said in seen.alarms if "the motor is not what is stated: its lag J R / k_T" in said]
+    # A weaker motor looks like one whose voltage comes late.
+    assert ("samples late" in alarm) == (factor < 1.0)
 
 
 @pytest.mark.slow

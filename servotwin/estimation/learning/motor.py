@@ -194,9 +194,9 @@ class MotorLearning:
         short = np.diag(np.maximum(0.0, floor**2 - np.diag(made[1])))
         fresh = LearntMotor(tuple(made[0].tolist()), tuple((made[1] + short).ravel().tolist()), now)
         if before is None:
-            return replace(fresh, alarm=self._outside(None, fresh))
+            return replace(fresh, alarm=self._outside(None, fresh, window))
         if not _surprising(mean, covariance, *made):
-            return replace(fresh, windows=before.windows + 1, alarm=self._outside(before, fresh))
+            return replace(fresh, windows=before.windows + 1, alarm=self._outside(before, fresh, window))
         return self._contradicted(before, fresh, window, now)
 
     def current(self, motor: LearntMotor | None, now: float) -> LearntMotor | None:
@@ -215,16 +215,24 @@ class MotorLearning:
         anew = self.updated(None, window, now)
         return anew and replace(anew, alarm=f"{alarm}; it is learnt anew after {count} such windows")
 
-    def _outside(self, before: LearntMotor | None, after: LearntMotor) -> str:
+    def _outside(self, before: LearntMotor | None, after: LearntMotor, window: Window) -> str:
         """Sentence on a number that has turned out to be outside of what is stated of it; empty without one."""
         for name, index, std in (("back EMF k_B", BACK_EMF, self.back_emf), ("lag J R / k_T", LAG, self.lag)):
-            stated = math.sqrt(3.0) * std
-            if after.surely(index) > stated and (before is None or before.surely(index) <= stated):
+            stated, off = math.sqrt(3.0) * std, after.surely(index)
+            if off > stated and (before is None or before.surely(index) <= stated):
                 return (
-                    f"the motor is not what is stated: its {name} is at least {100.0 * after.surely(index):.3g} % off "
-                    f"the model's, and {100.0 * stated:.3g} % are stated; check the nameplate, and the motor's load"
+                    f"the motor is not what is stated: its {name} is at least {100.0 * off:.3g} % off the model's, and "
+                    f"{100.0 * stated:.3g} % are stated{self._as_delay(after, window) if index == LAG else ''}; "
+                    "check the nameplate, and the motor's load"
                 )
         return ""
+
+    def _as_delay(self, motor: LearntMotor, window: Window) -> str:
+        """The delay of the voltage that looks like a lag that is larger than the model's; empty: it is smaller."""
+        if motor.mean[LAG] <= 0.0:
+            return ""
+        samples = motor.mean[LAG] / (math.sqrt(12.0) * _delay_as_lag(self.servo, window.sample_rate))
+        return f", or the voltage reaches the motor about {samples:.2g} samples late"
 
     def _nameplate(self, rows: MotorRows, delay: float) -> tuple[Array, Array]:
         wide = _WIDE * float(np.sqrt(np.mean(rows.voltage**2)))

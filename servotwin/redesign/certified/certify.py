@@ -129,15 +129,15 @@ def _shortlist(
     """The first candidates, then as many of each kind that settles most surely: those whose integral stops the furthest
     from the reference, and those without integral action and dead zone."""
     kinds = (widest, is_plain)
-    found = [0, 0]
+    yielded = [0, 0]
     for place, setting in enumerate(ranked):
         kind = next((k for k, of_kind in enumerate(kinds) if of_kind(setting)), None)
-        if place < attempts or (kind is not None and found[kind] < attempts):
+        if place < attempts or (kind is not None and yielded[kind] < attempts):
             yield setting
         if kind is not None:
-            found[kind] += 1
+            yielded[kind] += 1
         if place + 1 >= attempts:
-            left = [of_kind for of_kind, count in zip(kinds, found, strict=True) if count < attempts]
+            left = [of_kind for of_kind, count in zip(kinds, yielded, strict=True) if count < attempts]
             if not left:
                 return
             screening.only = _any_of(left)
