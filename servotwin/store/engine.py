@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,8 @@ SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
 _BUSY_S = 10.0
 """s that a connection waits for another one's transaction."""
+_PAUSE_S = 0.005
+"""s between two attempts where SQLite itself does not wait."""
 _PAGE_BYTES = 8192
 _LOG_PAGES = 2000
 """Pages of the write-ahead log after which they are copied into the database: 16 MB."""
@@ -163,13 +166,26 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
         # The driver would begin transactions itself, and late; `begin_transaction` does it.
         connection.isolation_level = None
         for pragma in _pragmas(reading):
-            connection.execute(f"PRAGMA {pragma}")
+            _set_pragma(connection, pragma)
 
     @event.listens_for(engine, "begin")
     def begin_transaction(connection: sa.Connection) -> None:
         connection.exec_driver_sql(begin)
 
     return engine
+
+
+def _set_pragma(connection: Any, pragma: str) -> None:
+    """Set a pragma; wait where others open the file too: SQLite does not wait where two would switch to a log."""
+    patience = time.monotonic() + _BUSY_S
+    while True:
+        try:
+            connection.execute(f"PRAGMA {pragma}")
+            return
+        except sqlite3.OperationalError as error:
+            if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY or time.monotonic() > patience:
+                raise
+        time.sleep(_PAUSE_S)
 
 
 def _pragmas(reading: bool) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 import os
 import random
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -18,7 +19,7 @@ from store_cases import MORE, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations
-from servotwin.store.engine import StoreUnavailable, engines_of, parse_address, public_address, transaction
+from servotwin.store.engine import StoreUnavailable, _set_pragma, engines_of, parse_address, public_address, transaction
 from servotwin.store.records import MessageKind, PutResult
 from servotwin.store.results import _locked_serials
 from servotwin.store.schema import REVISION, metadata, twins
@@ -134,6 +135,21 @@ def test_processes_that_open_a_new_database_at_once_make_it_once(new_address: Ne
     assert len(opened) == 4
     for store in opened:
         store.close()
+
+
+def test_the_switch_to_a_log_waits_for_another_process(tmp_path: Path) -> None:
+    other, own = (
+        sqlite3.connect(tmp_path / "store.db", check_same_thread=False, isolation_level=None) for _ in range(2)
+    )
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(sqlite3.OperationalError, match="locked"):
+        own.execute("PRAGMA journal_mode = WAL")  # at once, whatever the connection's patience
+    timer = threading.Timer(0.1, other.close)
+    timer.start()
+    _set_pragma(own, "journal_mode = WAL")
+    timer.join()
+    assert own.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+    own.close()
 
 
 # Addresses
