@@ -40,7 +40,7 @@ def numbers_of(automaton: Automaton, guards: int) -> Numbers:
 def build_tables(automaton: Automaton, step: float) -> Tables:
     """All tables of `automaton` for one search step in seconds."""
     tables = empty_tables(automaton)
-    fill_tables(tables, numbers_of(automaton, tables.guards), step, True, new_workspace(tables))
+    fill_tables(tables, numbers_of(automaton, tables.guards), step, NODES_FINE, new_workspace(tables))
     return tables
 
 
@@ -127,18 +127,18 @@ def _fill_guard(
 
 
 @subroutine
-def _fill_jumps(t: Tables, jumps: Array, nodes: int, flow: int, p: Powers) -> None:
-    """Jumps of one scale: the present power becomes its base, and its powers follow."""
+def _fill_jumps(t: Tables, jumps: Array, nodes: int, count: int, flow: int, p: Powers) -> None:
+    """The first jumps of one scale: the present power becomes its base, and its powers follow."""
     n = t.states
     rebase(n, p)
-    for j in range(nodes):
+    for j in range(count):
         if j > 0:
             next_power(n, p)
         _store(p, n, jumps, (flow * nodes + j) * n * n)
 
 
 @subroutine
-def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
+def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, w: Workspace) -> None:
     """Everything that advances by the flow of a mode."""
     n, flow, p = t.states, t.flow_of[mode], w.powers
     _fill_orders(t, numbers, flow, mode, step, w)
@@ -149,17 +149,18 @@ def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool
     for j in range(1, PARTS):
         _store(p, n, t.jump_part, base + j * n * n)
         next_power(n, p)
-    # Literals would have the function compiled once for each.
-    _fill_jumps(t, t.jump_fine, int(NODES_FINE), flow, p)
-    if blocks:
-        _fill_jumps(t, t.jump_coarse, int(NODES_COARSE), flow, p)
+    _fill_jumps(t, t.jump_fine, int(NODES_FINE), min(reach, NODES_FINE), flow, p)
+    if reach >= NODES_FINE:
+        _fill_jumps(t, t.jump_coarse, int(NODES_COARSE), int(NODES_COARSE), flow, p)
 
 
 @subroutine
-def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, mode: int, spacing: float, w: Workspace) -> None:
-    """The guards of a mode at the nodes of one scale."""
+def _fill_nodes(
+    t: Tables, table: Array, jumps: Array, nodes: int, count: int, mode: int, spacing: float, w: Workspace
+) -> None:
+    """The guards of a mode at the first nodes of one scale."""
     n, p = t.states, w.powers
-    for j in range(nodes):
+    for j in range(count):
         base = (t.flow_of[mode] * nodes + j) * n * n
         for i in range(n):
             for k in range(n):
@@ -195,27 +196,29 @@ def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w:
 
 
 @bare
-def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
+def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, w: Workspace) -> None:
     """Tables of one mode, and of its flow where no mode before it had the same."""
     if w.filled[t.flow_of[mode]] == 0:
-        _fill_flow(t, numbers, mode, step, blocks, w)
+        _fill_flow(t, numbers, mode, step, reach, w)
         w.filled[t.flow_of[mode]] = 1
     _fill_guards(t, numbers, mode, w)
-    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), mode, step, w)
+    blocks = reach >= NODES_FINE
+    # Literals would have the functions compiled once for each.
+    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), NODES_FINE if blocks else int(1), mode, step, w)
     if blocks:
-        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), mode, step * NODES_FINE, w)
+        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), int(NODES_COARSE), mode, step * NODES_FINE, w)
     for g in range(t.guard_count[mode]):
         _fill_series(t, numbers, mode, g, step, w)
     _fill_single(t, mode)
 
 
-def fill_tables(t: Tables, numbers: Numbers, step: float, blocks: bool, w: Workspace) -> None:
-    """Tables of the automaton with these numbers; `t` has its structure. Without `blocks` the coarse scale is left out,
-    for loops that only take steps."""
+def fill_tables(t: Tables, numbers: Numbers, step: float, reach: int, w: Workspace) -> None:
+    """Tables of the automaton with these numbers; `t` has its structure. For loops that never advance by a fine block at
+    once, `reach` is the steps that they do, and what only blocks need is left out."""
     w.filled[:] = 0
     # Not compiled: all that a compiled function calls is compiled once more with it.
     for mode in range(len(t.guard_count)):
-        _fill_mode(t, numbers, mode, step, blocks, w)
+        _fill_mode(t, numbers, mode, step, reach, w)
 
 
 @subroutine
@@ -233,5 +236,5 @@ def fill_entered(t: Tables, mode: int, pending: Pending) -> None:
     """Tables of a mode that is entered for the first time."""
     a = pending.automaton[0]
     numbers = Numbers(pending.flows[a], pending.rows[a], pending.resets[min(a, len(pending.resets) - 1)])
-    _fill_mode(t, numbers, mode, pending.step[a], pending.blocks[a], pending.workspace)
+    _fill_mode(t, numbers, mode, pending.step[a], pending.reach[a], pending.workspace)
     pending.filled[mode] = 1

@@ -228,7 +228,7 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         resets=family.resets,
         step=family.step,
         # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
-        blocks=family.searches >= NODES_FINE,
+        reach=family.searches,
     )
     return SampledWorker(
         tables,
