@@ -7,7 +7,7 @@ import numpy as np
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import bare, subroutine
 from servotwin.hybrid.exponential import next_power, rebase, start_powers
-from servotwin.hybrid.flow import product
+from servotwin.hybrid.flow import listed_product, product
 from servotwin.hybrid.tables import (
     NODES_COARSE,
     NODES_FINE,
@@ -82,15 +82,21 @@ def _fill_single(t: Tables, mode: int) -> None:
 @subroutine
 def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
     """The terms ``(A s)**k / k!`` of a part's flow, k = 1 .. PART_TERMS, transposed side by side."""
-    n, stride = t.states, t.states * PART_TERMS
+    n, stride, p = t.states, t.states * PART_TERMS, w.powers
     base, source = flow * n * stride, mode * n * n
-    for i in range(n):
+    moving = p.moving[: p.movers[0]]
+    part = w.row[: moving.size]
+    for at in range(base, base + n * stride):
+        t.flow_part[at] = 0.0
+    for i in moving:
         for j in range(n):
             w.powers.term[j] = numbers.flows[source + i * n + j] * (step / PARTS)
         for k in range(PART_TERMS):
             for j in range(n):
                 t.flow_part[base + j * stride + k * n + i] = w.powers.term[j]
-            product(numbers.flows, source, n, n, w.powers.term[:n], w.next_row)
+            for j in range(moving.size):
+                part[j] = w.powers.term[moving[j]]
+            listed_product(numbers.flows, source, n, n, moving, part, w.next_row)
             for j in range(n):
                 w.powers.term[j] = w.next_row[j] * (step / PARTS) / (k + 2)
 
@@ -141,8 +147,8 @@ def _fill_jumps(t: Tables, jumps: Array, nodes: int, count: int, flow: int, p: P
 def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, w: Workspace) -> None:
     """Everything that advances by the flow of a mode."""
     n, flow, p = t.states, t.flow_of[mode], w.powers
-    _fill_orders(t, numbers, flow, mode, step, w)
     start_powers(numbers.flows, mode * n * n, n, step / PARTS, p)
+    _fill_orders(t, numbers, flow, mode, step, w)
     base = flow * PARTS * n * n
     for i in range(n * n):
         t.jump_part[base + i] = 0.0
@@ -204,7 +210,7 @@ def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, 
     _fill_guards(t, numbers, mode, w)
     blocks = reach >= NODES_FINE
     # Literals would have the functions compiled once for each.
-    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), NODES_FINE if blocks else int(1), mode, step, w)
+    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), NODES_FINE if blocks else 1, mode, step, w)
     if blocks:
         _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), int(NODES_COARSE), mode, step * NODES_FINE, w)
     for g in range(t.guard_count[mode]):
@@ -213,8 +219,8 @@ def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, 
 
 
 def fill_tables(t: Tables, numbers: Numbers, step: float, reach: int, w: Workspace) -> None:
-    """Tables of the automaton with these numbers; `t` has its structure. For loops that never advance by a fine block at
-    once, `reach` is the steps that they do, and what only blocks need is left out."""
+    """Tables of the automaton with these numbers; `t` has its structure. `reach` are the steps that a loop takes at
+    once: what only blocks need is left out where it is fewer than a fine block has."""
     w.filled[:] = 0
     # Not compiled: all that a compiled function calls is compiled once more with it.
     for mode in range(len(t.guard_count)):

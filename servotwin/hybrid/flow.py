@@ -84,8 +84,9 @@ def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out:
     count, n, step = np.uint64(rows), np.uint64(x.size), np.uint64(stride)
     at: Any = np.uint64(base)
     eights = n // np.uint64(8)
-    for r in range(count):
-        out[r] = 0.0
+    if eights == 0:
+        for r in range(count):
+            out[r] = 0.0
     for block in range(eights):
         j = block * np.uint64(8)
         x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
@@ -97,10 +98,17 @@ def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out:
         f = e + step
         g = f + step
         h = g + step
-        for r in range(count):
-            out[r] += ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
-                (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
-            )
+        # The first ones are stored: to clear and to add would be one more way through memory.
+        if block == 0:
+            for r in range(count):
+                out[r] = ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
+        else:
+            for r in range(count):
+                out[r] += ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
         at = h + step
     begin: Any = eights * np.uint64(8)
     if n - begin >= np.uint64(4):
@@ -126,8 +134,9 @@ def listed_product(
     """The same for columns that are listed: ``out[r] = sum of table[base + which[j] * stride + r] * x[j]``."""
     count, n, step, first = np.uint64(rows), np.uint64(x.size), np.uint64(stride), np.uint64(base)
     eights = n // np.uint64(8)
-    for r in range(count):
-        out[r] = 0.0
+    if eights == 0:
+        for r in range(count):
+            out[r] = 0.0
     for block in range(eights):
         j = block * np.uint64(8)
         x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
@@ -140,10 +149,16 @@ def listed_product(
         f = first + np.uint64(which[j + np.uint64(5)]) * step
         g = first + np.uint64(which[j + np.uint64(6)]) * step
         h = first + np.uint64(which[j + np.uint64(7)]) * step
-        for r in range(count):
-            out[r] += ((table[a + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
-                (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
-            )
+        if block == 0:
+            for r in range(count):
+                out[r] = ((table[a + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
+        else:
+            for r in range(count):
+                out[r] += ((table[a + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
     begin: Any = eights * np.uint64(8)
     if n - begin >= np.uint64(4):
         x0, x1, x2, x3 = x[begin], x[begin + np.uint64(1)], x[begin + np.uint64(2)], x[begin + np.uint64(3)]

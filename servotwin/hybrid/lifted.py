@@ -55,6 +55,8 @@ class LiftedTables(NamedTuple):
 class LiftedWorkspace(NamedTuple):
     """Working memory to fill a slot; matrices are row-major, those of many watches side by side."""
 
+    moving: NDArray[np.int64]  # N: first the states that the map moves, whose rows of M - I are not zero
+    movers: NDArray[np.int64]  # 1: how many
     map: Array  # N * N: M - I
     values: Array  # W * N: rows of the watches at a tick
     starts: Array  # W * N: thirds of their slopes over a tick, at its beginning
@@ -71,8 +73,6 @@ class LiftedWorkspace(NamedTuple):
     product: Array  # N * N
     deviations: Array  # 3 * 16 * N: those from one cubic, at the control points of every interval
     column: Array  # 3 * 16
-    moving: NDArray[np.int64]  # N: first the states that the map moves, whose rows of M - I are not zero
-    movers: NDArray[np.int64]  # 1: how many
 
 
 def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
@@ -99,7 +99,7 @@ def new_lifted_workspace(states: int, watches: int) -> LiftedWorkspace:
     points = 3 * COARSE
     sizes = (n2, *rows, watches, watches * n2, COARSE * n2, (points + 3) * n, n, *(watches * n2,) * 3, n2)
     whole = np.zeros((2, max(n, 1)), dtype=np.int64)
-    return LiftedWorkspace(*(zeros(size) for size in (*sizes, points * n, points)), whole[0], whole[1, :1])
+    return LiftedWorkspace(whole[0], whole[1, :1], *(zeros(size) for size in (*sizes, points * n, points)))
 
 
 def row_count(states: int, watches: int, intervals: int) -> int:

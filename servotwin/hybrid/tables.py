@@ -112,7 +112,7 @@ class Pending(NamedTuple):
     rows: Array  # (A, M * G * n)
     resets: Array  # (A, M * G * n * n), or (1, ...): those of all
     step: Array  # (A,) of the search, s
-    reach: NDArray[np.int64]  # (A,) steps at once: blocks where it is as many as a fine block has, none where it is fewer
+    reach: NDArray[np.int64]  # (A,) steps that are taken at once: with fewer than a fine block has, no blocks
     workspace: Workspace
 
 
