@@ -254,20 +254,23 @@ def _fill_level(
     """Rows of one watch at one scale, and its deviation's matrix from `sums`; `length` of an interval in ticks."""
     n, stride, starts = t.states, level_stride(t, intervals), (COARSE + 1) * t.states
     at = slot * n * stride + watch * (3 * intervals + 1 + n)
-    for i in range(intervals + 1):
-        for j in range(n):
-            column, value = at + j * stride, w.rows[i * n + j]
+    for j in range(n):
+        column, largest = at + j * stride, 0.0
+        for i in range(intervals + 1):
+            value = w.rows[i * n + j]
             table[column + i] = value
-            size = (slot * t.watches + watch) * n + j
-            t.sizes[size] = max(t.sizes[size], _ROUNDING * abs(value))
-            if i < intervals:
-                table[column + intervals + 1 + i] = length * w.rows[starts + i * n + j]
-            if i > 0:
-                table[column + 2 * intervals + i] = length * w.rows[2 * starts + i * n + j]
-    square = at + 3 * intervals + 1
-    for i in range(n):
-        for j in range(n):
-            table[square + j * stride + i] = w.sums[(i * watches + watch) * n + j]
+            largest = max(largest, abs(value))
+        size = (slot * t.watches + watch) * n + j
+        t.sizes[size] = max(t.sizes[size], _ROUNDING * largest)
+        column += intervals + 1
+        for i in range(intervals):
+            table[column + i] = length * w.rows[starts + i * n + j]
+        column += intervals
+        for i in range(intervals):
+            table[column + i] = length * w.rows[2 * starts + (i + 1) * n + j]
+        column += intervals
+        for i in range(n):
+            table[column + i] = w.sums[(i * watches + watch) * n + j]
 
 
 @subroutine

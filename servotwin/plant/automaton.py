@@ -151,7 +151,7 @@ class LoopParts:
 
 
 def _with(guard: Guard, row: Array, reset: Array) -> Guard:
-    return replace(guard, row=row, reset=None if guard.reset is None else reset)
+    return Guard(row, guard.target, None if guard.reset is None else reset, guard.label, guard.side)
 
 
 def degree(pieces: PiecewiseCubic) -> int:
