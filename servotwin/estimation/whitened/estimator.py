@@ -30,6 +30,7 @@ from servotwin.estimation.whitened.gate import (
     one_sided,
     slow_share,
     static_lost_motion,
+    sure_of_contact,
     travel_needed,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
@@ -153,16 +154,13 @@ class WindowFit:
     def _one_contact(self, evidence: FitEvidence, contacts: ContactEvidence, reasons: tuple[str, ...]) -> GapEstimate:
         """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
         fitted = evidence.aligned.whitened
-        blank = replace(self.blank, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
-        unexplained = misfits(evidence, self.settings)
-        reasons = tuple(dict.fromkeys((*reasons, *unexplained)))
-        bound = 0.0 if unexplained else lower_bound(evidence, self.settings)
+        blank = replace(self.blank, reasons=reasons, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
+        bound = lower_bound(evidence, self.settings) if sure_of_contact(evidence, self.settings) else 0.0
         if bound >= evidence.smallest:  # the lead, which costs far more, can only lower it
-            ramp = fastest(fitted.reduction, self.second)
-            bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings, ramp))
+            bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings))
         if bound < evidence.smallest:
-            return replace(blank, status=GapStatus.UNIDENTIFIABLE, reasons=reasons)
-        return replace(blank, status=GapStatus.LOWER_BOUND, reasons=reasons, gap=bound, interval=(bound, math.inf))
+            return replace(blank, status=GapStatus.UNIDENTIFIABLE)
+        return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))
 
     def _doubt(self, evidence: FitEvidence) -> float:
         """Root mean square (rad) of what machines and sensors that are not as assumed can do to the gap."""

@@ -36,7 +36,7 @@ COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
 CYCLIC = 2e-3 * math.pi  # rad, usual size of an error once per turn: a thousandth of a turn
 _FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
 _EVALUATIONS = 12  # of a fit
-_GAIN = 1e-2  # of the residual's variance, promised by a step: a tenth of one standard deviation of anything
+_GAIN = 1e-3  # of the residual's variance, promised by a step: a thirtieth of one standard deviation of anything
 _SINGULAR = 1e-10  # of a column's length
 _ANY = (0.0, math.inf, math.inf)
 

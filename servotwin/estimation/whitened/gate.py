@@ -7,17 +7,17 @@ the static lost motion at rest, the gap in the paper's observer form, and the ga
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from servotwin.estimation.core.contacts import Travel
+from servotwin.estimation.core.least_squares import spread
 from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
 from servotwin.estimation.whitened.free_model import (
     COMPLIANCE,
-    CYCLIC,
     FREEDOM,
     ContactEvidence,
     FactorPrior,
@@ -25,6 +25,7 @@ from servotwin.estimation.whitened.free_model import (
     contact_evidence,
 )
 from servotwin.estimation.whitened.lead import possible_leads
+from servotwin.estimation.whitened.reduction import GAP
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift
 from servotwin.plant.servo import Servo
@@ -183,14 +184,22 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     disagreements = () if too_little else _disagreements(evidence, settings)
     mismatches = (*misfits(evidence, settings), *disagreements)
     silence = tuple(filter(None, (too_little, _spread(evidence, settings))))
-    # A fit that noise and model do not explain may have its delay or its growth from the way to the contact.
-    sure = not misfits(evidence, settings) and math.isinf(evidence.interval[1])
+    sure = math.isinf(evidence.interval[1]) and sure_of_contact(evidence, settings)
     bound = sure and lower_bound(evidence, settings) > evidence.smallest
     if evidence.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(evidence.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
     if silence:
-        return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), (*silence, *mismatches)
+        return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), silence
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
+
+
+def sure_of_contact(evidence: FitEvidence, settings: WhitenedSettings) -> bool:
+    """False where a delay that cannot be takes the place of the motor's way to the contact."""
+    aligned, rows = evidence.aligned, evidence.aligned.whitened.rows
+    if not settings.skew or abs(aligned.delay) <= settings.skew_limit:
+        return True
+    std = spread(rows[-1], rows[GAP:-1]) * math.sqrt(max(1.0, aligned.whitened.variance))
+    return abs(aligned.delay) <= settings.skew_limit + NORMAL_95 * std
 
 
 def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
@@ -210,14 +219,9 @@ def freed(aligned: AlignedFit, servo: Servo) -> FreeProblem:
     return FreeProblem(result.reduction, result.noise, servo, usual, aligned.largest, COMPLIANCE)
 
 
-def least_lead(
-    evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings, ramp: float
-) -> float:
-    """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error.
-
-    Sensors may err once per turn, and the gap may grow or shrink by about `ramp` (rad/s).
-    """
-    problem = replace(freed(evidence.aligned, servo), cyclic=CYCLIC, ramp=ramp)
+def least_lead(evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings) -> float:
+    """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error."""
+    problem = freed(evidence.aligned, servo)
     leads = possible_leads(problem, contacts.single, contacts.variance)
     sigmas = NORMAL_95 * (1.0 + _COLOURED * evidence.colour)
     return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.counts
