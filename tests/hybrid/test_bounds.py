@@ -46,7 +46,8 @@ test_hybrid_automaton.test_set_between_advances()
 import servotwin as st
 from servotwin.simulation.ensemble import simulate_ensemble
 servo = st.Servo.preset("table1")
-worn = st.PiecewiseCubic([0.0, 0.1001, 0.10013, 0.15], [[0.1, 0.2, 0, 0], [0.2, 0, 0, 0], [0.05, 0, 0, 0], [0, 0, 1, 1]])
+knots = [0.0, 0.1001, 0.10013, 0.15]
+worn = st.PiecewiseCubic(knots, [[0.1, 0.2, 0, 0], [0.2, 0, 0, 0], [0.05, 0, 0, 0], [0, 0, 1, 1]])
 wave, tolerance = st.SquareWave(1e-3, 0.125), servo.tolerance_for(math.radians(1.0))
 limited = servo.controller.replace(voltage_limit=0.5, loop_filter_hz=20.0)
 sampled = [limited.replace(sample_rate=1000.0), servo.controller.replace(sample_rate=5000.0)]
