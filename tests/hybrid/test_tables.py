@@ -122,3 +122,16 @@ def test_filled_mode_by_mode_in_any_order_they_are_the_same(shape: Shape) -> Non
 
 def same(one: Tables, other: Tables) -> bool:
     return all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+@pytest.mark.parametrize("reach", [1, 3])
+def test_tables_for_few_steps_hold_what_these_steps_need(reach: int) -> None:
+    automaton, step = loop(Shape())
+    whole, few = build_tables(automaton, step), empty_tables(automaton)
+    fill_tables(few, numbers_of(automaton, few.guards), step, reach, new_workspace(few))
+    for name in ("reset", "taylor", "jump_part", "flow_part", "single", "rows", "sizes", "changes"):
+        assert np.array_equal(getattr(few, name), getattr(whole, name)), name
+    n = len(automaton.names)
+    jumps, expected = (each.jump_fine.reshape(-1, NODES_FINE, n, n) for each in (few, whole))
+    assert np.array_equal(jumps[:, :reach], expected[:, :reach])
+    assert not few.coarse.any()
