@@ -137,11 +137,11 @@ def test_a_gap_that_grows_within_the_window():
 
 @pytest.mark.slow
 def test_stated_spread_is_that_of_many_fits():
-    """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.2."""
+    """The same window in 16 white noises; the stated spread carries the settings' inflation of 1.2."""
     run = run_of("paper", 10.0, False, False)
     servo, rng, errors, stated = scaled(run.servo, **WRONG), np.random.default_rng(8), [], []
     clean = Window.from_run(run, 5.0, 1.0)
-    for _ in range(24):
+    for _ in range(16):
         window = clean.replace(position=clean.position + FLOOR * rng.standard_normal(clean.position.size))
         found = estimate_jointly(window, servo, prior=math.radians(9.0))
         errors.append(found.gap.gap - math.radians(10.0))
