@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from exploration import extent
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -151,10 +152,11 @@ def test_stated_spread_is_that_of_many_fits():
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_random_windows_are_right_or_refused():
     """Quiet, one contact, straddling a step, calm loops; wrong structures, and k_B wrong without the angle."""
     rng, accepted, travelled = np.random.default_rng(21), 0, 0
-    for index in range(5):
+    for index in range(extent(4, 5)):
         servo, gap = Servo.preset(("paper", "table1")[index % 2]), math.radians(rng.uniform(0.0, 25.0))
         controller = servo.controller.replace(Ki=servo.controller.Ki * rng.choice([0.0, 1.0, 1.0]))
         tolerance = rng.choice([None, servo.tolerance_for(gap)])
