@@ -63,6 +63,7 @@ def test_equal_flows_are_kept_once() -> None:
     assert [len(set(flows)) for flows in kept] == [4, 2, 6]
 
 
+@pytest.mark.slow
 def test_series_of_a_guard() -> None:
     """Its values along the flow by the polynomial, and sizes and changes that bound it."""
     automaton, step = loop(Shape())
