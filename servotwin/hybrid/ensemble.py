@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
 from servotwin.hybrid.output import empty_outputs, new_output_workspace
 from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables, nothing_pending
+from servotwin.hybrid.threads import on_threads
 from servotwin.hybrid.trajectory import ZenoError
 
 _PARTS_PER_WORKER = 8
@@ -194,12 +194,8 @@ def _run(
     parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
     tail = 1 if options is None else options.last
 
-    def work(_: int) -> list[int]:
-        return _run_parts(family, structure, starts, results, parts, tail)
-
-    with ThreadPoolExecutor(workers) as pool:
-        zeno = [member for part in pool.map(work, range(workers)) for member in part]
-    if zeno:
+    stuck = on_threads(lambda: _run_parts(family, structure, starts, results, parts, tail), workers)
+    if zeno := [member for each in stuck for member in each]:
         raise ZenoError(f"member {min(zeno)} changes mode without end: the automaton is Zeno or slides")
 
 

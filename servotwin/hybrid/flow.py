@@ -276,7 +276,10 @@ def advance_clean(
     values = guards * (nodes + 1)
     stride = (2 * t.guards * (nodes + 1) + VECTOR - 1) // VECTOR * VECTOR
     used = (2 * values + VECTOR - 1) // VECTOR * VECTOR
-    tall_product(table, mode * t.states * stride, stride, used, x, out)
+    if t.states == 16:
+        wide_product(table, mode * t.states * stride, stride, used, x, out)
+    else:
+        tall_product(table, mode * t.states * stride, stride, used, x, out)
     positive = 0
     for r in range(np.uint64(values)):
         positive += out[r] + abs(out[np.uint64(values) + r]) > 0.0

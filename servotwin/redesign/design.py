@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -46,10 +47,15 @@ class Design:
         The loop is left out: it does not answer at frequencies far above its crossover. Gains as in Eq 14, behind the
         loop filter.
         """
-        law = self.controller
-        hertz = np.geomspace(*band, _GRID)
-        s = 2j * math.pi * hertz
-        gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
-        if law.loop_filter_hz is not None:
-            gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
-        return noise * float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))
+        return noise * _noise_gain(self.controller, band)
+
+
+@lru_cache(maxsize=1024)
+def _noise_gain(law: Controller, band: tuple[float, float]) -> float:
+    """Root mean square of a law's gain (V/m) within a band (Hz)."""
+    hertz = np.geomspace(*band, _GRID)
+    s = 2j * math.pi * hertz
+    gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
+    if law.loop_filter_hz is not None:
+        gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
+    return float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))

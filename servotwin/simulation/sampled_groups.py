@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +16,7 @@ from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
 from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
+from servotwin.hybrid.threads import on_threads
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.servo import Servo
@@ -181,8 +181,7 @@ def run_group(
     workers = max(1, min(threads or os.cpu_count() or 1, count))
     size = max(1, count // (_PARTS_PER_WORKER * workers))
     parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
-    with ThreadPoolExecutor(workers) as pool:
-        stuck = list(pool.map(lambda _: _run_parts(group, starts, span, results, parts), range(workers)))
+    stuck = on_threads(lambda: _run_parts(group, starts, span, results, parts), workers)
     if zeno := [int(group.which[place]) for each in stuck for place in each]:
         raise ZenoError(f"member {min(zeno)} changes mode without end: the automaton is Zeno or slides")
 
