@@ -99,6 +99,10 @@ class Limits:
     feedforward: Annotated[
         float, key("feedforward_v", minimum=0.0, infinite=True, help="Largest feedforward, either sign.")
     ] = 0.25
+    notch_min_hz: Annotated[float, key(minimum=0.0, help="Least centre of a notch.")] = 0.0
+    notch_max_hz: Annotated[
+        float, key(minimum=0.0, infinite=True, help="Largest centre of a notch; 0: updates set none.")
+    ] = 0.0
     patience_s: Annotated[
         float,
         key(
@@ -126,7 +130,9 @@ class Limits:
         scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
         kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
         fed = abs(gains.feedforward) <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
-        return scaled and gains.leave <= self.gain_factor * own.leave and fed
+        # A notch adds phase lag below its centre.
+        notch = gains.notch_hz == 0.0 or self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
+        return scaled and gains.leave <= self.gain_factor * own.leave and fed and notch
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
         """True where gains may change from old to new, `since` seconds after the last change."""

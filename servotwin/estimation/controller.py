@@ -160,6 +160,10 @@ def _corrected(
         columns["derivative"] = -parameters.derivative_gain * acting * (1.0 - parameters.filter_step) ** count
     if parameters.velocity_gain != 0.0:
         columns["ahead"] = parameters.velocity_gain * (1.0 - parameters.velocity_step) ** (count + 1)
+    if parameters.notch_gain != 0.0:
+        for name in columns.keys() & {"integral", "derivative"}:
+            columns[name] = behind_notch(parameters, np.asarray(columns[name], dtype=float), 0.0, 0.0)
+        columns |= _notch_columns(parameters, left.size)
     matrix = np.stack([column[free] for column in columns.values()], axis=1)
     values = _least_squares(matrix, left[free])
     return state._replace(
@@ -175,13 +179,33 @@ def _factors(
     stated = {name: term for name, term in terms.gains.items() if np.any(term != 0.0)}
     steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
     # What the law's state before the window leaves in it.
-    initial = (terms.acting, *(1.0 - steps) ** np.arange(voltage.size))
+    initial = [terms.acting, *(1.0 - steps) ** np.arange(voltage.size)]
+    initial += _notch_columns(parameters, voltage.size).values() if parameters.notch_gain != 0.0 else ()
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
     values = _least_squares(columns, measured)
     if _rms(measured - columns @ values) > tolerated:
         return {}
     return {name: float(value) for name, value in zip(stated, values, strict=False)}
+
+
+def _notch_columns(parameters: LawParameters, count: int) -> dict[str, Array]:
+    """Voltages (count,) that unit states of the notch before a window leave in it."""
+    nothing = np.zeros(count)
+    starts = {"notch_band": (1.0, 0.0), "notch_low": (0.0, 1.0)}
+    return {name: behind_notch(parameters, nothing, *start) for name, start in starts.items()}
+
+
+@compiled
+def behind_notch(parameters: LawParameters, values: Array, band: float, low: float) -> Array:
+    """Filter voltages (n,) by the notch, from its states before them on."""
+    result = np.empty(values.size)
+    for k in range(values.size):
+        result[k] = values[k] - parameters.notch_gain * band
+        behind = values[k] - low
+        low += parameters.notch_turn * band + parameters.notch_rise * behind
+        band += parameters.notch_turn * behind - parameters.notch_fall * band
+    return result
 
 
 @compiled

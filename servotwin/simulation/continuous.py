@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -262,8 +263,13 @@ def _with_states(
         error, tolerance = float(loop.rows["error"][0] @ state), common["tolerance"]
         zone = _zone_after(zone, error, controller.enter * tolerance, controller.leave * tolerance)
     # Contact and stick-slip modes stay: both automata number them alike.
-    mechanics = now.mode // len(now.loop.zones)
-    return LoopState(loop, state, mechanics * len(loop.zones) + loop.zones.index(zone))
+    mode = now.mode // len(now.loop.zones) * len(loop.zones) + loop.zones.index(zone)
+    names = loop.automaton.names
+    if "notch low" in names and "notch low" not in common:
+        # At rest at what it filters, which drives the band-pass.
+        driven = float(loop.automaton.flows[mode][loop.automaton.index("notch band")] @ state)
+        state[loop.automaton.index("notch low")] = driven / (2.0 * math.pi * controller.notch_hz)
+    return LoopState(loop, state, mode)
 
 
 def _zone_after(zone: str, error: float, enter: float, leave: float) -> str:

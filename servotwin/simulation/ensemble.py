@@ -338,7 +338,7 @@ def check_constants(constants: dict[str, Array]) -> None:
 
 def _structure_of(servo: Servo, law: Controller) -> tuple[object, ...]:
     limits = law.voltage_limit is None, law.loop_filter_hz is None
-    return servo.n, servo.rigid, *limits, law.integral_only, law.velocity_feedforward == 0.0
+    return servo.n, servo.rigid, *limits, law.integral_only, law.velocity_feedforward == 0.0, law.notch_hz == 0.0
 
 
 def _constants_of(laws: list[Controller]) -> dict[str, Array]:

@@ -96,13 +96,16 @@ def take_tick(loop: LiftedLoop, places: Places, z: Array, place: Place) -> float
     filtered = z[places.filtered] if places.filtered >= 0 else y
     active = 1.0 if place.at[2] == 1 else 0.0
     past, ahead = (z[places.past], z[places.ahead]) if places.ahead >= 0 else (z[places.reference], 0.0)
-    state = LawState(z[places.integral], z[places.derivative], filtered, last, active, 0.0, past, ahead)
+    band, low = (z[places.notch], z[places.notch_low]) if places.notch >= 0 else (0.0, 0.0)
+    state = LawState(z[places.integral], z[places.derivative], filtered, last, active, 0.0, past, ahead, band, low)
     new = tick(p, state, z[places.reference], y)
     z[places.integral], z[places.derivative] = new.integral, new.derivative
     if places.filtered >= 0:
         z[places.filtered] = new.filtered
     if places.ahead >= 0:
         z[places.past], z[places.ahead] = new.reference, new.ahead
+    if places.notch >= 0:
+        z[places.notch], z[places.notch_low] = new.notch_band, new.notch_low
     if places.delay > 0:
         z[places.voltage] = z[places.waiting]
         for i in range(places.waiting, places.waiting + places.delay - 1):

@@ -70,6 +70,8 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         ("feedforward", controller.feedforward != 0.0),
         ("past", controller.velocity_feedforward != 0.0),
         ("ahead", controller.velocity_feedforward != 0.0),
+        ("notch", controller.notch_hz != 0.0),
+        ("notch_low", controller.notch_hz != 0.0),
     ):
         places[name] = count if exists else -1
         count += exists

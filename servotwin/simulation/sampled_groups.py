@@ -94,7 +94,7 @@ def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
     limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None
     feedforwards = law.feedforward == 0.0, law.velocity_feedforward == 0.0
     switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    return servo.n, servo.rigid, *limits, *feedforwards, *switches
+    return servo.n, servo.rigid, *limits, law.notch_hz == 0.0, *feedforwards, *switches
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:

@@ -105,7 +105,7 @@ def run_one(
     p, rate = family.laws[law], family.rate[law]
     parameters = LawParameters(
         p[0], p[1], p[2], p[3], starts.enter[k], starts.leave[k], p[6], p[7], p[8], p[9], p[10], p[11], p[12], p[13],
-        p[14],
+        p[14], p[15], p[16], p[17], p[18],
     )  # fmt: skip
     loop = LiftedLoop(
         parameters, family.dead_zone, family.searches[plant], family.step[plant], family.flows[plant], family.modes

@@ -87,6 +87,10 @@ def tick_between(
         parameters.acting_inside,
         parameters.velocity_gain,
         parameters.velocity_step,
+        parameters.notch_gain,
+        parameters.notch_fall,
+        parameters.notch_rise,
+        parameters.notch_turn,
     )
     return tick(now, state, reference, y)
 

@@ -279,6 +279,7 @@ def _compiled_run(parameters: Any, state: Any, references: Any, measurements: An
         out[k, 0], out[k, 1], out[k, 2] = state.integral, state.derivative, state.filtered
         out[k, 3], out[k, 4], out[k, 5] = state.voltage, state.active, state.offset
         out[k, 6], out[k, 7] = state.reference, state.ahead
+        out[k, 8], out[k, 9] = state.notch_band, state.notch_low
 
 
 def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -291,19 +292,27 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 STOPPED = LIMITED.replace(integral_only=True, Ki=300.0, voltage_limit=1.0, rate_limit=150.0)
 BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
+NOTCHED = LIMITED.replace(notch_hz=4.3, notch_damping=0.4)
 FED = LIMITED.replace(velocity_feedforward=190.0, velocity_time=0.03)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "controller",
-    [PAPER, LIMITED, BIASED, STOPPED, FED],
-    ids=["paper", "limits, hysteresis, filter", "offset, feedforward", "integral only", "velocity feedforward"],
+    [PAPER, LIMITED, BIASED, STOPPED, FED, NOTCHED],
+    ids=[
+        "paper",
+        "limits, hysteresis, filter",
+        "offset, feedforward",
+        "integral only",
+        "velocity feedforward",
+        "notch",
+    ],
 )
 def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
     law, samples = controller.law(1e-3), 1_000_000
     reference, measurement = _signals(samples)
-    compiled = np.empty((samples, 8))
+    compiled = np.empty((samples, len(LawState._fields)))
     first = start(0.0)._replace(offset=2.3)
     numba.njit(_compiled_run)(law, first, reference, measurement, compiled)
     state, interpreted = first, array("d")

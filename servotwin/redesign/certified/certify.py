@@ -25,6 +25,7 @@ from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
+_Gains = tuple[float, float, float, float]
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
 # Time constant of a velocity feedforward's filter, in units of 1 / crossover of a motor that Kp alone moves.
@@ -212,8 +213,8 @@ def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> li
     ]
 
 
-def _gains(law: Controller) -> tuple[float, float, float]:
-    return law.Kp, law.Kd, law.Tf
+def _gains(law: Controller) -> _Gains:
+    return law.Kp, law.Kd, law.Tf, law.notch_hz
 
 
 def _ranked_in_stages(
@@ -239,10 +240,10 @@ def _ranked_in_stages(
     return _by_moves(screening, candidates, [*always, running] if running is not None else always, running)
 
 
-def _velocities(ranked: Iterator[Design], own: tuple[float, float, float]) -> dict[tuple[float, float, float], float]:
+def _velocities(ranked: Iterator[Design], own: _Gains) -> dict[_Gains, float]:
     """Velocity feedforwards with which integral action is tried, by gains: the best for each of the best gains; for the
     own gains that of the best of all."""
-    fed, best = dict[tuple[float, float, float], float](), math.nan
+    fed, best = dict[_Gains, float](), math.nan
     for setting in ranked:
         law = setting.controller
         best = law.velocity_feedforward if math.isnan(best) else best

@@ -338,7 +338,8 @@ def alike(one: Design, other: Setting | None) -> bool:
     """True when two settings are the same but for the feedforward."""
     if other is None or other.gains is None:
         return False
-    names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only", "velocity_feedforward", "velocity_time")
+    names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only", "velocity_feedforward", "velocity_time"]
+    names += ["notch_hz", "notch_damping", "notch_depth"]
     gains = ((getattr(other.gains, name), getattr(one.controller, name)) for name in names)
     pairs = (*gains, (other.tolerance, one.tolerance))
     return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
