@@ -49,12 +49,14 @@ def by_hand(controller, tolerance, state=None, count=4000, scale=1.0, rate=2000.
         LAW.replace(voltage_limit=2.5),
         LAW.replace(integral_only=True, velocity_feedforward=20.0),
         LAW.replace(enter=0.5, leave=1.5),
+        LAW.replace(Ki=0.03 * LAW.Ki, notch_hz=4.3),
     ],
-    ids=["paper", "without integral", "limited", "integral only", "hysteresis"],
+    ids=["paper", "without integral", "limited", "integral only", "hysteresis", "notch"],
 )
 def test_a_law_explains_its_own_voltage_whatever_its_state_was_at_the_beginning(controller):
     tolerance = 2e-4
     state = start(0.0)._replace(integral=0.7, derivative=4e-4, offset=-0.2, voltage=0.4, reference=-1e-3)
+    state = state._replace(notch_band=0.3, notch_low=0.5)
     if controller.Ki == 0.0:
         state = state._replace(integral=0.0)
     made = compare_controller(by_hand(controller, tolerance, state), controller, tolerance)

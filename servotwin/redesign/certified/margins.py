@@ -24,8 +24,8 @@ _WORTH_TRYING = 0.5
 _ALWAYS = (0.6, 1.0)
 _ROUNDED = 1.0 + 1e-6
 # Damping ratio of a notch's poles, and least one of its zeros: a deeper notch is a worse one as soon as the resonance
-# is a little off. Resonances up to a share of the rate.
-_NOTCH_DAMPING, _LEAST_DAMPING, _RESOLVED = 0.5, 0.05, 0.1
+# is a little off. Resonances up to a share of the rate; centres per octave.
+_NOTCH_DAMPING, _LEAST_DAMPING, _RESOLVED, _PER_OCTAVE = 0.5, 0.05, 0.1, 24
 
 
 def widened(uncertainty: Uncertainty, demands: Demands) -> Uncertainty:
@@ -164,12 +164,14 @@ def with_notch(servo: Servo) -> Controller | None:
     resonant = poles[(poles.imag > 0.0) & (-poles.real < _NOTCH_DAMPING * np.abs(poles))]
     if not resonant.size:
         return None
-    first = resonant[np.argmin(np.abs(resonant))]
+    first = complex(resonant[np.argmin(np.abs(resonant))])
     hertz, damping = abs(first) / (2.0 * math.pi), -first.real / abs(first)
     rate = servo.controller.sample_rate
     if rate is not None and hertz > _RESOLVED * rate:
         return None
-    depth = min(1.0, max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING)
+    # Rounded: what a window adds to a learnt resonance is not worth another notch.
+    hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
+    depth = min(1.0, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
     return servo.controller.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
