@@ -130,19 +130,15 @@ def laws_within(
         return known[law]
 
     laws = _scaled_laws(own, demands, demands.shapes, integral)
-    if uncertainty.learnt is not None:
-        laws += _scaled_laws(own, demands, demands.learnt_shapes, integral)
-        laws += [] if notched is None else _scaled_laws(notched, demands, demands.notch_shapes, integral)
-    fastest = _fastest(laws, passes)
-    if fastest is None and notched is not None:
-        laws = _scaled_laws(notched, demands, demands.notch_shapes, integral)
-        fastest = _fastest(laws, passes)
-    if fastest is None:
-        raise InvalidInput(_none_within(servo, uncertainty, demands, plants, laws))
-    # A loop with less than half of the gain that another one may have is slower, at every gap of the presets.
-    least = _WORTH_TRYING * abs(fastest.Kp)
+    laws += _scaled_laws(own, demands, demands.learnt_shapes, integral) if uncertainty.learnt is not None else []
     always = {scaled_law(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
-    return tuple(law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law))
+    within = _lively(laws, passes, always)
+    if notched is not None and (uncertainty.learnt is not None or not within):
+        laws = _scaled_laws(notched, demands, demands.notch_shapes, integral)
+        within += _lively(laws, passes, set())
+    if not within:
+        raise InvalidInput(_none_within(servo, uncertainty, demands, plants, laws))
+    return tuple(within)
 
 
 def _scaled_laws(
@@ -152,8 +148,12 @@ def _scaled_laws(
     return list(dict.fromkeys(laws))
 
 
-def _fastest(laws: list[Controller], passes: Callable[[Controller], bool]) -> Controller | None:
-    return next((law for law in sorted(laws, key=lambda law: -abs(law.Kp)) if passes(law)), None)
+def _lively(laws: list[Controller], passes: Callable[[Controller], bool], always: set[Controller]) -> list[Controller]:
+    """Laws that pass and are of `always`, or have at least half of the gain of the fastest that passes: the others are
+    slower, at every gap of the presets."""
+    fastest = next((law for law in sorted(laws, key=lambda law: -abs(law.Kp)) if passes(law)), None)
+    least = math.inf if fastest is None else _WORTH_TRYING * abs(fastest.Kp)
+    return [law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law)]
 
 
 def with_notch(servo: Servo) -> Controller | None:
