@@ -42,6 +42,8 @@ class LawParameters(NamedTuple):
         Velocity feedforward over the time constant of its low-pass filter, V/m.
     velocity_step : float
         The exact zero-order-hold step of that filter.
+    friction : float
+        V, added with the sign of the reference's last change: none before its first one.
     """
 
     Kp: float
@@ -59,6 +61,7 @@ class LawParameters(NamedTuple):
     acting_inside: float = 0.0
     velocity_gain: float = 0.0
     velocity_step: float = 1.0
+    friction: float = 0.0
 
 
 class LawState(NamedTuple):
@@ -84,6 +87,8 @@ class LawState(NamedTuple):
     ahead : float
         What the reference was ahead of its low-pass in the velocity feedforward, m: where the reference rests it
         fades beyond all rounding.
+    direction : float
+        Sign of the reference's last change; 0.0 before the first one.
     """
 
     integral: float
@@ -94,6 +99,7 @@ class LawState(NamedTuple):
     offset: float = 0.0
     reference: float = 0.0
     ahead: float = 0.0
+    direction: float = 0.0
 
 
 def start(measurement: float) -> LawState:
@@ -138,8 +144,15 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     driven = error * acting
     slope = driven - state.derivative
     pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
-    ahead = (1.0 - parameters.velocity_step) * state.ahead + (reference - state.reference)
-    unlimited = pidf + (parameters.feedforward + state.offset + parameters.velocity_gain * ahead)
+    moved = reference - state.reference
+    ahead = (1.0 - parameters.velocity_step) * state.ahead + moved
+    direction = state.direction
+    if moved > 0.0:
+        direction = 1.0
+    elif moved < 0.0:
+        direction = -1.0
+    fed = parameters.feedforward + parameters.friction * direction
+    unlimited = pidf + (fed + state.offset + parameters.velocity_gain * ahead)
     voltage = unlimited
     if voltage > parameters.voltage_limit:
         voltage = parameters.voltage_limit
@@ -155,7 +168,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     integral = state.integral + parameters.integral_step * driven * active + correction
     derivative = state.derivative + parameters.filter_step * slope
     offset = state.offset * (1.0 - parameters.release_step)
-    return LawState(integral, derivative, filtered, voltage, active, offset, reference, ahead)
+    return LawState(integral, derivative, filtered, voltage, active, offset, reference, ahead, direction)
 
 
 def replaced(integral: float, feedforward: float) -> float:

@@ -97,7 +97,13 @@ class Limits:
         ),
     ] = inf
     feedforward: Annotated[
-        float, key("feedforward_v", minimum=0.0, infinite=True, help="Largest feedforward, either sign.")
+        float,
+        key(
+            "feedforward_v",
+            minimum=0.0,
+            infinite=True,
+            help="Largest feedforward, and largest friction feedforward, either sign.",
+        ),
     ] = 0.25
     patience_s: Annotated[
         float,
@@ -125,7 +131,8 @@ class Limits:
         """True where gains lie in the box around the servo's own."""
         scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
         kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
-        fed = abs(gains.feedforward) <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
+        voltages = max(abs(gains.feedforward), abs(gains.friction_feedforward))
+        fed = voltages <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
         return scaled and gains.leave <= self.gain_factor * own.leave and fed
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:

@@ -22,6 +22,8 @@ class Gains(Struct, frozen=True):
         True: inside the dead zone only the integral stops; otherwise the loop opens there.
     velocity_feedforward, velocity_time : float
         V s/m, and s of its low-pass filter.
+    friction_feedforward : float
+        V, with the sign of the reference's last change.
     """
 
     Kp: float
@@ -34,6 +36,7 @@ class Gains(Struct, frozen=True):
     integral_only: bool = False
     velocity_feedforward: float = 0.0
     velocity_time: float = 0.1
+    friction_feedforward: float = 0.0
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:

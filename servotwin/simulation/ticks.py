@@ -87,6 +87,7 @@ def tick_between(
         parameters.acting_inside,
         parameters.velocity_gain,
         parameters.velocity_step,
+        parameters.friction,
     )
     return tick(now, state, reference, y)
 

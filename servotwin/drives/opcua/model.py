@@ -31,7 +31,10 @@ INTEGRAL_ONLY = "IntegralOnly"
 VELOCITY = ("VelocityFeedforward", "VelocityTime")
 """Double: V s/m, s; a drive that lacks them has no velocity feedforward."""
 
-OPTIONAL = (INTEGRAL_ONLY, *VELOCITY)
+FRICTION = "FrictionFeedforward"
+"""Double, V; a drive that lacks it has no friction feedforward."""
+
+OPTIONAL = (INTEGRAL_ONLY, *VELOCITY, FRICTION)
 """Gains that not every drive has."""
 
 COMMIT = "Commit"
