@@ -41,7 +41,7 @@ test: lint packages
 	$(PYTEST)
 
 fuzz: $(STAMP)
-	$(PYTEST) -m hypothesis --hypothesis-profile=fuzz
+	$(PYTEST) -m "hypothesis or exploration" --hypothesis-profile=fuzz
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks

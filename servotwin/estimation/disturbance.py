@@ -16,7 +16,6 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.window import Window
@@ -206,6 +205,9 @@ def _spread(drive: Array) -> float:
 @lru_cache(maxsize=16)
 def _few(freedom: int) -> float:
     """Return the factor from normal to Student's 95 % interval, for a spread estimated from few values."""
+    # Here, because scipy.special takes long to import and many processes estimate nothing.
+    from scipy.special import stdtrit
+
     return float(stdtrit(freedom, 0.975)) / NORMAL_95
 
 

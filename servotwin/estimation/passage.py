@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
-from scipy.special import ndtr, owens_t
 
 from servotwin.plant.signals import Array
 
@@ -76,6 +74,9 @@ def _quantile(passed: Callable[[Array], Array], grid: Array, chance: Array, tail
         return 0.0
     if index == chance.size:
         return math.inf
+    # scipy.optimize and scipy.special take a third of a second to import: here, for the processes that never need them.
+    from scipy.optimize import brentq
+
     begin, end = 0.0 if index == 1 else float(grid[index - 2]), float(grid[index - 1])
     return float(brentq(lambda t: float(passed(np.array([t]))[0]) - tail, begin, end, xtol=1e-12 * end))
 
@@ -103,6 +104,8 @@ def _score(distance: Array | float, variance: Array) -> Array:
 
 def both_below(h: Array, k: Array, correlation: Array) -> Array:
     """(n,) chance that two standard normals of the given correlation lie below h and below k (Owen, 1956)."""
+    from scipy.special import ndtr
+
     left = np.sqrt(1.0 - correlation**2)
     smooth = (left > 0.0) & np.isfinite(h) & np.isfinite(k)
     safe_h, safe_k = np.where(smooth, h, 1.0), np.where(smooth, k, 1.0)
@@ -113,6 +116,8 @@ def both_below(h: Array, k: Array, correlation: Array) -> Array:
 
 
 def _owen(h: Array, k: Array, correlation: Array) -> Array:
+    from scipy.special import ndtr, owens_t
+
     left = np.sqrt(1.0 - correlation**2)
     with np.errstate(divide="ignore", invalid="ignore"):
         by_h, by_k = (k / h - correlation) / left, (h / k - correlation) / left

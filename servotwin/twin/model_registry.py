@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Annotated
@@ -38,6 +37,7 @@ from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
 from servotwin.twin.model import TwinModel
+from servotwin.twin.servo_names import ServoNames
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 MAX_MODELS = 256
@@ -108,10 +108,7 @@ class ModelRegistry:
     def __post_init__(self) -> None:
         if len(self._by_name) < len(self.models) or not 1 <= len(self.models) <= MAX_MODELS:
             raise InvalidInput(f"fleet: has {len(self.models)} models: must be 1 to {MAX_MODELS} with different names")
-        if not self.servos:
-            raise InvalidInput('servos: is empty; give at least one, such as "ax-1" = "NAME OF A MODEL"')
-        for servo, model in self.servos:
-            _check_pattern(servo)
+        for servo, model in self._names.servos:
             if model not in self._by_name:
                 hint = did_you_mean(model, self._by_name)
                 raise InvalidInput(f"servos.{servo} = {model!r}: there is no such model{hint}")
@@ -129,9 +126,9 @@ class ModelRegistry:
             unstable on its servo even without a gap.
         """
         models = models_of(table, folder)
-        servos = table.table("servos", required=True)
+        names = ServoNames.read(table)
         with named(table):
-            return cls(models, tuple((servo, servos.text(servo)) for servo in servos.values))
+            return cls(models, names.servos)
 
     @classmethod
     def loads(cls, text: str, source: str, folder: Path) -> ModelRegistry:
@@ -146,9 +143,8 @@ class ModelRegistry:
         InvalidInput
             The servo has no model.
         """
-        exact = self._exact.get(servo)
-        model = exact or next((model for pattern, model in self._patterns if fnmatchcase(servo, pattern)), None)
-        if model is None or not re.match(NAME_PATTERN, servo):
+        model = self._names.model_of(servo)
+        if model is None:
             raise InvalidInput(f"servo {servo!r} has no model: [servos] has neither its name nor a pattern that fits")
         return self._by_name[model]
 
@@ -157,12 +153,8 @@ class ModelRegistry:
         return {model.name: model for model in self.models}
 
     @cached_property
-    def _exact(self) -> dict[str, str]:
-        return {servo: model for servo, model in self.servos if "*" not in servo}
-
-    @cached_property
-    def _patterns(self) -> tuple[tuple[str, str], ...]:
-        return tuple((servo, model) for servo, model in self.servos if "*" in servo)
+    def _names(self) -> ServoNames:
+        return ServoNames(self.servos)
 
 
 def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[ServoModel, ...]:
@@ -170,11 +162,6 @@ def models_of(table: Table, folder: Path, checked: bool = True) -> tuple[ServoMo
     inner = table.table("models", required=True)
     make = partial(_model, folder=folder, checked=checked)
     return tuple(read_inner(inner, name, partial(make, name=name)) for name in inner.values)
-
-
-def _check_pattern(servo: str) -> None:
-    if not re.match(NAME_PATTERN, servo.replace("*", "a")):
-        raise InvalidInput(f"servos: {servo!r} is not allowed: 1 to 64 of A-Z a-z 0-9 . _ - and * for any")
 
 
 def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:

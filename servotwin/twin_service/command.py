@@ -20,6 +20,7 @@ from servotwin.twin_service.http_server import HttpServer, check_tls, listening_
 from servotwin.twin_service.monitoring import configure_logging
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import TwinFile, read_twin
+from servotwin.twin_service.worker import WorkerPool
 
 log = logging.getLogger(__name__)
 
@@ -32,23 +33,26 @@ def run(path: Path, port: int | None = None) -> None:
     InvalidInput
         The file, the tokens, the store or the address cannot be used, or another process uses the store.
     """
-    twin = read_twin(path)
+    twin = read_twin(path, models=False)
     check_tls(twin.service)
     configure_logging(twin.service.log_level)
+    pool = WorkerPool(twin.service.workers, twin.start, twin.service.job_timeout_s)
     with (
+        # First: a worker checks the models before a store is made.
+        pool.launched(),
         _exclusive_store(twin.service.store),
         closing(_open_configured_store(twin.service)) as store,
         listening_socket(twin.service, port) as listener,
     ):
-        serve(twin, store, listener)
+        serve(twin, store, listener, pool)
 
 
-def serve(twin: TwinFile, store: Store, listener: socket.socket) -> None:
+def serve(twin: TwinFile, store: Store, listener: socket.socket, pool: WorkerPool) -> None:
     """Serve on a listening socket; raises SystemExit where the service does not start."""
     if twin.service.tokens is None:
         log.warning("no tokens: whoever reaches this machine itself may do everything")
     raise_descriptor_limit()
-    service = TwinService(twin, store)
+    service = TwinService(twin, store, pool=pool)
     server = HttpServer(twin.service, service.http_app(), service.polls.close)
     asyncio.run(server.serve([listener]))
 

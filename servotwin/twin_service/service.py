@@ -12,14 +12,13 @@ from functools import lru_cache, partial
 from typing import Any
 from uuid import uuid4
 
-from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import OutgoingMessage
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
-from servotwin.twin.model_registry import ModelRegistry
+from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
@@ -55,7 +54,7 @@ class TwinService:
         Open; the caller closes it, after `stop`.
     clocks : Clocks, optional
     pool : WorkerPool, optional
-        Replaces the one that the file describes.
+        Replaces the one that the file describes; it may have been launched.
     """
 
     def __init__(
@@ -73,7 +72,7 @@ class TwinService:
         self.polls = LongPolls(self._read_outgoing, config.long_polls, shared=self._shared)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
-        has_servo = _servo_test(twin.fleet)
+        has_servo = _servo_test(twin.servos)
         slack = math.inf if config.lockstep else config.future_slack_s
         self.ingest = Ingest(
             put=self._writes.put,
@@ -218,15 +217,11 @@ def _log_failure(task: asyncio.Task[None]) -> None:
         log.error("a task of the service ended", exc_info=error)
 
 
-def _servo_test(fleet: ModelRegistry) -> Callable[[str], bool]:
-    """Test whether a fleet has a servo of a name; invalid names, however long, are not cached."""
+def _servo_test(servos: ServoNames) -> Callable[[str], bool]:
+    """Test whether there is a servo of a name; invalid names, however long, are not cached."""
 
     @lru_cache(maxsize=MAX_SERVOS)
     def has(servo: str) -> bool:
-        try:
-            fleet.model_of(servo)
-        except InvalidInput:
-            return False
-        return True
+        return servos.model_of(servo) is not None
 
     return lambda servo: re.match(NAME_PATTERN, servo) is not None and has(servo)

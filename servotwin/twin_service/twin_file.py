@@ -1,15 +1,23 @@
-"""A twin's file as a whole: [service] is read here, models and servos by `twin.model_registry`."""
+"""A twin's file as a whole: [service] is read here, [servos] by `twin.servo_names`, [models] by `twin.model_registry`.
+
+The models take long to import. The service leaves them to its workers.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from servotwin.config.table import read_inner, read_toml
 from servotwin.errors import InvalidInput
-from servotwin.twin.model_registry import ModelRegistry
+from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.config import ServiceConfig, read_service
 from servotwin.twin_service.worker import WorkerStart
+
+if TYPE_CHECKING:
+    from servotwin.twin.model_registry import ModelRegistry
 
 
 @dataclass(frozen=True)
@@ -20,15 +28,22 @@ class TwinFile:
     ----------
     path : Path
     service : ServiceConfig
-    fleet : ModelRegistry
+    servos : ServoNames
     text : str
         Of the file: workers read it once more.
     """
 
     path: Path
     service: ServiceConfig
-    fleet: ModelRegistry
+    servos: ServoNames
     text: str
+
+    @cached_property
+    def fleet(self) -> ModelRegistry:
+        """Models and servos, read at the first use; raises InvalidInput."""
+        from servotwin.twin.model_registry import ModelRegistry
+
+        return ModelRegistry.loads(self.text, str(self.path), self.path.parent)
 
     @property
     def start(self) -> WorkerStart:
@@ -36,8 +51,8 @@ class TwinFile:
         return WorkerStart(self.text, str(self.path), str(self.path.parent))
 
 
-def read_twin(path: Path) -> TwinFile:
-    """Read a twin's file.
+def read_twin(path: Path, models: bool = True) -> TwinFile:
+    """Read a twin's file; where not `models`, without checking [models], which takes much longer.
 
     Raises
     ------
@@ -47,9 +62,13 @@ def read_twin(path: Path) -> TwinFile:
     table = read_toml(path)
     text, folder = path.read_text(encoding="utf-8"), path.parent
     config = read_inner(table, "service", lambda inner: read_service(inner, folder))
-    fleet = ModelRegistry.read(table, folder)
+    servos = ServoNames.read(table)
+    table.known("models")
     table.done()
-    return TwinFile(path, config, fleet, text)
+    twin = TwinFile(path, config, servos, text)
+    if models:
+        _ = twin.fleet
+    return twin
 
 
 def service_of(path: Path) -> ServiceConfig:

@@ -14,13 +14,15 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
+from servotwin.errors import InvalidInput
 from servotwin.runtime.child_process import ChildProcess
 from servotwin.runtime.frames import frame, read_frame, receive_frame
 from servotwin.runtime.retry import Backoff, Retry
@@ -106,6 +108,8 @@ class WorkerProcess:
     def __init__(self, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
         self._start, self._timeout, self._command = start, timeout, tuple(command)
         self._process: ChildProcess | None = None
+        self._socket: socket.socket | None = None
+        self._ready = False
         self._reader: asyncio.StreamReader | None = None
         self._writer: asyncio.StreamWriter | None = None
 
@@ -114,16 +118,48 @@ class WorkerProcess:
         """Process id, while the process runs."""
         return None if self._process is None or self._process.code is not None else self._process.pid
 
-    async def start(self) -> None:
-        """Start the process and wait until it is ready; raises WorkerLost."""
-        ours, theirs = socket.socketpair()
+    def launch(self) -> None:
+        """Start the process, without waiting until it is ready."""
+        self._socket, theirs = socket.socketpair()
         # Closed here once the child has a copy: only then does the end of the child close the connection.
         with theirs:
             number = theirs.fileno()
             self._process = ChildProcess((*self._command, str(number)), pass_fds=(number,), env=_environment())
-        self._reader, self._writer = await asyncio.open_connection(sock=ours)
-        self._send(encode_frame(self._start))
-        await self._receive(_START_S)
+
+    def check(self) -> None:
+        """Wait until the launched process is ready, without an event loop; `start` reports one that is not.
+
+        Raises
+        ------
+        InvalidInput
+            The worker refuses the twin's file.
+        """
+        assert self._socket is not None
+        self._socket.settimeout(_START_S)
+        try:
+            self._socket.sendall(encode_frame(self._start))
+            with self._socket.makefile("rb") as stream:
+                answer = read_frame(stream)
+        except OSError:
+            answer = None
+        if answer is None:
+            self.discard()
+        elif answer:
+            raise InvalidInput(answer.decode())
+        else:
+            self._ready = True
+
+    async def start(self) -> None:
+        """Start the process, unless it was launched, and wait until it is ready; raises WorkerLost."""
+        if self._socket is None:
+            self.launch()
+        if self._socket is None or self._socket.fileno() < 0:
+            raise WorkerLost("the worker ended")
+        self._reader, self._writer = await asyncio.open_connection(sock=self._socket)
+        if not self._ready:
+            self._send(encode_frame(self._start))
+            if refusal := await self._receive(_START_S):
+                raise WorkerLost(refusal.decode())
 
     async def work(self, leases: Sequence[Lease], now: float) -> AsyncIterator[LeaseResult]:
         """Process leases; yields their results in order. Raises WorkerLost."""
@@ -146,6 +182,14 @@ class WorkerProcess:
         if self._process is not None:
             self._process.kill()
             await asyncio.to_thread(self._process.wait, _STOP_S)
+
+    def discard(self) -> None:
+        """Close the socket and kill the process, without an event loop; does nothing to one that was stopped."""
+        if self._socket is not None:
+            self._socket.close()
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait(_STOP_S)
 
     def _send(self, data: bytes) -> None:
         if self._writer is None or self._writer.is_closing():
@@ -183,6 +227,7 @@ class WorkerPool:
     def __init__(self, size: int, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
         self.size, self.lost = size, 0
         self._make = partial(WorkerProcess, start, timeout, command)
+        self._launched: list[WorkerProcess] = []
         self._workers: set[WorkerProcess] = set()
         self._idle: asyncio.Queue[WorkerProcess] = asyncio.Queue()
 
@@ -190,6 +235,25 @@ class WorkerPool:
     def alive(self) -> int:
         """Number of workers whose process runs."""
         return sum(worker.pid is not None for worker in self._workers)
+
+    @contextmanager
+    def launched(self) -> Iterator[None]:
+        """Launch all workers, have the first one check the twin's file, and kill in the end those that still run.
+
+        Raises
+        ------
+        InvalidInput
+            A worker refuses the file.
+        """
+        self._launched = [self._make() for _ in range(self.size)]
+        try:
+            for worker in self._launched:
+                worker.launch()
+            self._launched[0].check()
+            yield
+        finally:
+            for worker in self._launched:
+                worker.discard()
 
     async def start(self) -> None:
         """Start all workers.
@@ -199,7 +263,7 @@ class WorkerPool:
         WorkerLost
             A worker did not start; the others were stopped.
         """
-        self._workers = {self._make() for _ in range(self.size)}
+        self._workers = set(self._launched) or {self._make() for _ in range(self.size)}
         try:
             await asyncio.gather(*(worker.start() for worker in self._workers))
         except WorkerLost:
@@ -260,7 +324,11 @@ def main(descriptor: int) -> None:
         start = read_frame(stream)
         if start is None:
             return
-        work = _load_work(start)
+        try:
+            work = _load_work(start)
+        except InvalidInput as refusal:
+            line.sendall(frame(str(refusal).encode()))
+            return
         # Empty: the imports are done, and the worker is ready for a job.
         line.sendall(frame(b""))
         while (body := read_frame(stream)) is not None:

@@ -93,7 +93,7 @@ def enroll(path: Path, request: Enrolment) -> list[Path]:
 
 def enroll_operator(path: Path, name: str, file: Path, replace_token: bool = False) -> list[Path]:
     """Enrol an operator with the twin of a file, and write the token to `file`; returns and raises as `enroll`."""
-    twin = read_twin(path)
+    twin = read_twin(path, models=False)
     tokens = _tokens_file(twin)
     _check_name(name, _read_or_create(tokens).operators, replace_token)
     if file.exists() and not replace_token:
@@ -112,7 +112,7 @@ def revoke(path: Path, name: str) -> Path:
     InvalidInput
         No servo and no operator of that name has a token.
     """
-    tokens = _tokens_file(read_twin(path))
+    tokens = _tokens_file(read_twin(path, models=False))
     with tokens_locked(tokens):
         known = read_tokens(tokens)
         names = [*known.servos, *known.operators]

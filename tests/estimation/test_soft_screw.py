@@ -80,16 +80,18 @@ def test_a_lag_differs_from_a_delay_by_the_motion_that_is_stated(channel):
     assert np.linalg.norm(left - left.mean()) < 0.25 * np.linalg.norm(truth[begun] - truth[begun].mean())
 
 
-def test_a_delay_widens_the_interval_by_what_a_lag_would_do():
-    """A late channel may be a lagging one; without a delay nothing is widened."""
+def test_a_lag_widens_the_interval_and_a_delay_that_cannot_be_one_hardly_does():
+    """Both delay the channel by 3 ms; the lag rounds it off besides, which one micrometre of noise lets be seen."""
     case = paper_case()
     case = case.noisy(np.random.default_rng(1).normal(0.0, 1e-6, case.window.position.size))
     position = case.window.position
     held = np.concatenate([np.full(15, position[0]), position[:-15]])
-    late = case.replaced(case.window.replace(position=held), case.servo)
+    decay = math.exp(-1.0 / (5000.0 * 3e-3))
+    lagging = position[0] + lfilter([1.0 - decay], [1.0, -decay], position - position[0])
+    late, lags = (case.replaced(case.window.replace(position=one), case.servo) for one in (held, lagging))
     known = FactorPrior.of_spreads(2e-4, 1e-3, 1e-4, 1e-3)
-    doubts = [fitted(one, known).learnt.doubt(1e-6, 1.1) for one in (case, late)]
-    assert doubts[1] > doubts[0] + math.radians(5e-4)
+    plain, delayed, lagged = (fitted(one, known).learnt.doubt(1e-6, 1.1) for one in (case, late, lags))
+    assert plain < delayed < plain + math.radians(5e-4) < lagged
 
 
 def test_the_softness_of_some_windows_is_their_weighted_mean_and_ends_at_a_floor():

@@ -255,12 +255,11 @@ def test_another_view_counts_from_three_standard_deviations_on(view: str, deviat
     assert judge(seen, given)[0] is status
 
 
-def test_a_free_model_that_is_no_likelier_widens_the_estimate_and_does_not_refuse_it():
+def test_a_free_model_that_is_no_likelier_does_not_refuse_the_estimate():
     """Free in directions that the window hardly shows, a model moves the gap by chance."""
     seen, std = evidence(clean()[1]), math.radians(0.02)
     moved = replace(seen, shift=ModelShift(5.0 * std, std, "a stiffness off", 10.0))
     assert judge(moved, WhitenedSettings())[0] is GapStatus.OK
-    assert moved.systematic == 5.0 * std
     assert judge(replace(moved, shift=moved.shift._replace(gain=100.0)), WhitenedSettings())[0] is not GapStatus.OK
 
 

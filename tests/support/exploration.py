@@ -1,4 +1,4 @@
-"""How many examples a random test draws: few and always the same in the suite, fresh ones and many in `make fuzz`."""
+"""Extent of random tests: few examples, always the same, in the suite; many fresh ones in `make fuzz`."""
 
 from typing import Any
 
@@ -10,5 +10,9 @@ FUZZ = 20
 
 def examples(number: int, **others: Any) -> settings:
     """Settings of a test that draws so many examples in the suite."""
-    fuzzing = settings.get_current_profile_name() == "fuzz"
-    return settings(max_examples=number * FUZZ if fuzzing else number, **others)
+    return settings(max_examples=extent(number, number * FUZZ), **others)
+
+
+def extent(suite: int, fuzz: int) -> int:
+    """Return the first number in the suite, the second one in `make fuzz`; for tests marked `exploration`."""
+    return fuzz if settings.get_current_profile_name() == "fuzz" else suite

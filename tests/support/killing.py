@@ -5,7 +5,7 @@ import os
 import signal
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from random import Random
 
@@ -40,22 +40,33 @@ def complete_windows(first: int, last: int) -> int:
 class Killer:
     """Kills what is there, one at a time, and starts it again after a while.
 
+    The kinds come like cards of a deck that is shuffled again and again: even a few strikes meet all of them.
+
     Parameters
     ----------
     fleet : Fleet
     seed : int
-    weights : mapping of str to int
-        How often "twin", "edge", "link" (process of an edge) and "broker" are struck.
+    deck : mapping of str to int
+        Cards of each kind: "twin", "edge", "link" (process of an edge) and "broker".
     broker : Mosquitto, optional
     """
 
-    def __init__(self, fleet: Fleet, seed: int, weights: Mapping[str, int], broker: Mosquitto | None = None) -> None:
-        self._fleet, self._random, self._weights, self._broker = fleet, Random(seed), weights, broker
+    def __init__(self, fleet: Fleet, seed: int, deck: Mapping[str, int], broker: Mosquitto | None = None) -> None:
+        self._fleet, self._random, self._deck, self._broker = fleet, Random(seed), deck, broker
         self._spared = {servo: time.monotonic() for servo in fleet.roles}
+        self._cards: list[str] = []
         self.kills: Counter[str] = Counter()
 
+    @property
+    def dealt(self) -> bool:
+        """True once every kind was struck."""
+        return self._deck.keys() <= self.kills.keys()
+
     def strike(self) -> None:
-        what = self._random.choices(list(self._weights), list(self._weights.values()))[0]
+        if not self._cards:
+            self._cards = [kind for kind, number in self._deck.items() for _ in range(number)]
+            self._random.shuffle(self._cards)
+        what = self._cards.pop()
         getattr(self, what)()
         self.kills[what] += 1
 
@@ -99,10 +110,11 @@ def is_link(process: int) -> bool:
         return False
 
 
-def strike_until(fleet: Fleet, killer: Killer, windows: int, seed: int) -> None:
+def strike_until(fleet: Fleet, killer: Killer, windows: int, seed: int, enough: Callable[[], bool]) -> None:
+    """Strike until so many windows were recorded and `enough` else has happened too."""
     random = Random(seed)
     end = time.monotonic() + 3.0 * PATIENCE
-    while count_witnessed(fleet) < windows:
+    while count_witnessed(fleet) < windows or not enough():
         assert time.monotonic() < end, fleet.twin.log
         time.sleep(random.uniform(0.5, 2.5))
         killer.strike()

@@ -2,11 +2,13 @@
 
 import datetime
 import ipaddress
+import itertools
 import json
 import os
 import signal
 import socket
 import ssl
+import subprocess
 import sys
 import threading
 import time
@@ -39,7 +41,6 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import encode
 from servotwin.store.store import open_store
 from servotwin.twin_service import command as service
-from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker import WorkerPool
 
@@ -139,11 +140,12 @@ def test_killed_in_midstream_every_acknowledged_window_is_stored_once(tmp_path):
     path, sequence, acknowledged = twin_file(tmp_path, "rate_burst = 1e6"), 0, []
     for _ in range(2):
         with process(path) as (running, url):
-            killer = threading.Timer(0.7, running.kill)
-            killer.start()
+            killer = threading.Timer(0.02, running.kill)
             try:
                 with httpx.Client(base_url=url, timeout=PATIENCE) as client:
-                    while True:
+                    for number in itertools.count():
+                        if number == 20:  # counted, not timed: a busy machine is as far when the kill comes
+                            killer.start()
                         assert send(client, sequence).status_code in (200, 201)
                         acknowledged.append(sequence)
                         sequence += 1
@@ -304,14 +306,34 @@ def test_a_second_twin_on_the_same_file_is_refused_and_the_first_goes_on(tmp_pat
             assert httpx.get(f"{again}/healthz").json()["ok"] is True
 
 
-def test_a_service_that_cannot_start_exits_with_an_error(tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_a_model_that_is_not_allowed_is_refused_by_a_worker_before_a_store_is_made(tmp_path):
+    path = twin_file(tmp_path)
+    path.write_text(path.read_text().replace('servo = "paper"', 'servo = "papre"'))
+    result = CliRunner().invoke(app, ["twin", "--config", str(path)])
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert "did you mean 'paper'" in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert [each.name for each in tmp_path.iterdir() if each.suffix == ".db"] == []
+
+
+def test_the_service_leaves_numerics_to_its_workers():
+    """Half of its start, and most of its memory."""
+    code = "import sys, servotwin.twin_service.command; print(*{'numba', 'numpy', 'scipy'} & set(sys.modules))"
+    completed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert completed.stdout.strip() == ""
+
+
+@pytest.mark.slow
+def test_a_service_that_cannot_start_exits_with_an_error(tmp_path):
     twin = read_twin(twin_file(tmp_path))
     pool = WorkerPool(1, twin.start, 5.0, (sys.executable, "-c", "pass"))
-    monkeypatch.setattr(service, "TwinService", lambda twin, store: TwinService(twin, store, pool=pool))
     with (
+        pool.launched(),
         closing(open_store(twin.service.store)) as store,
         service.listening_socket(twin.service) as listener,
         pytest.raises(SystemExit) as ended,
     ):
-        service.serve(twin, store, listener)
+        service.serve(twin, store, listener, pool)
     assert ended.value.code not in (None, 0)

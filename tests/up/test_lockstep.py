@@ -51,6 +51,10 @@ hold_s = 2.0
 [twin]
 {twin}
 """
+CERTIFIED = """policy = "certified"
+demands = {velocity_feedforward = false}
+"""
+"""With half of the candidates: both sides verify them all."""
 TWIN = """
 [service]
 store = "sqlite:///twin.db"
@@ -108,7 +112,8 @@ def in_memory(loop: Loop) -> dict[tuple[str, int], bytes]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("twin", "duration", "period", "fine", "updates"),
-    [('policy = "paper"', 24.0, 4.0, "false", 2), ('policy = "certified"', 24.0, 8.0, "true", 1)],
+    [('policy = "paper"', 24.0, 4.0, "false", 2), (CERTIFIED, 24.0, 8.0, "true", 1)],
+    ids=["paper", "certified"],
 )
 def test_deployed_is_simulated(
     tmp_path: Path, twin: str, duration: float, period: float, fine: str, updates: int

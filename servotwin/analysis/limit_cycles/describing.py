@@ -9,7 +9,6 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
-from scipy.optimize import brentq
 
 from servotwin.analysis.limit_cycles.cycle import CycleResult, CycleStatus
 from servotwin.analysis.limit_cycles.orbit import closed_orbit
@@ -88,6 +87,9 @@ def predictions(servo: Servo, gap: float, controller: Controller | None = None) 
 
 def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
     """Solutions within one band, rad/s, ascending, from a grid that is dense at its ends, in every decade from 0."""
+    # Here and below, because scipy.optimize takes long to import and most commands need none of it.
+    from scipy.optimize import brentq
+
     ends = [low, high] if low > 0.0 else [0.0, *(high * 10.0**k for k in range(-5, 1))]
     part = 0.5 * (1.0 - np.cos(np.pi * np.arange(_GRID + 1) / _GRID))
     grid = np.unique([a + (b - a) * part for a, b in pairwise(ends)])[1:-1].tolist()
@@ -122,6 +124,8 @@ def _play(angle: float) -> complex:
 
 def _angle(phase: float) -> float:
     """The angle at which N has a phase (rad) of its range; the phase falls all the way."""
+    from scipy.optimize import brentq
+
     return float(brentq(lambda angle: _play_phase(angle) - phase, *_ANGLES, xtol=1e-15))
 
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import brentq
 
 from servotwin.analysis.limit_cycles.poincare import (
     FixedPoint,
@@ -130,6 +129,8 @@ def extremes(automaton: Automaton, state: Array, segments: tuple[FlowSegment, ..
 
 def _turn(row: Array, flow: Array, x: Array, interval: float) -> float:
     """Value of the output where its slope vanishes within an interval (s)."""
+    # Here, because scipy.optimize takes long to import and most commands need none of it.
+    from scipy.optimize import brentq
 
     def at(time: float) -> Array:
         return np.asarray(x + expm1(flow, time).astype(float) @ x)

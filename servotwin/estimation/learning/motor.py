@@ -19,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from scipy.special import erf
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.learning.machine import LearningSettings
@@ -315,6 +314,9 @@ def _least_speed(window: Window, servo: Servo, speed: Array, kernel: Array) -> f
 def _filters(width: float) -> Array:
     """(4, n) weights of a Gaussian of `width` samples about its middle: of a held signal, and of the derivatives of one
     to three samples^-1 of a sampled one."""
+    # Here, because scipy.special takes long to import and many processes estimate nothing.
+    from scipy.special import erf
+
     reach = math.ceil(_REACH * width)
     edges = erf(np.arange(-reach, reach + 2) / (width * math.sqrt(2.0)))
     place = np.arange(-reach, reach + 1) / width

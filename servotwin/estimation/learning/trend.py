@@ -11,7 +11,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import log_ndtr
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, CarriedOffset, GapEstimate, GapStatus, Interval, OffsetReading
@@ -90,6 +89,9 @@ def _bound_std(estimate: GapEstimate) -> float:
 
 def truncation(margin: float) -> tuple[float, float]:
     """(shift, shrinkage) of a standard normal that is known to exceed -margin: its mean, one less its variance."""
+    # Here, because scipy.special takes long to import and many processes estimate nothing.
+    from scipy.special import log_ndtr
+
     if math.isinf(margin):
         return 0.0, 0.0
     pull = math.exp(-0.5 * margin * margin - 0.5 * math.log(2.0 * math.pi) - float(log_ndtr(margin)))

@@ -16,11 +16,13 @@ from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
+from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     contacts_seen,
+    freed,
     judge,
     least_lead,
     lower_bound,
@@ -28,6 +30,7 @@ from servotwin.estimation.whitened.gate import (
     one_sided,
     slow_share,
     static_lost_motion,
+    sure_of_contact,
     travel_needed,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
@@ -122,7 +125,7 @@ class WindowFit:
             return self.blank
         evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
-            evidence = _with_free_model(evidence, self.learnt, self.settings, self.second)
+            evidence = _with_free_model(evidence, self.learnt, self.settings)
         status, reasons = judge(evidence, self.settings)
         usable = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
         if self.learnt is not None and self.learnt.beyond and usable:
@@ -132,7 +135,7 @@ class WindowFit:
             contacts = contacts_seen(self.aligned, self.servo)
             if status is not GapStatus.UNIDENTIFIABLE and not contacts.two:
                 reasons = reasons or (_ONE_CONTACT,)
-                bound = _one_contact(self.blank, evidence, contacts, reasons, self.servo, self.settings)
+                bound = self._one_contact(evidence, contacts, reasons)
                 if self.learnt is None or misfits(evidence, self.settings):
                     return bound
                 either = self.learnt.reading_of_either(contacts.single.point, self.settings.calibration)
@@ -141,10 +144,32 @@ class WindowFit:
         if status is GapStatus.MODEL_MISMATCH:
             fault = likely_fault(self.window, self.angle, self.servo, evidence.unexplained, self.second)
             reasons = (*fault, *reasons)
+        if status is GapStatus.OK:
+            evidence = replace(evidence, doubt=self._doubt(evidence))
         stated = _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
         if self.learnt is None or not teaches:
             return stated
         return replace(stated, machine=self.learnt.reading(self.settings.calibration))
+
+    def _one_contact(self, evidence: FitEvidence, contacts: ContactEvidence, reasons: tuple[str, ...]) -> GapEstimate:
+        """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
+        fitted = evidence.aligned.whitened
+        blank = replace(self.blank, reasons=reasons, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
+        bound = lower_bound(evidence, self.settings) if sure_of_contact(evidence, self.settings) else 0.0
+        if bound >= evidence.smallest:  # the lead, which costs far more, can only lower it
+            bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings))
+        if bound < evidence.smallest:
+            return replace(blank, status=GapStatus.UNIDENTIFIABLE)
+        return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))
+
+    def _doubt(self, evidence: FitEvidence) -> float:
+        """Root mean square (rad) of what machines and sensors that are not as assumed can do to the gap."""
+        aligned, ramp = evidence.aligned, fastest(evidence.aligned.whitened.reduction, self.second)
+        if self.learnt is not None:
+            return self.learnt.doubt(ramp, self.settings.calibration)
+        problem, fitted = freed(aligned, self.servo), aligned.whitened
+        at = np.array([*fitted.point, *problem.prior.mean])
+        return gap_doubt(problem, at, max(1.0, fitted.variance), aligned.delay, ramp, learnt=False)
 
     def _teaches(self, evidence: FitEvidence, status: GapStatus) -> bool:
         """True where the window shows the machine's numbers, whether or not it shows the gap well enough."""
@@ -217,6 +242,7 @@ def _evidence(
         needed=travel_needed(gap, servo, settings),
         smallest=least_bound(servo.encoder_resolution),
         count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),
+        scale=counted(window.position) / abs(gain),
         colour=max(0.0, 1.0 - result.noise.unpredicted / result.reduction.decimation.whiteness),
     )
 
@@ -226,16 +252,10 @@ def _count(angle: Array, servo: Servo) -> float:
     return max(servo.encoder_resolution, counted(angle))
 
 
-def _with_free_model(
-    evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings, second: float
-) -> FitEvidence:
+def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:
     """Widen a spread and an interval by what the model's factors leave open."""
     std = learnt.gap_std(settings.calibration)
-    if not math.isfinite(std):
-        return evidence
-    ramp = fastest(evidence.aligned.whitened.reduction, second)
-    evidence = replace(evidence, doubt=learnt.doubt(ramp, settings.calibration))
-    if not std > evidence.std:
+    if not evidence.std < std < math.inf:
         return evidence
     gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
     extra = NORMAL_95 * math.sqrt(std**2 - evidence.std**2)
@@ -257,23 +277,6 @@ def _travel(result: WhitenedFit) -> Travel:
     return travel(reduction.theta_m[:count], at)
 
 
-def _one_contact(
-    blank: GapEstimate,
-    evidence: FitEvidence,
-    contacts: ContactEvidence,
-    reasons: tuple[str, ...],
-    servo: Servo,
-    settings: WhitenedSettings,
-) -> GapEstimate:
-    """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
-    fitted = evidence.aligned.whitened
-    blank = replace(blank, reasons=reasons, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
-    bound = min(least_lead(evidence, contacts, servo, settings), lower_bound(evidence, settings))
-    if bound < evidence.smallest:
-        return replace(blank, status=GapStatus.UNIDENTIFIABLE)
-    return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))
-
-
 def _stated(
     blank: GapEstimate,
     evidence: FitEvidence,
@@ -284,7 +287,7 @@ def _stated(
 ) -> GapEstimate:
     """Fill a blank estimate from the evidence."""
     fitted = evidence.aligned.whitened
-    systematic = math.hypot(settings.model_error, evidence.systematic)
+    systematic = math.hypot(settings.model_error, evidence.doubt)
     result = replace(
         blank,
         status=status,

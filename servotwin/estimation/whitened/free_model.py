@@ -17,9 +17,11 @@ from functools import cached_property
 
 import numpy as np
 
+from servotwin.estimation.core.contacts import BY_RATE
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
+from servotwin.estimation.whitened.cyclic import cyclic_motions
 from servotwin.estimation.whitened.lag import lag_motion
 from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
@@ -31,11 +33,12 @@ FACTORS = ("k/m", "c/m", "pitch", "mass ratio")
 FREEDOM = (0.1, 0.5, 0.05, 0.1)  # relative standard deviations of the factors where nothing else is known of them
 LARGEST = 4.0  # standard deviations by which a factor may move
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
+CYCLIC = 2e-3 * math.pi  # rad, usual size of an error once per turn: a thousandth of a turn
 _FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
 _EVALUATIONS = 12  # of a fit
-_GAIN = 1e-4  # of the cost: in a whitened window far below one standard deviation of anything
+_GAIN = 1e-3  # of the residual's variance, promised by a step: a thirtieth of one standard deviation of anything
 _SINGULAR = 1e-10  # of a column's length
-_ANY = (0.0, math.inf)
+_ANY = (0.0, math.inf, math.inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,6 +157,10 @@ class FreeProblem:
         Usual size of the structure's stiffness over the screw's, a nuisance; 0: the screw is as stiff as the model's.
     delay : float
         s, by which the position is late: how much a sensor may lag, a nuisance too; 0: no sensor lags.
+    cyclic : float
+        Usual size (rad) of a sensor's error once per turn, a nuisance too; 0: none.
+    ramp : float
+        Usual size (rad/s) of a ramp of the gap beyond the growth that is assumed, a nuisance too; 0: none.
     """
 
     reduction: Reduction
@@ -163,11 +170,14 @@ class FreeProblem:
     largest: float
     compliance: float = 0.0
     delay: float = 0.0
+    cyclic: float = 0.0
+    ramp: float = 0.0
 
     def rows(self, q: Array, keep: bool = False) -> tuple[Array, Array]:
         """Residual (M,) and derivatives of the motion (6, M) at a point (6,), nuisances out, prior appended.
 
-        With `keep` the compliance, in units of its usual size, is the last derivative and not one of the nuisances.
+        With `keep` compliance, lag, cyclic errors (4) and ramp, as far as they are free and in units of their usual
+        sizes, are the last derivatives and not nuisances.
         """
         point, factors = Point(q[0], q[1]), q[2:]
         rate, soft = 1.0 / self.reduction.response.interval, self.compliance > 0.0
@@ -180,8 +190,7 @@ class FreeProblem:
         answer = reduction.position - table[RESIDUAL]
         motions = near.motions(screw[:1], answer, weights[1 : len(reduction.fixed())])
         motions[factors.size :] *= self.compliance
-        if self.delay != 0.0:
-            motions = np.vstack([motions, lag_motion(reduction, point, screw, self.delay)])
+        motions = np.vstack([motions, *self._by_sensors(reduction, point, screw)])
         last, seen = len(table) + factors.size, rows.shape[1]
         whole = np.zeros((len(table) + len(motions), seen + len(motions)))
         whole[: len(table), :seen], whole[len(table) :, : answer.size] = rows, self.noise.whiten(motions)
@@ -195,35 +204,58 @@ class FreeProblem:
         remainder = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
         return remainder[RESIDUAL], remainder[GAP:]
 
+    def _by_sensors(self, reduction: Reduction, point: Point, screw: Array) -> list[Array]:
+        """(1 or 4, m) motions by lag, cyclic errors and ramp, as far as these are free."""
+        free = []
+        if self.delay != 0.0:
+            free.append(lag_motion(reduction, point, screw, self.delay)[None])
+        if self.cyclic > 0.0:
+            free.append(self.cyclic * cyclic_motions(reduction, point))
+        if self.ramp > 0.0:
+            free.append(self.ramp * reduction.response.interval * reduction.reduced.respond(screw[BY_RATE:]))
+        return free
+
     def descend(
-        self, start: Array, free: tuple[bool, bool], within: tuple[float, float] = _ANY, evaluations: int = _EVALUATIONS
+        self,
+        start: Array,
+        free: tuple[bool, bool],
+        within: tuple[float, float, float] = _ANY,
+        evaluations: int = _EVALUATIONS,
+        gain: float = _GAIN,
     ) -> FreeFit:
         """Descend from a start (6,) with at most so many evaluations; of gap and place only what is `free` moves.
 
-        It ends early once the cost is below the first number of `within`, or once even the linearised problem cannot
-        bring it below the second: its value is then not that of the minimum, but on the same side of both.
+        It ends where a step promises less than the part `gain` of the residual's variance. It ends early once the cost
+        is below the first number of `within`, once the linearised problem stays above the second by more than it is
+        below the cost, or once it stays above the third: its value is then not that of the minimum, but on the same
+        side of these.
         """
-        least, most = self.prior.limits()
-        low, high = np.concatenate([[0.0, -1.0], least]), np.concatenate([[self.largest, 1.0], most])
-        movable, (enough, hopeless) = np.array([*free, *(True for _ in FACTORS)]), within
+        lowest, highest = self.prior.limits()
+        low, high = np.concatenate([[0.0, -1.0], lowest]), np.concatenate([[self.largest, 1.0], highest])
+        movable, (enough, most, hopeless) = np.array([*free, *(True for _ in FACTORS)]), within
         q, damping = np.clip(start, low, high), _FIRST_DAMPING
         residual, rows = self.rows(q)
         cost, count, floor = float(residual @ residual), 1, 0.0
         while count < evaluations and damping < _LARGEST_DAMPING and cost > enough:
             floor = _linear_floor(residual, rows, movable)
-            if floor > hopeless:
+            if floor > hopeless or floor - most > cost - floor:
                 break
-            trial = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high)
-            ahead, slopes = self.rows(trial)
+            step = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high) - q
+            if _promised(step, residual, rows) <= gain * cost / residual.size:
+                break
+            ahead, slopes = self.rows(q + step)
             after, count = float(ahead @ ahead), count + 1
             if after < cost:
-                gained = cost - after
-                q, residual, rows, cost, damping = trial, ahead, slopes, after, max(0.1 * damping, _LEAST_DAMPING)
-                if gained <= _GAIN * cost:
-                    break
+                q, residual, rows, cost, damping = q + step, ahead, slopes, after, max(0.1 * damping, _LEAST_DAMPING)
             else:
                 damping *= 10.0
         return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, rows, movable, count, floor)
+
+
+def _promised(step: Array, residual: Array, rows: Array) -> float:
+    """Decrease of the cost by a step, were the residual linear."""
+    move = step @ rows
+    return float(move @ (2.0 * residual - move))
 
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
@@ -285,7 +317,7 @@ def contact_evidence(problem: FreeProblem, misfit: Misfit, two: Point) -> Contac
     places = tuple(dict.fromkeys((*same_way(two, wide), *PLACES)))
     order = np.argsort(misfit.costs([Point(wide, place) for place in places]), kind="stable")
     out_of_reach = believed.cost + _OUT_OF_REACH * allowed
-    within = (believed.cost + _ENOUGH * allowed, believed.cost + HOPELESS * allowed)
+    within = believed.cost + _ENOUGH * allowed, believed.cost + allowed, believed.cost + HOPELESS * allowed
     fits = []
     for index in order[:_STARTS]:
         start = np.array([wide, places[index], *believed.factors])

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.estimation.core.contacts import Travel
+from servotwin.estimation.core.least_squares import spread
 from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
@@ -24,6 +25,7 @@ from servotwin.estimation.whitened.free_model import (
     contact_evidence,
 )
 from servotwin.estimation.whitened.lead import possible_leads
+from servotwin.estimation.whitened.reduction import GAP
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift
 from servotwin.plant.servo import Servo
@@ -143,8 +145,11 @@ class FitEvidence:
         rad: a lower bound below this says nothing.
     count : float
         rad, of the encoder, as stated or as it shows in the angle; 0: none.
+    scale : float
+        rad, of the position's counts as they show, seen through the pitch; 0: none.
     doubt : float
-        rad, what a soft screw or a ramp of the gap may do to it besides a machine that is being learnt.
+        rad, root mean square of what machines and sensors that are not as assumed can do to the gap; computed for
+        gaps that are accepted.
     colour : float
         Share of the noise's variance that is predicted beyond that of decimated white noise; 0: white.
     """
@@ -160,13 +165,14 @@ class FitEvidence:
     needed: float
     smallest: float
     count: float = 0.0
+    scale: float = 0.0
     doubt: float = 0.0
     colour: float = 0.0
 
     @property
-    def systematic(self) -> float:
-        """Change of the gap that other models than the fitted one allow, rad."""
-        return max(abs(self.shift.gap), self.doubt)
+    def counts(self) -> float:
+        """Angle (rad) that a single contact may seem wider by, because both channels come in counts."""
+        return self.count + self.scale
 
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
@@ -178,12 +184,22 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     disagreements = () if too_little else _disagreements(evidence, settings)
     mismatches = (*misfits(evidence, settings), *disagreements)
     silence = tuple(filter(None, (too_little, _spread(evidence, settings))))
-    bound = lower_bound(evidence, settings) > evidence.smallest and math.isinf(evidence.interval[1])
+    sure = math.isinf(evidence.interval[1]) and sure_of_contact(evidence, settings)
+    bound = sure and lower_bound(evidence, settings) > evidence.smallest
     if evidence.unexplained > _UNEXPLAINED or (mismatches and not math.isinf(evidence.interval[1])):
         return GapStatus.MODEL_MISMATCH, mismatches
     if silence:
         return (GapStatus.LOWER_BOUND if bound else GapStatus.UNIDENTIFIABLE), silence
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
+
+
+def sure_of_contact(evidence: FitEvidence, settings: WhitenedSettings) -> bool:
+    """False where a delay that cannot be takes the place of the motor's way to the contact."""
+    aligned, rows = evidence.aligned, evidence.aligned.whitened.rows
+    if not settings.skew or abs(aligned.delay) <= settings.skew_limit:
+        return True
+    std = spread(rows[-1], rows[GAP:-1]) * math.sqrt(max(1.0, aligned.whitened.variance))
+    return abs(aligned.delay) <= settings.skew_limit + NORMAL_95 * std
 
 
 def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
@@ -194,25 +210,26 @@ def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...
 
 def contacts_seen(aligned: AlignedFit, servo: Servo) -> ContactEvidence:
     """Evidence for a second contact in a window, with the model free within its usual error."""
-    return contact_evidence(_freed(aligned, servo), aligned.whitened.misfit, aligned.whitened.point)
+    return contact_evidence(freed(aligned, servo), aligned.whitened.misfit, aligned.whitened.point)
 
 
-def _freed(aligned: AlignedFit, servo: Servo) -> FreeProblem:
-    """The window in its noise with the model free within its usual error."""
+def freed(aligned: AlignedFit, servo: Servo) -> FreeProblem:
+    """Return the window in its noise with the model free within its usual error."""
     result, usual = aligned.whitened, FactorPrior.of_spreads(*FREEDOM)
     return FreeProblem(result.reduction, result.noise, servo, usual, aligned.largest, COMPLIANCE)
 
 
 def least_lead(evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings) -> float:
     """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error."""
-    leads = possible_leads(_freed(evidence.aligned, servo), contacts.single, contacts.variance)
+    problem = freed(evidence.aligned, servo)
+    leads = possible_leads(problem, contacts.single, contacts.variance)
     sigmas = NORMAL_95 * (1.0 + _COLOURED * evidence.colour)
-    return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.count
+    return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.counts
 
 
 def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:
     """Gap (rad) below which the window contradicts every gap, even with the model's usual error."""
-    return max(0.0, evidence.interval[0] - NORMAL_95 * settings.model_error - evidence.count)
+    return max(0.0, evidence.interval[0] - NORMAL_95 * settings.model_error - evidence.counts)
 
 
 def travel_needed(gap: float, servo: Servo, settings: WhitenedSettings) -> float:

@@ -21,6 +21,7 @@ from servotwin.estimation.whitened.nearby import PITCH
 # Structure's stiffness over the screw's, beyond that of the model. Below the first the lead moves by little, and a
 # screw softer than the last is no drive.
 _SOFTER = (0.0, 0.02, 0.05, 0.1, 0.2)
+_GAIN = 0.1  # of the variance: a third of one standard deviation
 
 
 class Lead(NamedTuple):
@@ -54,20 +55,24 @@ def possible_leads(problem: FreeProblem, single: FreeFit, variance: float) -> li
 
 def _softer(problem: FreeProblem, single: FreeFit, allowed: float) -> Iterator[FreeFit]:
     """Fits with softer and softer screws, each from the one before, until the cost has risen by what is allowed."""
-    servo, fit, before, least = problem.servo, single, 0.0, math.inf
+    servo, least = problem.servo, math.inf
     stiffness = float(servo.stiffnesses.max())
     own = 0.0 if servo.rigid else stiffness / servo.k_d
+    # The structure is held at its other end too: a soft screw takes its share of the travel.
+    before, here, moved = 0.0, np.array([*single.point, *single.factors]), np.eye(6)[2 + PITCH]
     for more in _SOFTER:
         screw = stiffness / (own + more) if own + more > 0.0 else math.inf
         softened = replace(problem, servo=servo.replace(k_d=screw), compliance=0.0)
-        start = np.array([*fit.point, *fit.factors])
-        # The structure is held at its other end too: a soft screw takes its share of the travel.
-        start[2 + PITCH] += math.log1p(more) - math.log1p(before)
-        fit = softened.descend(start, (False, True), (0.0, least + HOPELESS * allowed))
+        start = here + (more - before) * moved
+        within = (0.0, least + allowed, least + HOPELESS * allowed)
+        fit = softened.descend(start, (False, True), within, gain=_GAIN)
         yield fit
-        before, least = more, min(least, fit.cost)
+        least = min(least, fit.cost)
         if fit.cost > least + allowed:
             return
+        there = np.array([*fit.point, *fit.factors])
+        moved = (there - here) / (more - before) if before > 0.0 else moved
+        before, here = more, there
 
 
 def _lead(problem: FreeProblem, fit: FreeFit, variance: float) -> Lead:

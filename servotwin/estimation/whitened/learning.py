@@ -17,6 +17,7 @@ import numpy as np
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
+from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, look_around
 from servotwin.estimation.whitened.free_model import (
     BELIEVED,
@@ -29,7 +30,7 @@ from servotwin.estimation.whitened.free_model import (
     FreeProblem,
     adapted,
 )
-from servotwin.estimation.whitened.reduction import NuisancePrior, Point
+from servotwin.estimation.whitened.reduction import Point
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -118,20 +119,14 @@ class LearntFit:
         return math.sqrt(self._scale(calibration) * self.free.covariance[0, 0])
 
     def doubt(self, ramp: float, calibration: float) -> float:
-        """Root mean square (rad) of what a soft screw, a ramp of the gap and a sensor's lag can do to the gap.
+        """Root mean square (rad) of what machines and sensors that are not as assumed can do to the gap.
 
-        All are free beside the factors within wide limits here (`ramp`: rad/s), and cost only where the window does not
-        tell them from these. A screw that is soft for certain moves the gap whatever the factors have taken up of it.
+        A screw that is soft for certain moves the gap whatever the factors have taken up of it. `ramp`: rad/s.
         """
-        reduction = self.problem.reduction
-        growth = NuisancePrior(0.0, ramp * reduction.response.interval)
-        growing = replace(reduction, growth=growth)
-        wide = replace(self.problem, reduction=growing, compliance=COMPLIANCE, delay=self.aligned.delay)
-        residual, rows = wide.rows(np.array([*self.free.point, *self.free.factors]))
-        solved = least_squares(rows, residual)
-        more = self._scale(calibration) * (float(solved.deviations[0]) ** 2 - self.free.covariance[0, 0])
+        variance = max(1.0, self.aligned.whitened.variance)
+        at = np.array([*self.free.point, *self.free.factors])
         moved = self._softness.moved(self.problem.prior.softness, self._scale(calibration))
-        return math.hypot(float(solved.coefficients[0]), math.sqrt(max(0.0, more)), moved)
+        return math.hypot(gap_doubt(self.problem, at, variance, self.aligned.delay, ramp, learnt=True), moved)
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from scipy.linalg import block_diag
 
 from servotwin.estimation.learning.motor import BACK_EMF, LAG, LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
@@ -47,6 +46,8 @@ def learnt_servo(
                 variances.append(np.array([[relative**2]]))
     if not names:
         return None
+    from scipy.linalg import block_diag
+
     covariance = block_diag(*variances)
     spread = tuple(tuple(row) for row in covariance.tolist())
     return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
