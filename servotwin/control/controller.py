@@ -31,6 +31,7 @@ class ControllerChanges(TypedDict, total=False):
     integral_only: bool
     velocity_feedforward: float
     velocity_time: float
+    friction_feedforward: float
     notch_hz: float
     notch_damping: float
     notch_depth: float
@@ -119,6 +120,14 @@ class Controller:
     velocity_time: Annotated[
         float, key("velocity_time_s", above=0.0, help="Time constant of the velocity feedforward's low-pass filter.")
     ] = 0.1
+    friction_feedforward: Annotated[
+        float,
+        key(
+            "friction_feedforward_v",
+            help="Voltage added with the sign of the reference's last change; it cancels Coulomb friction on the way. "
+            "The loop's margins do not depend on it.",
+        ),
+    ] = 0.0
     notch_hz: Annotated[
         float,
         key(
@@ -232,6 +241,7 @@ class Controller:
             acting_inside=1.0 if self.integral_only else 0.0,
             velocity_gain=self.velocity_feedforward / self.velocity_time,
             velocity_step=-expm1(-step / self.velocity_time),
+            friction=float(self.friction_feedforward),
             notch_gain=self.notch_gain,
             notch_fall=notch[0],
             notch_rise=notch[1],

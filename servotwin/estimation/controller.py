@@ -141,7 +141,7 @@ def _voltage_from_best_start(parameters: LawParameters, voltage: Array, referenc
             # A voltage at its limit corrects the integral: what is left of its first value shows before that.
             first = int(np.argmax(limited)) if limited.any() else limited.size
             free = np.arange(limited.size) < first if first >= _FEWEST else ~limited
-            state = _corrected(parameters, state, voltage - given, acting, free)
+            state = _corrected(parameters, state, voltage - given, acting, free, reference)
         given, _ = run_law(parameters, state, reference, position)
         if (error := _rms(voltage - given)) < least:
             best, least = given, error
@@ -149,7 +149,12 @@ def _voltage_from_best_start(parameters: LawParameters, voltage: Array, referenc
 
 
 def _corrected(
-    parameters: LawParameters, state: LawState, left: Array, acting: Array, free: NDArray[np.bool_]
+    parameters: LawParameters,
+    state: LawState,
+    left: Array,
+    acting: Array,
+    free: NDArray[np.bool_],
+    reference: Array,
 ) -> LawState:
     """Correct the initial state by what it would have to be for the voltage left (n,) to vanish where it is free."""
     count = np.arange(left.size)
@@ -160,6 +165,9 @@ def _corrected(
         columns["derivative"] = -parameters.derivative_gain * acting * (1.0 - parameters.filter_step) ** count
     if parameters.velocity_gain != 0.0:
         columns["ahead"] = parameters.velocity_gain * (1.0 - parameters.velocity_step) ** (count + 1)
+    if parameters.friction != 0.0:
+        # Which way the reference moved before the window holds until it moves in it.
+        columns["direction"] = parameters.friction * (np.cumsum(reference != reference[0]) == 0)
     if parameters.notch_gain != 0.0:
         for name in columns.keys() & {"integral", "derivative"}:
             columns[name] = behind_notch(parameters, np.asarray(columns[name], dtype=float), 0.0, 0.0)
@@ -180,6 +188,8 @@ def _factors(
     steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
     # What the law's state before the window leaves in it.
     initial = [terms.acting, *(1.0 - steps) ** np.arange(voltage.size)]
+    if parameters.friction != 0.0:
+        initial += [np.where(np.cumsum(reference != reference[0]) == 0, 1.0, 0.0)]
     initial += _notch_columns(parameters, voltage.size).values() if parameters.notch_gain != 0.0 else ()
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
@@ -240,10 +250,11 @@ def _law_terms(parameters: LawParameters, reference: Array, position: Array) -> 
         "Ki": {"integral_step": parameters.integral_step},
         "Kd": {"derivative_gain": parameters.derivative_gain},
         "velocity feedforward": {"velocity_gain": parameters.velocity_gain},
+        "friction feedforward": {"friction": parameters.friction},
     }
     nothing = parameters._replace(
         voltage_limit=math.inf, rate_step=math.inf, tracking_step=0.0, feedforward=0.0,
-        Kp=0.0, integral_step=0.0, derivative_gain=0.0, velocity_gain=0.0,
+        Kp=0.0, integral_step=0.0, derivative_gain=0.0, velocity_gain=0.0, friction=0.0,
     )  # fmt: skip
     _, acting = run_law(nothing, start, reference, position)
     runs = {name: run_law(nothing._replace(**gain), start, reference, position)[0] for name, gain in stated.items()}

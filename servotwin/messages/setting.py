@@ -22,6 +22,8 @@ class Gains(Struct, frozen=True):
         True: inside the dead zone only the integral stops; otherwise the loop opens there.
     velocity_feedforward, velocity_time : float
         V s/m, and s of its low-pass filter.
+    friction_feedforward : float
+        V, with the sign of the reference's last change.
     notch_hz, notch_damping, notch_depth : float
         Centre of the notch (Hz; 0: none), damping ratio of its poles, gain at its centre.
     """
@@ -36,6 +38,7 @@ class Gains(Struct, frozen=True):
     integral_only: bool = False
     velocity_feedforward: float = 0.0
     velocity_time: float = 0.1
+    friction_feedforward: float = 0.0
     notch_hz: float = 0.0
     notch_damping: float = 0.5
     notch_depth: float = 0.1

@@ -41,6 +41,8 @@ class Shape:
         A state "friction" (N m, Coulomb's on the motor's shaft) and the modes of stick and slip.
     feedforward, offset : bool
         States of those names (V, always added to the controller's voltage); the offset decays.
+    push : bool
+        A state "push" (V, always added): the friction feedforward with the sign of the reference's last change.
     """
 
     reference: int = 0
@@ -52,6 +54,7 @@ class Shape:
     friction: bool = False
     feedforward: bool = False
     offset: bool = False
+    push: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +164,16 @@ def degree(pieces: PiecewiseCubic) -> int:
 
 
 def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
-    """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in the feedforward only."""
+    """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in constant feedforwards
+    only."""
     return _one_continuous_loop(servo, without_feedforward(controller), shape)
 
 
 def without_feedforward(controller: Controller) -> Controller:
-    """Controller without its feedforward, which the automaton holds as a state: equal ones share an automaton."""
-    return controller.replace(feedforward=0.0) if controller.feedforward else controller
+    """Controller without the feedforwards that the automaton holds as states: equal ones share an automaton."""
+    if not (controller.feedforward or controller.friction_feedforward):
+        return controller
+    return controller.replace(feedforward=0.0, friction_feedforward=0.0)
 
 
 @lru_cache(maxsize=64)
@@ -270,8 +276,8 @@ def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, err
 
     With `integral_only` the integral stops inside, and the rest goes on.
     """
-    # The feedforward and the offset act inside the dead zone too.
-    always = basis.row("feedforward") + basis.row("offset")
+    # Feedforwards and the offset act inside the dead zone too.
+    always = basis.row("feedforward") + basis.row("offset") + basis.row("push")
     if "lagging" in basis:
         ahead = basis.row("reference") - basis.row("lagging")
         always = always + controller.velocity_feedforward / controller.velocity_time * ahead
@@ -331,7 +337,7 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
     names += [name for key in INPUTS for name in input_names(key, getattr(shape, key))]
     names += ["voltage limit"] if controller.voltage_limit is not None else []
     names += ["noise"] if shape.noise else []
-    names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
+    names += [name for name in ("feedforward", "offset", "push") if getattr(shape, name)]
     return names + _constants(shape.bias, shape.friction)
 
 

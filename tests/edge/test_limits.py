@@ -48,6 +48,8 @@ def judged(gains: Gains, limits: Limits, old: Gains = OWN, seconds: float = 10.0
         ({"leave": 4.1}, False),
         ({"feedforward": -0.25}, True),
         ({"feedforward": 0.26}, False),
+        ({"friction_feedforward": -0.25}, True),
+        ({"friction_feedforward": 0.26}, False),
         ({"velocity_feedforward": -400.0}, True),
         ({"velocity_feedforward": 401.0}, False),
         ({"velocity_feedforward": 401.0, "velocity_time": 0.2}, True),

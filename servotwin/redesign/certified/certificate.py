@@ -60,6 +60,8 @@ class Demands:
     ----------
     tail, tolerance : float
         m: largest error of a machine in the last part, widest dead zone.
+    friction_limit : float
+        V, largest friction feedforward.
     scales : tuple of float
         Factors on Kp and Kd.
     shapes : tuple of (float, float)
@@ -137,6 +139,13 @@ class Demands:
             "none."
         ),
     ] = True
+    friction_feedforward: Annotated[
+        bool,
+        key(
+            help="Candidates with a friction feedforward are tried too, where friction is known; false for machines "
+            "whose own controller has none."
+        ),
+    ] = True
     notch: Annotated[
         bool,
         key(
@@ -146,6 +155,7 @@ class Demands:
     ] = True
     tail: float = math.inf
     tolerance: float = math.inf
+    friction_limit: float = math.inf
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))

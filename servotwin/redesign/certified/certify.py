@@ -171,8 +171,9 @@ def _for_disturbance(demands: Demands, disturbed: bool) -> Demands:
 def candidates_of(
     servo: Servo, uncertainty: Uncertainty, demands: Demands, disturbed: bool, noisy: bool
 ) -> list[Design]:
-    """Every combination of scales, shapes, velocity feedforward, integral action and dead zone within the bounds on Ms.
+    """Every combination of scales, shapes, feedforwards, integral action and dead zone within the bounds on Ms.
 
+    The friction that acts on every machine is fed forward, all of it or none: more would push.
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
     candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
     reference that stops the integral only.
@@ -185,6 +186,7 @@ def candidates_of(
     integral = demands.integral if disturbed else (0.0,)
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
+    laws += _with_friction(servo, laws, uncertainty.friction[0], demands)
     plain = [Design(law) for law in laws]
     plain += [stopped for law in laws if law.Ki for stopped in _stopped(servo, law, uncertainty.step[0], demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
@@ -200,6 +202,16 @@ def _with_velocity(servo: Servo, law: Controller, demands: Demands) -> list[Cont
     shares = demands.velocity if demands.velocity_feedforward and own > 0.0 else ()
     time = _VELOCITY_TIME * needed / own if shares else law.velocity_time
     return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
+
+
+def _with_friction(servo: Servo, laws: list[Controller], friction: float, demands: Demands) -> list[Controller]:
+    """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
+    every reversal what it holds against it."""
+    push = min(friction * servo.R / servo.k_T, demands.friction_limit)
+    if not demands.friction_feedforward or not push:
+        return []
+    push = math.copysign(push, servo.controller.Kp)
+    return [law.replace(friction_feedforward=push) for law in laws if not law.Ki]
 
 
 def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:

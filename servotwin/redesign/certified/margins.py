@@ -212,7 +212,7 @@ def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share:
 def unfed(law: Controller) -> Controller:
     """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
     plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
-    return plain.replace(velocity_feedforward=0.0, velocity_time=1.0)
+    return plain.replace(velocity_feedforward=0.0, velocity_time=1.0, friction_feedforward=0.0)
 
 
 def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
