@@ -32,6 +32,7 @@ def same(one, other):
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in MEASURES)
 
 
+@pytest.mark.slow
 def test_a_cell_is_the_run_from_rest():
     settings = MapSettings(PAPER, WORN, members=1, **QUICK)
     found, rate = whole(settings), settings.sample_rate

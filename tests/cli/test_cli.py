@@ -175,6 +175,7 @@ main()
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals")
 @pytest.mark.parametrize("program", [IN_AN_IMPORT, WHILE_COMPILING], ids=["in an import", "while compiling"])
 def test_a_process_ends_with_130_and_one_line_wherever_it_is_interrupted(tmp_path, program):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exploration import extent
 
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Recording, Scenario
@@ -142,9 +143,10 @@ def test_a_move_of_the_reference_ends_the_probing_move_one_sample_later(
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
     bad = LinkSettings(delay_s=0.5, loss=0.5, duplicate=0.3)
-    for seed in range(4):
+    for seed in range(extent(2, 8)):
         scenario = calm(ExcitationSettings(), recording=SHORT, reference=SquareWave(1e-3, 20.0), seed=seed, uplink=bad)
         recording = Recording(retry=Retry(2.0), window=1.0, longest_window=2.0, longest_pre_trigger=0.3)
         twin = scenario.twin.replace(retry=2.0, attempts=20)

@@ -45,6 +45,7 @@ def loop(units: Units) -> Loop:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", [Units(time=2.0**-8), Units(2.0**8, 2.0**-20, 2.0**7)])
 def test_edge_and_twin_do_the_same_on_a_machine_in_other_units(units: Units) -> None:
     here, there = loop(Units()), loop(units)

@@ -30,6 +30,7 @@ def estimator(tmp_path, method, lines):
     return load(tmp_path, SHORT.replace("[gap]", text)).twin.estimator
 
 
+@pytest.mark.slow
 def test_every_key_of_the_papers_estimator_is_read(tmp_path):
     lines = ["padding = 'even'", "origin = 'first'", "lowpass_order = 4", "padding_samples = 9", "iterations = 7"]
     lines += ["reversals = 2", "rest_speed_rad_per_s = 0.2", "contact_travel_deg = 1", "method_error_deg = 2"]

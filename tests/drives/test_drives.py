@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from machines import machine, plant_file
+from machines import machine, plant_file, served
 from numpy.typing import NDArray
 
 from servotwin.control import law
@@ -102,7 +102,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
 def test_a_dead_zone_is_set_as_it_is_and_parameters_of_no_controller_change_nothing(tmp_path: Path) -> None:
     gains = Gains(1.0, 2.0, 3.0, 0.1)
     path = plant_file(tmp_path, "supervise", 4.0)
-    with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
+    with served(path) as address, closing(SimulatedSupervised(address)) as drive:
         drive.connect()
         blocks = [drive.read(2990)]
         for bad in (-1.0, np.inf):
@@ -124,7 +124,7 @@ def test_a_dead_zone_is_set_as_it_is_and_parameters_of_no_controller_change_noth
 def test_a_killed_edge_reconnects_to_the_running_machine(tmp_path: Path) -> None:
     """In supervise nothing is missing either, as long as the machine keeps it."""
     path = plant_file(tmp_path, "supervise", speed=20.0, endless=True)
-    with machine(path) as (address, _), closing(SimulatedSupervised(address)) as drive:
+    with served(path) as address, closing(SimulatedSupervised(address)) as drive:
         drive.connect()
         first, name = drive.read(), drive.machine
         drive.close()
@@ -143,7 +143,7 @@ def test_a_killed_edge_reconnects_to_the_running_machine(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_a_paced_machine_runs_on_without_its_edge(tmp_path: Path) -> None:
     path = plant_file(tmp_path, "control", speed=5.0, endless=True)
-    with machine(path) as (address, _), closing(SimulatedControl(address)) as drive:
+    with served(path) as address, closing(SimulatedControl(address)) as drive:
         drive.connect()
         numbers = [_ticked(drive).number for _ in range(200)]
         assert numbers == list(range(numbers[0], numbers[0] + 200))
@@ -174,7 +174,7 @@ def test_an_edge_that_sleeps_misses_its_ticks(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_voltage_that_is_no_number_lets_the_last_one_hold(tmp_path: Path) -> None:
-    with machine(plant_file(tmp_path, "control", 1.0)) as (address, _), closing(SimulatedControl(address)) as drive:
+    with served(plant_file(tmp_path, "control", 1.0)) as address, closing(SimulatedControl(address)) as drive:
         drive.connect()
         positions = []
         for voltage in (0.5, np.nan, np.inf, None):
@@ -213,7 +213,7 @@ def test_wrong_roles_protocols_and_missing_machines_are_refused(tmp_path: Path) 
 
 @pytest.mark.slow
 def test_rubbish_from_a_client_ends_that_client_only(tmp_path: Path) -> None:
-    with machine(plant_file(tmp_path, "supervise", 1.0)) as (address, _):
+    with served(plant_file(tmp_path, "supervise", 1.0)) as address:
         for rubbish in (b"", b"GET / HTTP/1.1\r\n\r\n", wire.HELLO.pack(wire.MAGIC, 99, wire.SUPERVISE)):
             host, port = address.split(":")
             with socket.create_connection((host, int(port))) as line:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +31,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.simulation import Run, Simulation
 
-pytest.importorskip("asyncua")
+pytestmark = pytest.mark.skipif(find_spec("asyncua") is None, reason="the extra opcua is not installed")
 
 SERVER = Path(__file__).parents[1] / "support" / "opcua_machine.py"
 CHANNELS = ("reference", "theta_m", "position", "voltage")
@@ -46,7 +47,7 @@ def free_url() -> str:
 @contextmanager
 def server(folder: Path, **options: Any) -> Iterator[tuple[str, subprocess.Popen[str]]]:
     """A running server: its URL and its process, killed in the end."""
-    plant = plant_file(folder, "supervise", SIMULATED, endless=True, block_s=0.02)
+    plant = plant_file(folder, "supervise", SIMULATED, endless=True, block_s=0.05)
     arguments = {"plant": str(plant), "url": free_url(), **options}
     process = subprocess.Popen(
         [sys.executable, str(SERVER), json.dumps(arguments)],

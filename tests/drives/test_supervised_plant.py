@@ -44,6 +44,7 @@ def advance(plant: SupervisedPlant, blocks: int) -> np.ndarray:
     return np.hstack(read)
 
 
+@pytest.mark.slow
 def test_a_reader_that_is_behind_receives_many_blocks_at_once(plant: SupervisedPlant) -> None:
     at_once = advance(plant, 12)
     block = plant.read(5, 100)

@@ -5,6 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
+from exploration import extent
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -137,11 +138,11 @@ def test_a_gap_that_grows_within_the_window():
 
 @pytest.mark.slow
 def test_stated_spread_is_that_of_many_fits():
-    """The same window in 24 white noises; the stated spread carries the settings' inflation of 1.2."""
+    """The same window in 16 white noises; the stated spread carries the settings' inflation of 1.2."""
     run = run_of("paper", 10.0, False, False)
     servo, rng, errors, stated = scaled(run.servo, **WRONG), np.random.default_rng(8), [], []
     clean = Window.from_run(run, 5.0, 1.0)
-    for _ in range(24):
+    for _ in range(16):
         window = clean.replace(position=clean.position + FLOOR * rng.standard_normal(clean.position.size))
         found = estimate_jointly(window, servo, prior=math.radians(9.0))
         errors.append(found.gap.gap - math.radians(10.0))
@@ -151,10 +152,11 @@ def test_stated_spread_is_that_of_many_fits():
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_random_windows_are_right_or_refused():
     """Quiet, one contact, straddling a step, calm loops; wrong structures, and k_B wrong without the angle."""
     rng, accepted, travelled = np.random.default_rng(21), 0, 0
-    for index in range(5):
+    for index in range(extent(4, 5)):
         servo, gap = Servo.preset(("paper", "table1")[index % 2]), math.radians(rng.uniform(0.0, 25.0))
         controller = servo.controller.replace(Ki=servo.controller.Ki * rng.choice([0.0, 1.0, 1.0]))
         tolerance = rng.choice([None, servo.tolerance_for(gap)])

@@ -50,6 +50,7 @@ def problem_of(case, prior=ROUGH, noise=1e-6):
     return FreeProblem(slow, Autoregression.white(noise), MODEL, prior, 2.0 * float(np.ptp(slow.theta_m))), points
 
 
+@pytest.mark.slow
 def test_one_contact_with_a_model_a_little_off_is_not_taken_for_two():
     """It was: 37.81 deg, ok, 37.68 .. 37.94 deg, where the gap is 54.31 deg and the damping 5.7 % off."""
     machine = MODEL.replace(c=tuple(1.0568 * MODEL.dampings))

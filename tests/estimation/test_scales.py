@@ -88,6 +88,7 @@ def test_the_loop_sets_the_time_of_a_stiff_machine() -> None:
     assert scales(stiff).time == pytest.approx(0.1 * SERVO.k_B / (SERVO.controller.Kp * SERVO.p) / 0.0456, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", ELSEWHERE)
 def test_a_simulation_is_the_same_motion_with_as_many_events(units: Units) -> None:
     here, there = loop(HERE), loop(units)
@@ -96,6 +97,7 @@ def test_a_simulation_is_the_same_motion_with_as_many_events(units: Units) -> No
     assert len(there.events) == len(here.events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("units", ELSEWHERE)
 def test_estimates_are_the_same(units: Units) -> None:
     servo = scaled(SERVO, *units)

@@ -31,6 +31,7 @@ def fitted(case, machine=NAMEPLATE):
     return whitened.fit(case.window, case.servo, None, whitened.WhitenedSettings(), machine)
 
 
+@pytest.mark.slow
 def test_a_lower_bound_lies_below_the_gap_of_a_machine_with_a_soft_screw():
     """It lay up to 0.5 deg above: the lead was that of a rigid screw, and of a fit that had stopped early."""
     bounds = []

@@ -105,6 +105,7 @@ def test_a_prediction_may_be_split(step, share):
     np.testing.assert_allclose(halves.covariance, whole.covariance, rtol=1e-9, atol=1e-15)
 
 
+@pytest.mark.slow
 @given(st.floats(1e-3, 1e3), st.floats(1e-3, 1e3))
 def test_units_do_not_matter(angle, clock):
     """Angles times `angle`, times times `clock`: the settings carry their units, so every answer scales with them."""

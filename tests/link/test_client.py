@@ -169,6 +169,7 @@ def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_withou
     assert sender.step(3.0).window == ("b0", 0)
 
 
+@pytest.mark.slow
 @examples(40, deadline=None)
 @given(FAULTS)
 def test_every_window_is_delivered_once_or_counted(

@@ -77,6 +77,7 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
     assert "at most 60 deg are certified: nothing is sent" in made.reason
 
 
+@pytest.mark.slow
 def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(policy: CertifiedPolicy) -> None:
     """The fallback set is verified for an unknown bias, without a bound on the overshoot."""
     strict = replace(policy, demands=replace(SMALL, overshoot=1e-6))

@@ -88,6 +88,7 @@ def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
         Uncertainty().replace(kk=0.1)
 
 
+@pytest.mark.slow
 def test_a_loop_that_never_reaches_a_gain_of_one_is_refused() -> None:
     """A stiff spring to the ground holds the first mass: without integral action nothing crosses over."""
     held = SERVO.replace(k=(1e6, 1e4, 1e4), k_d=1e6)

@@ -62,6 +62,7 @@ def watched(plant: Servo, setting: Setting) -> bool:
     return watch.update(0, *parts) is None and watch.verified
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("factors", OFF_BY)
 def test_a_learnt_machine_stays_in_the_band_that_is_predicted_on_it(factors: tuple[float, ...]) -> None:
     plant, before = adapted(SERVO, np.log(factors)), POLICY.redesign(evidence())

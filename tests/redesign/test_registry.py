@@ -124,7 +124,7 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
 @pytest.mark.slow
 def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InvalidInput, match=r"no fallback set for the servo's stated range: none of \d+ candidates"):
-        load(tmp_path, "[twin.demands]\nsettled_percent = 100")
+        load(tmp_path, "[twin.demands]\nsettled_percent = 100\nvelocity_feedforward = false")
 
 
 def test_an_unstable_loop_is_refused_under_every_policy(tmp_path):

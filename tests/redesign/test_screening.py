@@ -45,6 +45,7 @@ def fully_ranked(question: Question, candidates: list[Design]) -> list[Design]:
     return [candidates[k] for k in sorted(range(len(candidates)), key=rank)]
 
 
+@pytest.mark.slow
 def test_the_order_is_that_of_all_candidates_on_all_machines() -> None:
     question, every = question_and_candidates()
     candidates = every[::7]
@@ -69,6 +70,7 @@ def test_the_first_candidates_cost_fewer_simulations(monkeypatch: pytest.MonkeyP
     assert runs < 0.5 * len(candidates) * DEMANDS.screened * DEMANDS.conditions
 
 
+@pytest.mark.slow
 def test_only_those_that_meet_the_demands_come_first() -> None:
     """On a machine with an unknown bias some candidates leave too much of an error."""
     question, every = question_and_candidates()
@@ -78,6 +80,7 @@ def test_only_those_that_meet_the_demands_come_first() -> None:
     assert list(Screening(question).ranked(candidates, passing=True)) == expected
 
 
+@pytest.mark.slow
 def test_candidates_that_are_not_plain_can_be_dropped_on_the_way() -> None:
     question, every = question_and_candidates()
     candidates = every[::7]

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exploration import extent
 from scipy import stats
 
 from servotwin.commissioning.edge_settings import guarding
@@ -73,6 +74,7 @@ def test_three_hundred_machines_without_a_failure_show_ninety_nine_percent() -> 
 # --- the loop that runs
 
 
+@pytest.mark.slow
 def test_a_loop_that_its_rate_makes_unstable_is_refused_in_a_sentence() -> None:
     """In continuous time the same gains are certified."""
     with pytest.raises(InvalidInput, match=r"at 50 Hz with up to 3 samples of delay; none is stable there") as caught:
@@ -130,7 +132,7 @@ def test_no_plant_of_the_stated_set_exceeds_the_worst_Ms(rate: float | None) -> 
     servo = SERVO.replace(sample_rate=rate)
     demands = Demands(integral=(0.0,))
     laws = [setting.controller for setting in candidates_of(servo, Uncertainty(), demands, False, False)]
-    fresh = draw_independently(servo, widened(Uncertainty(), demands), 512, 11)
+    fresh = draw_independently(servo, widened(Uncertainty(), demands), extent(256, 512), 11)
     plants = PlantSet.of([plant.plant() for plant in fresh.plants], rate)
     for law in laws:
         for delay in (0,) if rate is None else (0, 3):
@@ -164,12 +166,13 @@ def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> N
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
 def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
     found = certify(servo, known)
     assert isinstance(found, Certificate), found
-    members = draw_independently(servo, known, 1024, 99)
+    members = draw_independently(servo, known, extent(512, 1024), 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
 
@@ -203,6 +206,7 @@ def motor(back_emf: float, friction: float, bias: float, std: float) -> LearntMo
     return LearntMotor((back_emf, 0.0, friction, bias), tuple(np.diag(spreads).ravel().tolist()), 0.0)
 
 
+@pytest.mark.slow
 def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_friction_hides() -> None:
     policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5,)))
     gap, spread = 10.0 * DEG, 0.02 * DEG
@@ -252,6 +256,7 @@ def test_a_running_setting_that_is_hardly_dearer_stays(share: float, stays: bool
     assert again.certificate.cost <= 1.1 * best.cost
 
 
+@pytest.mark.slow
 def test_settings_are_compared_on_the_steps_that_the_machine_makes_and_verified_on_all() -> None:
     """A gentle loop is the cheaper one where the gap is a large part of the step."""
     one = replace(SMALL, shapes=((1.0, 1.0),), learnt_shapes=(), notch=False)
@@ -294,6 +299,7 @@ def test_a_velocity_feedforward_makes_moves_quicker_at_the_same_margins() -> Non
     assert fed.overshoot < 0.25
 
 
+@pytest.mark.slow
 def test_a_first_voltage_at_rest_may_be_frictions_and_is_not_fed_forward() -> None:
     policy = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1)), replace(SMALL, scales=(0.5, 0.7)))
     gap, spread = 10.0 * DEG, 0.02 * DEG

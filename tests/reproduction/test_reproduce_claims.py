@@ -128,6 +128,7 @@ def test_fig_12_is_lost_where_it_is_known_to_be(runs):
     assert number(found, "to 30 deg: gap where the first begins") == pytest.approx(19.44, abs=0.01)
 
 
+@pytest.mark.slow
 def test_the_bias_with_a_known_gap_is_the_known_one(runs):
     found = runs["paper"].get(TwinJob("paper", exact=True)).trace.steps
     assert max(abs(step.bias) for step in found) == pytest.approx(0.072e-3, abs=0.001e-3)

@@ -26,6 +26,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_against_an_interpreted_loop(name: str) -> None:
     """The edge's tick on plain floats, with noise and a coarse sensor, and an exact plant that shares no code."""

@@ -46,6 +46,7 @@ def test_members_are_runs() -> None:
             assert np.abs(members[name][i, j, k] - values).max() <= 1e-9 * np.abs(values).max(), (i, j, k, name)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0, 1, 3])
 @pytest.mark.parametrize("resolution", [0.0, 1e-6])
 def test_delayed_members_follow_an_interpreted_loop(delay: int, resolution: float) -> None:

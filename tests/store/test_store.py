@@ -263,6 +263,7 @@ def test_no_message_is_lost_when_results_and_messages_are_committed_at_once(stor
     assert taken == total
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("url", ["mysql://u:secret@h/d", "postgresql://u:secret@h:port/d", "http://secret@h/d", ""])
 def test_an_invalid_address_is_refused_without_showing_its_password(url: str) -> None:
     with pytest.raises(InvalidInput, match=r"the store's address") as refused:

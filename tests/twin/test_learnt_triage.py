@@ -56,6 +56,7 @@ def off_twin(factors: tuple[float, ...], calm: bool, learn: bool) -> EvidenceLog
     return twin.log
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("calm", [False, True])
 @pytest.mark.parametrize("factors", OFF_BY)
 def test_a_learnt_machine_is_news_only_where_its_gap_moves(factors: tuple[float, ...], calm: bool) -> None:

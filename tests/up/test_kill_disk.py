@@ -12,7 +12,7 @@ from killing import by_boot, check_controllers_ticked, check_exactly_once
 from records import count_stored, count_witnessed, dropped, pending, stored, witnessed
 from smalldisk import Disk, small_disk
 
-FAULT_S = 6.0
+FAULT_S = 4.0
 KINDS = ("read-only", "full")
 """In this order: for the first one the process is killed, and what a full disk left in memory would be lost."""
 
@@ -79,11 +79,11 @@ def test_the_edges_disk(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path, ["control", "supervise"])
     url = f"http://127.0.0.1:{fleet.port}"
     with small_disk(tmp_path / "ax-0", 8) as disk, deployed(fleet, url):
-        reach(fleet, count_witnessed, 6)
+        reach(fleet, count_witnessed, 4)
         for kind in KINDS:
             with fault(kind, disk, fleet.edges["ax-0"]):
                 time.sleep(FAULT_S)
-            reach(fleet, count_witnessed, 6)
+            reach(fleet, count_witnessed, 4)
         finish(fleet)
         check_controllers_ticked(fleet)
         kept, boots = Counter(stored(fleet)), by_boot(set(stored(fleet)))
@@ -99,9 +99,9 @@ def test_the_twins_disk(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path, ["control", "supervise"], store="store/twin.db")
     with small_disk(tmp_path / "store", 16) as disk, deployed(fleet, f"http://127.0.0.1:{fleet.port}"):
         for kind in KINDS:
-            reach(fleet, count_stored, 6)
+            reach(fleet, count_stored, 4)
             with fault(kind, disk, fleet.twin):
-                sufficient = collect(fleet, 8)
+                sufficient = collect(fleet, 6)
         finish(fleet)
         check_exactly_once(fleet, sufficient)
         check_controllers_ticked(fleet)

@@ -274,18 +274,21 @@ class CertifiedPolicy:
         fed, _ = self._input_bias(evidence)
         if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
             return True
-        sticks = self._friction(evidence)[1] > 0.0
-        if evidence.tuned_for is None and sticks and self._motor(evidence) is not None:
-            # The fallback set is verified for the stated friction only.
+        low, high = self._friction(evidence)
+        sticks = high > 0.0
+        if sticks and self._motor(evidence) is not None and (evidence.tuned_for is None or (low > 0.0 and gains.Ki)):
+            # The fallback set is verified for the stated friction only, and an integral is not all that friction allows
+            # once it is known.
             return True
         return (gains.Ki != 0.0) != sticks and len(evidence.rests) > 0
 
     def _motor(self, evidence: Evidence) -> LearntMotor | None:
         """The learnt motor, where it tells friction and bias well enough to act on them: to a small voltage, or to a
-        share of the one at rest, which is then of one or of the other."""
-        motor, enough, rest = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer, evidence.disturbance.bias
-        if math.isfinite(rest):
-            enough = max(enough, _TELLS * abs(rest))
+        share of the largest one of the last rests, which is then of one or of the other: at a single rest they may
+        cancel."""
+        motor, enough = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
+        rests = (*evidence.rests, evidence.disturbance.bias)
+        enough = max(enough, *(_TELLS * abs(rest) for rest in rests if math.isfinite(rest)))
         known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= enough
         return motor if known else None
 
