@@ -185,11 +185,11 @@ def speeds(flows: Array) -> tuple[Array, Array]:
 def shared_flows(flows: Array) -> NDArray[np.int64]:
     """(M,) index of each mode's flow among the different ones of (..., M, n, n), in the order of appearance."""
     result: list[int] = []
-    first = flows.reshape(-1, *flows.shape[-3:])[0]
+    # The flows of the first automaton tell most of them apart; the sum makes one zero of both.
+    first = [(each + 0.0).tobytes() for each in flows.reshape(-1, *flows.shape[-3:])[0]]
     for m in range(flows.shape[-3]):
-        # The flows of the first automaton tell most of them apart.
-        one, here = first[m], flows[..., m, :, :]
-        same = (k for k in range(m) if np.array_equal(first[k], one) and np.array_equal(flows[..., k, :, :], here))
+        here = flows[..., m, :, :]
+        same = (k for k in range(m) if first[k] == first[m] and np.array_equal(flows[..., k, :, :], here))
         result.append(next((result[k] for k in same), max(result, default=-1) + 1))
     return np.array(result)
 

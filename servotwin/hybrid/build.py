@@ -7,7 +7,7 @@ import numpy as np
 from servotwin.hybrid.automaton import Array, Automaton
 from servotwin.hybrid.compiled import bare, subroutine
 from servotwin.hybrid.exponential import next_power, rebase, start_powers
-from servotwin.hybrid.flow import product
+from servotwin.hybrid.flow import listed_product, product
 from servotwin.hybrid.tables import (
     NODES_COARSE,
     NODES_FINE,
@@ -40,7 +40,7 @@ def numbers_of(automaton: Automaton, guards: int) -> Numbers:
 def build_tables(automaton: Automaton, step: float) -> Tables:
     """All tables of `automaton` for one search step in seconds."""
     tables = empty_tables(automaton)
-    fill_tables(tables, numbers_of(automaton, tables.guards), step, True, new_workspace(tables))
+    fill_tables(tables, numbers_of(automaton, tables.guards), step, NODES_FINE, new_workspace(tables))
     return tables
 
 
@@ -82,15 +82,21 @@ def _fill_single(t: Tables, mode: int) -> None:
 @subroutine
 def _fill_orders(t: Tables, numbers: Numbers, flow: int, mode: int, step: float, w: Workspace) -> None:
     """The terms ``(A s)**k / k!`` of a part's flow, k = 1 .. PART_TERMS, transposed side by side."""
-    n, stride = t.states, t.states * PART_TERMS
+    n, stride, p = t.states, t.states * PART_TERMS, w.powers
     base, source = flow * n * stride, mode * n * n
-    for i in range(n):
+    moving = p.moving[: p.movers[0]]
+    part = w.row[: moving.size]
+    for at in range(base, base + n * stride):
+        t.flow_part[at] = 0.0
+    for i in moving:
         for j in range(n):
             w.powers.term[j] = numbers.flows[source + i * n + j] * (step / PARTS)
         for k in range(PART_TERMS):
             for j in range(n):
                 t.flow_part[base + j * stride + k * n + i] = w.powers.term[j]
-            product(numbers.flows, source, n, n, w.powers.term[:n], w.next_row)
+            for j in range(moving.size):
+                part[j] = w.powers.term[moving[j]]
+            listed_product(numbers.flows, source, n, n, moving, part, w.next_row)
             for j in range(n):
                 w.powers.term[j] = w.next_row[j] * (step / PARTS) / (k + 2)
 
@@ -127,39 +133,40 @@ def _fill_guard(
 
 
 @subroutine
-def _fill_jumps(t: Tables, jumps: Array, nodes: int, flow: int, p: Powers) -> None:
-    """Jumps of one scale: the present power becomes its base, and its powers follow."""
+def _fill_jumps(t: Tables, jumps: Array, nodes: int, count: int, flow: int, p: Powers) -> None:
+    """The first jumps of one scale: the present power becomes its base, and its powers follow."""
     n = t.states
     rebase(n, p)
-    for j in range(nodes):
+    for j in range(count):
         if j > 0:
             next_power(n, p)
         _store(p, n, jumps, (flow * nodes + j) * n * n)
 
 
 @subroutine
-def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
+def _fill_flow(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, w: Workspace) -> None:
     """Everything that advances by the flow of a mode."""
     n, flow, p = t.states, t.flow_of[mode], w.powers
-    _fill_orders(t, numbers, flow, mode, step, w)
     start_powers(numbers.flows, mode * n * n, n, step / PARTS, p)
+    _fill_orders(t, numbers, flow, mode, step, w)
     base = flow * PARTS * n * n
     for i in range(n * n):
         t.jump_part[base + i] = 0.0
     for j in range(1, PARTS):
         _store(p, n, t.jump_part, base + j * n * n)
         next_power(n, p)
-    # Literals would have the function compiled once for each.
-    _fill_jumps(t, t.jump_fine, int(NODES_FINE), flow, p)
-    if blocks:
-        _fill_jumps(t, t.jump_coarse, int(NODES_COARSE), flow, p)
+    _fill_jumps(t, t.jump_fine, int(NODES_FINE), min(reach, NODES_FINE), flow, p)
+    if reach >= NODES_FINE:
+        _fill_jumps(t, t.jump_coarse, int(NODES_COARSE), int(NODES_COARSE), flow, p)
 
 
 @subroutine
-def _fill_nodes(t: Tables, table: Array, jumps: Array, nodes: int, mode: int, spacing: float, w: Workspace) -> None:
-    """The guards of a mode at the nodes of one scale."""
+def _fill_nodes(
+    t: Tables, table: Array, jumps: Array, nodes: int, count: int, mode: int, spacing: float, w: Workspace
+) -> None:
+    """The guards of a mode at the first nodes of one scale."""
     n, p = t.states, w.powers
-    for j in range(nodes):
+    for j in range(count):
         base = (t.flow_of[mode] * nodes + j) * n * n
         for i in range(n):
             for k in range(n):
@@ -195,27 +202,29 @@ def _fill_series(t: Tables, numbers: Numbers, mode: int, g: int, step: float, w:
 
 
 @bare
-def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, blocks: bool, w: Workspace) -> None:
+def _fill_mode(t: Tables, numbers: Numbers, mode: int, step: float, reach: int, w: Workspace) -> None:
     """Tables of one mode, and of its flow where no mode before it had the same."""
     if w.filled[t.flow_of[mode]] == 0:
-        _fill_flow(t, numbers, mode, step, blocks, w)
+        _fill_flow(t, numbers, mode, step, reach, w)
         w.filled[t.flow_of[mode]] = 1
     _fill_guards(t, numbers, mode, w)
-    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), mode, step, w)
+    blocks = reach >= NODES_FINE
+    # Literals would have the functions compiled once for each.
+    _fill_nodes(t, t.fine, t.jump_fine, int(NODES_FINE), NODES_FINE if blocks else 1, mode, step, w)
     if blocks:
-        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), mode, step * NODES_FINE, w)
+        _fill_nodes(t, t.coarse, t.jump_coarse, int(NODES_COARSE), int(NODES_COARSE), mode, step * NODES_FINE, w)
     for g in range(t.guard_count[mode]):
         _fill_series(t, numbers, mode, g, step, w)
     _fill_single(t, mode)
 
 
-def fill_tables(t: Tables, numbers: Numbers, step: float, blocks: bool, w: Workspace) -> None:
-    """Tables of the automaton with these numbers; `t` has its structure. Without `blocks` the coarse scale is left out,
-    for loops that only take steps."""
+def fill_tables(t: Tables, numbers: Numbers, step: float, reach: int, w: Workspace) -> None:
+    """Tables of the automaton with these numbers; `t` has its structure. `reach` are the steps that a loop takes at
+    once: what only blocks need is left out where it is fewer than a fine block has."""
     w.filled[:] = 0
     # Not compiled: all that a compiled function calls is compiled once more with it.
     for mode in range(len(t.guard_count)):
-        _fill_mode(t, numbers, mode, step, blocks, w)
+        _fill_mode(t, numbers, mode, step, reach, w)
 
 
 @subroutine
@@ -233,5 +242,5 @@ def fill_entered(t: Tables, mode: int, pending: Pending) -> None:
     """Tables of a mode that is entered for the first time."""
     a = pending.automaton[0]
     numbers = Numbers(pending.flows[a], pending.rows[a], pending.resets[min(a, len(pending.resets) - 1)])
-    _fill_mode(t, numbers, mode, pending.step[a], pending.blocks[a], pending.workspace)
+    _fill_mode(t, numbers, mode, pending.step[a], pending.reach[a], pending.workspace)
     pending.filled[mode] = 1

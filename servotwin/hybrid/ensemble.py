@@ -17,7 +17,7 @@ from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
 from servotwin.hybrid.output import empty_outputs, new_output_workspace
-from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
+from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables, nothing_pending
 from servotwin.hybrid.trajectory import ZenoError
 
 _PARTS_PER_WORKER = 8
@@ -252,7 +252,7 @@ def _new_memory(family: AutomatonFamily, structure: Automaton) -> WorkerMemory:
         rows=family.guards,
         resets=family.resets,
         step=family.step,
-        blocks=np.ones(len(family.step), dtype=bool),
+        reach=np.full(len(family.step), NODES_FINE),
     )
     return WorkerMemory(
         tables,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, summed
@@ -79,12 +80,13 @@ def product(table: Array, base: int, stride: int, rows: int, x: Array, out: Arra
 
 @inlined
 def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out: Array) -> None:
-    """The same for many rows: eight columns at a time."""
+    """The same for many rows: eight columns at a time, then four, then each."""
     count, n, step = np.uint64(rows), np.uint64(x.size), np.uint64(stride)
     at: Any = np.uint64(base)
     eights = n // np.uint64(8)
-    for r in range(count):
-        out[r] = 0.0
+    if eights == 0:
+        for r in range(count):
+            out[r] = 0.0
     for block in range(eights):
         j = block * np.uint64(8)
         x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
@@ -96,16 +98,81 @@ def tall_product(table: Array, base: int, stride: int, rows: int, x: Array, out:
         f = e + step
         g = f + step
         h = g + step
-        for r in range(count):
-            out[r] += ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
-                (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
-            )
+        # The first ones are stored: to clear and to add would be one more way through memory.
+        if block == 0:
+            for r in range(count):
+                out[r] = ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
+        else:
+            for r in range(count):
+                out[r] += ((table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
         at = h + step
-    for rest in range(eights * np.uint64(8), n):
+    begin: Any = eights * np.uint64(8)
+    if n - begin >= np.uint64(4):
+        x0, x1, x2, x3 = x[begin], x[begin + np.uint64(1)], x[begin + np.uint64(2)], x[begin + np.uint64(3)]
+        b = at + step
+        c = b + step
+        d = c + step
+        for r in range(count):
+            out[r] += (table[at + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
+        at = d + step
+        begin += np.uint64(4)
+    for rest in range(begin, n):
         factor = x[rest]
         for r in range(count):
             out[r] += table[at + r] * factor
         at += step
+
+
+@inlined
+def listed_product(
+    table: Array, base: int, stride: int, rows: int, which: NDArray[np.int64], x: Array, out: Array
+) -> None:
+    """The same for columns that are listed: ``out[r] = sum of table[base + which[j] * stride + r] * x[j]``."""
+    count, n, step, first = np.uint64(rows), np.uint64(x.size), np.uint64(stride), np.uint64(base)
+    eights = n // np.uint64(8)
+    if eights == 0:
+        for r in range(count):
+            out[r] = 0.0
+    for block in range(eights):
+        j = block * np.uint64(8)
+        x0, x1, x2, x3 = x[j], x[j + np.uint64(1)], x[j + np.uint64(2)], x[j + np.uint64(3)]
+        x4, x5, x6, x7 = x[j + np.uint64(4)], x[j + np.uint64(5)], x[j + np.uint64(6)], x[j + np.uint64(7)]
+        a = first + np.uint64(which[j]) * step
+        b = first + np.uint64(which[j + np.uint64(1)]) * step
+        c = first + np.uint64(which[j + np.uint64(2)]) * step
+        d = first + np.uint64(which[j + np.uint64(3)]) * step
+        e = first + np.uint64(which[j + np.uint64(4)]) * step
+        f = first + np.uint64(which[j + np.uint64(5)]) * step
+        g = first + np.uint64(which[j + np.uint64(6)]) * step
+        h = first + np.uint64(which[j + np.uint64(7)]) * step
+        if block == 0:
+            for r in range(count):
+                out[r] = ((table[a + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
+        else:
+            for r in range(count):
+                out[r] += ((table[a + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)) + (
+                    (table[e + r] * x4 + table[f + r] * x5) + (table[g + r] * x6 + table[h + r] * x7)
+                )
+    begin: Any = eights * np.uint64(8)
+    if n - begin >= np.uint64(4):
+        x0, x1, x2, x3 = x[begin], x[begin + np.uint64(1)], x[begin + np.uint64(2)], x[begin + np.uint64(3)]
+        a = first + np.uint64(which[begin]) * step
+        b = first + np.uint64(which[begin + np.uint64(1)]) * step
+        c = first + np.uint64(which[begin + np.uint64(2)]) * step
+        d = first + np.uint64(which[begin + np.uint64(3)]) * step
+        for r in range(count):
+            out[r] += (table[a + r] * x0 + table[b + r] * x1) + (table[c + r] * x2 + table[d + r] * x3)
+        begin += np.uint64(4)
+    for rest in range(begin, n):
+        factor, a = x[rest], first + np.uint64(which[rest]) * step
+        for r in range(count):
+            out[r] += table[a + r] * factor
 
 
 @inlined

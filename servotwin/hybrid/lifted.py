@@ -9,14 +9,14 @@ block.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, subroutine
-from servotwin.hybrid.flow import SIGNIFICANT, tall_product
+from servotwin.hybrid.flow import listed_product, tall_product
 from servotwin.hybrid.tables import VECTOR, padded, zeros
 
 FINE = 8
@@ -27,9 +27,6 @@ BLOCK = FINE * COARSE
 """Ticks of a coarse block, and of an interval of the vast scale."""
 # Rounding of a product with a row, of the sum of its terms' sizes, in units of `SIGNIFICANT`.
 _ROUNDING = 0.01
-# Of the vast block: two million ticks, after which all that decays is gone.
-_DOUBLINGS, _GONE = 10, 1e-40
-_EVEN = 1e-11  # of what the other states make a watch deviate: rounding
 
 
 class LiftedTables(NamedTuple):
@@ -54,6 +51,8 @@ class LiftedTables(NamedTuple):
 class LiftedWorkspace(NamedTuple):
     """Working memory to fill a slot; matrices are row-major, those of many watches side by side."""
 
+    moving: NDArray[np.int64]  # N: first the states that the map moves, whose rows of M - I are not zero
+    movers: NDArray[np.int64]  # 1: how many
     map: Array  # N * N: M - I
     values: Array  # W * N: rows of the watches at a tick
     starts: Array  # W * N: thirds of their slopes over a tick, at its beginning
@@ -95,7 +94,8 @@ def new_lifted_workspace(states: int, watches: int) -> LiftedWorkspace:
     rows = (watches * n,) * 4
     points = 3 * COARSE
     sizes = (n2, *rows, watches, watches * n2, COARSE * n2, (points + 3) * n, n, *(watches * n2,) * 3, n2)
-    return LiftedWorkspace(*(zeros(size) for size in (*sizes, points * n, points)))
+    whole = np.zeros((2, max(n, 1)), dtype=np.int64)
+    return LiftedWorkspace(whole[0], whole[1, :1], *(zeros(size) for size in (*sizes, points * n, points)))
 
 
 def row_count(states: int, watches: int, intervals: int) -> int:
@@ -132,21 +132,46 @@ def cubic_weights(u: float, tilt: float) -> tuple[float, float, float, float]:
 
 
 @subroutine
+def find_moving(n: int, w: LiftedWorkspace) -> None:
+    """List the states that the map moves: all products below leave out the others, whose rows are zero in every
+    power."""
+    w.movers[0] = 0
+    for i in range(n):
+        size = 0.0
+        for j in range(n):
+            size += abs(w.map[i * n + j])
+        # Also without numbers.
+        if size != 0.0:
+            w.moving[w.movers[0]] = i
+            w.movers[0] += 1
+
+
+@subroutine
 def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
     """The powers of a scale from its first, as deviations from one; each round makes as many as there were."""
     u, stride, known = w.powers, intervals * n, 1
+    moving = w.moving[: w.movers[0]]
+    row = w.row[: moving.size]
+    mover = 0
+    for i in range(n):
+        if mover < moving.size and moving[mover] == i:
+            mover += 1
+        else:
+            for j in range(i * stride, (i + 1) * stride):
+                u[j] = 0.0
     while known < intervals:
         # The last one times all of them: D_a + (I + D_a) D_b.
         last = (known - 1) * n
-        for i in range(n):
+        for i in moving:
             at = i * stride
             for k in range(n):
-                w.row[k] = w.product[k] = u[at + last + k]
-            w.row[i] += 1.0
+                w.product[k] = u[at + last + k]
+            for k in range(moving.size):
+                row[k] = w.product[moving[k]] + (1.0 if moving[k] == i else 0.0)
             to = at + known * n
             # By way of another array: what it reads and writes side by side would not be vectorised.
             new = w.rows[: known * n]
-            tall_product(u, 0, stride, known * n, w.row, new)
+            listed_product(u, 0, stride, known * n, moving, row, new)
             for j in range(known):
                 for k in range(np.uint64(n)):
                     u[to + j * n + k] = new[j * n + k] + w.product[k]
@@ -156,21 +181,26 @@ def _fill_powers(n: int, intervals: int, w: LiftedWorkspace) -> None:
 @subroutine
 def _store_jumps(n: int, intervals: int, table: Array, slot: int, w: LiftedWorkspace) -> None:
     stride = intervals * n
-    for i in range(n):
+    begin = slot * n * stride
+    for at in range(begin, begin + n * stride):
+        table[at] = 0.0
+    for k in w.moving[: w.movers[0]]:
         for j in range(intervals):
-            for k in range(n):
-                table[(slot * n + i) * stride + j * n + k] = w.powers[k * stride + j * n + i]
+            for i in range(n):
+                table[begin + i * stride + j * n + k] = w.powers[k * stride + j * n + i]
 
 
 @subroutine
 def _double(n: int, intervals: int, power: int, watches: int, w: LiftedWorkspace) -> None:
     """``G + M' G M`` of every watch for the power of ``M`` at that place: the sums over twice as many intervals."""
     stride, width = intervals * n, watches * n
+    moving = w.moving[: w.movers[0]]
+    row = w.row[: moving.size]
     for i in range(n):
-        for k in range(n):
-            w.row[k] = w.powers[k * stride + power * n + i]
+        for k in range(moving.size):
+            row[k] = w.powers[moving[k] * stride + power * n + i]
         half = w.half[i * width : (i + 1) * width]
-        tall_product(w.sums, 0, width, width, w.row, half)
+        listed_product(w.sums, 0, width, width, moving, row, half)
         for j in range(width):
             half[j] += w.sums[i * width + j]
     # M' G, turned over, is G M, for G is symmetric.
@@ -179,10 +209,10 @@ def _double(n: int, intervals: int, power: int, watches: int, w: LiftedWorkspace
             for k in range(n):
                 w.turned[k * width + watch * n + i] = w.half[i * width + watch * n + k]
     for i in range(n):
-        for k in range(n):
-            w.row[k] = w.powers[k * stride + power * n + i]
+        for k in range(moving.size):
+            row[k] = w.powers[moving[k] * stride + power * n + i]
         half = w.half[i * width : (i + 1) * width]
-        tall_product(w.turned, 0, width, width, w.row, half)
+        listed_product(w.turned, 0, width, width, moving, row, half)
         for j in range(width):
             w.sums[i * width + j] += half[j] + w.turned[i * width + j]
 
@@ -191,10 +221,14 @@ def _double(n: int, intervals: int, power: int, watches: int, w: LiftedWorkspace
 def _fill_rows(n: int, intervals: int, watch: int, w: LiftedWorkspace) -> None:
     """Value row, start row and end row of a watch at all ends of the intervals, into `rows`."""
     stride = intervals * n
+    moving = w.moving[: w.movers[0]]
+    part = w.row[: moving.size]
     for kind in range(3):
         source = w.values if kind == 0 else (w.starts if kind == 1 else w.ends)
         row, first = source[watch * n : (watch + 1) * n], kind * (COARSE + 1) * n
-        tall_product(w.powers, 0, stride, stride, row, w.rows[first + n : first + n + stride])
+        for k in range(moving.size):
+            part[k] = row[moving[k]]
+        listed_product(w.powers, 0, stride, stride, moving, part, w.rows[first + n : first + n + stride])
         for k in range(n):
             w.rows[first + k] = row[k]
         for j in range(1, intervals + 1):
@@ -216,24 +250,27 @@ def _fill_level(
     """Rows of one watch at one scale, and its deviation's matrix from `sums`; `length` of an interval in ticks."""
     n, stride, starts = t.states, level_stride(t, intervals), (COARSE + 1) * t.states
     at = slot * n * stride + watch * (3 * intervals + 1 + n)
-    for i in range(intervals + 1):
-        for j in range(n):
-            column, value = at + j * stride, w.rows[i * n + j]
+    for j in range(n):
+        column, largest = at + j * stride, 0.0
+        for i in range(intervals + 1):
+            value = w.rows[i * n + j]
             table[column + i] = value
-            size = (slot * t.watches + watch) * n + j
-            t.sizes[size] = max(t.sizes[size], _ROUNDING * abs(value))
-            if i < intervals:
-                table[column + intervals + 1 + i] = length * w.rows[starts + i * n + j]
-            if i > 0:
-                table[column + 2 * intervals + i] = length * w.rows[2 * starts + i * n + j]
-    square = at + 3 * intervals + 1
-    for i in range(n):
-        for j in range(n):
-            table[square + j * stride + i] = w.sums[(i * watches + watch) * n + j]
+            largest = max(largest, abs(value))
+        size = (slot * t.watches + watch) * n + j
+        t.sizes[size] = max(t.sizes[size], _ROUNDING * largest)
+        column += intervals + 1
+        for i in range(intervals):
+            table[column + i] = length * w.rows[starts + i * n + j]
+        column += intervals
+        for i in range(intervals):
+            table[column + i] = length * w.rows[2 * starts + (i + 1) * n + j]
+        column += intervals
+        for i in range(n):
+            table[column + i] = w.sums[(i * watches + watch) * n + j]
 
 
 @subroutine
-def _add_deviation(
+def add_deviation(
     n: int, watch: int, watches: int, intervals: int, length: float, only_ends: bool, w: LiftedWorkspace
 ) -> None:
     """Make the sums of one scale those of an interval of the next: add the squares of its cubics' deviation from the
@@ -280,7 +317,7 @@ def _rebase(n: int, intervals: int, following: int, w: LiftedWorkspace) -> None:
 
 
 @subroutine
-def _fill_scale(
+def fill_scale(
     t: LiftedTables, table: Array, jumps: Array, slot: int, watches: int, intervals: int, length: int, last: bool,
     w: LiftedWorkspace,
 ) -> None:  # fmt: skip
@@ -301,7 +338,7 @@ def _fill_scale(
         _fill_rows(n, intervals, watch, w)
         _fill_level(t, table, slot, watch, watches, intervals, float(length), w)
         if not last:
-            _add_deviation(n, watch, watches, intervals, float(length), length == 1 and w.discrete[watch] > 0.0, w)
+            add_deviation(n, watch, watches, intervals, float(length), length == 1 and w.discrete[watch] > 0.0, w)
 
 
 @subroutine
@@ -316,84 +353,8 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
     for i in range(n):
         for k in range(n):
             w.powers[i * FINE * n + k] = w.map[i * n + k]
+    find_moving(n, w)
     # Literals would have the function compiled once for each.
-    _fill_scale(t, t.fine, t.jump_fine, slot, watches, int(FINE), 1, False, w)
+    fill_scale(t, t.fine, t.jump_fine, slot, watches, int(FINE), 1, False, w)
     _rebase(n, int(FINE), int(COARSE), w)
-    _fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), True, w)
-
-
-@subroutine
-def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """States from which the matrix in `product` makes others on which a watch deviates by more than rounding."""
-    n, stride = t.states, level_stride(t, COARSE)
-    sizes, row = w.powers[:n], w.powers[n : 2 * n]
-    for j in range(n):
-        t.uneven[slot * n + j] = 0.0
-    for watch in range(watches):
-        square = slot * n * stride + watch * (3 * COARSE + 1 + n) + 3 * COARSE + 1
-        for j in range(n):
-            sizes[j] = 0.0
-        for k in range(n):
-            own = math.sqrt(max(t.vast[square + k * stride + k], 0.0))
-            size = SIGNIFICANT * t.sizes[(slot * t.watches + watch) * n + k] + _EVEN * own
-            for j in range(n):
-                sizes[j] += size * abs(w.product[k * n + j])
-        for i in range(n):
-            for j in range(n):
-                row[j] = 0.0
-            for k in range(n):
-                factor = t.vast[square + i * stride + k]
-                for j in range(n):
-                    row[j] += factor * w.product[k * n + j]
-            scale = math.sqrt(max(t.vast[square + i * stride + i], 0.0))
-            for j in range(n):
-                # Also without numbers, where the powers have grown beyond all.
-                if not abs(row[j]) <= scale * sizes[j]:
-                    t.uneven[slot * n + j] = 1.0
-
-
-@subroutine
-def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """A high power of the map, from those of the vast scale in `w`, and what it leaves uneven."""
-    n, d, new = t.states, w.product, w.powers
-    for i in range(n):
-        for k in range(n):
-            d[i * n + k] = w.powers[(i + 1) * COARSE * n - n + k]
-    for _ in range(_DOUBLINGS):
-        for i in range(n):
-            row = new[i * n : (i + 1) * n]
-            for j in range(n):
-                row[j] = 2.0 * d[i * n + j]
-            for k in range(n):
-                factor = d[i * n + k]
-                for j in range(n):
-                    row[j] += factor * d[k * n + j]
-        for i in range(n * n):
-            d[i] = new[i]
-    for i in range(n * n):
-        t.settling[slot * n * n + i] = d[i]
-        whole = d[i] + (1.0 if i // n == i % n else 0.0)
-        d[i] = whole if abs(whole) > _GONE else 0.0
-    _find_uneven(t, slot, watches, w)
-
-
-@subroutine
-def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """The tables of the vast scale and of settling, from those of the coarse one and the watches in `w`."""
-    n, stride, block = t.states, level_stride(t, COARSE), (COARSE + 1) * t.states
-    for i in range(n):
-        for k in range(n):
-            w.powers[i * COARSE * n + k] = t.jump_coarse[((slot * n + k + 1) * COARSE - 1) * n + i]
-    for watch in range(watches):
-        for j in range(n):
-            at = (slot * n + j) * stride + watch * (3 * COARSE + 1 + n)
-            for i in range(COARSE + 1):
-                w.rows[i * n + j] = t.coarse[at + i]
-            for i in range(COARSE):
-                w.rows[block + i * n + j] = t.coarse[at + COARSE + 1 + i] / FINE
-                w.rows[2 * block + (i + 1) * n + j] = t.coarse[at + 2 * COARSE + 1 + i] / FINE
-            for i in range(n):
-                w.sums[(i * watches + watch) * n + j] = t.coarse[at + 3 * COARSE + 1 + i]
-        _add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
-    _fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
-    _settle(t, slot, watches, w)
+    fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), True, w)

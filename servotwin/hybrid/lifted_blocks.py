@@ -8,7 +8,7 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import inlined, subroutine
-from servotwin.hybrid.flow import SIGNIFICANT, dot, dot_sizes, product, tall_product
+from servotwin.hybrid.flow import SIGNIFICANT, dot, dot_sizes, product, tall_product, wide_product
 from servotwin.hybrid.lifted import COARSE, LiftedTables, level_stride
 from servotwin.hybrid.tables import VECTOR
 
@@ -77,7 +77,10 @@ def clean_ticks(
     """
     stride = level_stride(t, intervals)
     used = (watches * (3 * intervals + 1 + t.states) + VECTOR - 1) // VECTOR * VECTOR
-    tall_product(table, slot * t.states * stride, stride, used, z, out)
+    if t.states == 16:
+        wide_product(table, slot * t.states * stride, stride, used, z, out)
+    else:
+        tall_product(table, slot * t.states * stride, stride, used, z, out)
     clean, less, n = 0, 0.0, np.uint64(t.states)
     for watch in range(watches):
         square, at = 0.0, np.uint64(watch * (3 * intervals + 1 + t.states) + 3 * intervals + 1)
@@ -107,4 +110,7 @@ def jump(n: int, jumps: Array, slot: int, intervals: int, clean: int, z: Array, 
 @inlined
 def changes_at_ends(n: int, jumps: Array, slot: int, z: Array, out: Array) -> None:
     """Changes of the state up to the end of each interval of the vast scale, one after the other."""
-    tall_product(jumps, slot * n * COARSE * n, COARSE * n, COARSE * n, z, out)
+    if n == 16:
+        wide_product(jumps, slot * n * COARSE * n, COARSE * n, COARSE * n, z, out)
+    else:
+        tall_product(jumps, slot * n * COARSE * n, COARSE * n, COARSE * n, z, out)

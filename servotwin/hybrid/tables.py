@@ -17,13 +17,14 @@ from servotwin.hybrid.automaton import Array, Automaton, shared_flows
 
 NODES_COARSE = 16
 NODES_FINE = 8
-PARTS = 32
+PARTS = 8
 PIECES = 5
 # Doubles in two of the widest vectors.
 VECTOR = 16
-# |eigenvalue| * step <= 2 by the choice of the step: 2**24 / 24! = 3e-17, and (2 / 32)**9 / 9! = 4e-17.
+# |eigenvalue| * step <= 2 by the choice of the step: 2**24 / 24! = 3e-17, and (2 / 8)**13 / 13! = 2e-18. Fewer parts
+# with more terms, for an event costs less than one more power: most tables are those of runs with few events.
 TERMS = 24
-PART_TERMS = 8
+PART_TERMS = 12
 SPECTRAL_STEP = 2.0
 # A motion that lasts into the coarse search must turn slowly enough for a cubic over 8 steps: of 100 random pairs of
 # undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.
@@ -45,8 +46,8 @@ class Tables(NamedTuple):
     taylor: Array  # M * G * n * TERMS
     jump_coarse: Array  # F * 16 * n * n, transposed: exp(A 8 (j + 1) step) - I
     jump_fine: Array  # F * 8 * n * n, transposed
-    jump_part: Array  # F * 32 * n * n, transposed: exp(A j step / 32) - I
-    flow_part: Array  # F * n * (8 * n): the Taylor series of exp(A s step / 32) x in s, without its first term
+    jump_part: Array  # F * 8 * n * n, transposed: exp(A j step / 8) - I
+    flow_part: Array  # F * n * (12 * n): the Taylor series of exp(A s step / 8) x in s, without its first term
     single: Array  # M * n * (n + G * 4): the first of jump_fine beside Bernstein rows over one step
     rows: Array  # M * G * n
     sizes: Array  # M * G * TERMS * n: sum over the orders of abs(taylor), those of each derivative's own series
@@ -111,7 +112,7 @@ class Pending(NamedTuple):
     rows: Array  # (A, M * G * n)
     resets: Array  # (A, M * G * n * n), or (1, ...): those of all
     step: Array  # (A,) of the search, s
-    blocks: NDArray[np.bool_]  # (A,) with the coarse scale
+    reach: NDArray[np.int64]  # (A,) steps that are taken at once: with fewer than a fine block has, no blocks
     workspace: Workspace
 
 
@@ -123,7 +124,7 @@ def nothing_pending(tables: Tables) -> Pending:
         np.zeros(1, dtype=np.int64),
         *(none,) * 3,
         np.empty(0),
-        np.empty(0, dtype=bool),
+        np.empty(0, dtype=np.int64),
         new_workspace(tables),
     )
 

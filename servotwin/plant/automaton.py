@@ -16,7 +16,7 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, Guard, Mode
-from servotwin.plant.backlash import OPEN, ContactMode, contact_guards, contact_modes, screw_rate
+from servotwin.plant.backlash import OPEN, ContactMode, contact_guards, contact_modes, contact_reset, screw_rate
 from servotwin.plant.basis import Basis, GuardRow, LawNumbers, PlantNumbers, input_names, outer, plant_names, scaled
 from servotwin.plant.friction import StickSlipMode, stick_slip_guards, stick_slip_modes, stopping_speed
 from servotwin.plant.servo import Servo
@@ -151,7 +151,7 @@ class LoopParts:
 
 
 def _with(guard: Guard, row: Array, reset: Array) -> Guard:
-    return replace(guard, row=row, reset=None if guard.reset is None else reset)
+    return Guard(row, guard.target, None if guard.reset is None else reset, guard.label, guard.side)
 
 
 def degree(pieces: PiecewiseCubic) -> int:
@@ -333,6 +333,7 @@ class _System:
     def __init__(self, servo: PlantNumbers, basis: Basis, zones: tuple[Zone, ...], friction: bool) -> None:
         self.servo, self.basis, self.zones = servo, basis, zones
         self.contacts, self.frictions = contact_modes(servo), stick_slip_modes(servo, friction)
+        self._resets = {side: contact_reset(servo, basis, side) for side in (-1, 1)}
         self.combinations = [
             (contact, stick_slip, zone) for contact in self.contacts for stick_slip in self.frictions for zone in zones
         ]
@@ -362,7 +363,7 @@ class _System:
         accelerations = [self._acceleration(side, zone) for side in sides]
         ends += [
             (guard, (guard.target, stick_slip.name, zone.name))
-            for guard in contact_guards(self.servo, self.basis, contact, stopping, accelerations)
+            for guard in contact_guards(self.servo, self.basis, contact, stopping, accelerations, self._resets)
         ]
         return tuple(
             Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends

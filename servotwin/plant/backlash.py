@@ -9,7 +9,7 @@ never moves the screw, and a shrinking one pushes it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,7 +110,12 @@ def screw_rate(basis: Basis, contact: ContactMode) -> Array:
 
 
 def contact_guards(
-    servo: PlantNumbers, basis: Basis, contact: ContactMode, stopping: Array | float, accelerations: Sequence[Array]
+    servo: PlantNumbers,
+    basis: Basis,
+    contact: ContactMode,
+    stopping: Array | float,
+    accelerations: Sequence[Array],
+    resets: Mapping[int, Array],
 ) -> list[GuardRow]:
     """Guards that end a mode of the backlash.
 
@@ -120,14 +125,14 @@ def contact_guards(
         Speed at which a sliding motor has stopped.
     accelerations : sequence of (N,) rows
         Acceleration of the motor free of the load, and under all of it; used only where the motor rests on a flank.
+    resets : mapping of int to (..., N, N) array
+        `contact_reset` of either side.
     """
     side = contact.side
     if side == 0:
         apart = basis.row("theta_m") - basis.row("theta_d")
         return [
-            GuardRow(
-                s * apart - 0.5 * basis.row("gap"), "+" if s > 0 else "-", _contact_reset(servo, basis, s), "contact", s
-            )
+            GuardRow(s * apart - 0.5 * basis.row("gap"), "+" if s > 0 else "-", resets[s], "contact", s)
             for s in (1, -1)
         ]
     flank = "+" if side > 0 else "-"
@@ -135,16 +140,16 @@ def contact_guards(
         # Relative to the flank, which accelerates with the half gap.
         free, pressed = (side * row - 0.5 * basis.row("gap''") for row in accelerations)
         return [GuardRow(pressed, flank, None, "contact", side), GuardRow(-free, "open", None, "release", side)]
-    reset = _contact_reset(servo, basis, side)
     release = -side * screw_rate(basis, contact) - stopping
     if servo.rigid:
-        return [GuardRow(release, "open", reset, "release", side)]
+        return [GuardRow(release, "open", resets[side], "release", side)]
+    reset = resets[side].copy()
     # The motor stands on the flank and moves with it, at the rate of the half gap.
     reset[..., basis["speed"], :] = 0.5 * side * basis.row("gap'")
     return [GuardRow(release, f"held {flank}", reset, "hold", side)]
 
 
-def _contact_reset(servo: PlantNumbers, basis: Basis, side: int) -> Array:
+def contact_reset(servo: PlantNumbers, basis: Basis, side: int) -> Array:
     """Put the screw on its flank; the chain's damper turns a jump of the screw into one of velocity (Eq 10)."""
     chain = servo.chain()
     size, lead, first = len(basis.names), chain.B_velocity.shape[:-1], basis["chain0"]

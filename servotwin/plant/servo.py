@@ -240,7 +240,8 @@ class Servo:
         InvalidInput
             A factor is not positive and finite.
         """
-        values = {name: getattr(self, name) for name in (*_PLANT, "controller")}
+        own = self.__dict__
+        values = {name: own[name] for name in (*_PLANT, "controller")}
         for name, factor in factors.items():
             if not 0.0 < factor < math.inf:
                 raise InvalidInput(f"servo {name}: factor {factor!r} must be positive and finite")

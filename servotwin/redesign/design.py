@@ -36,7 +36,9 @@ class Design:
     def simulated(self) -> Design:
         """The design as it is simulated: as it runs, but that a law in continuous time has no rate limit."""
         law = self.controller
-        return self if law.sample_rate is not None else Design(law.replace(rate_limit=None), self.tolerance)
+        if law.sample_rate is not None or law.rate_limit is None:
+            return self
+        return Design(law.replace(rate_limit=None), self.tolerance)
 
     def noise_effort(self, noise: float, band: tuple[float, float]) -> float:
         """Voltage (V rms) caused by white measurement noise of `noise` (m rms) within `band` (Hz).

@@ -59,9 +59,14 @@ def advances_in_blocks(servo: Servo, controller: Controller, inputs: RunInputs, 
 
 
 def places_of(plant: ServoAutomaton, controller: Controller, delay: int, reference_degree: int) -> Places:
-    """Indices of the plant's, the law's and the inputs' states."""
-    names, count = plant.automaton.names, len(plant.automaton.names)
-    places = {}
+    """Indices of the plant's, the law's and the inputs' states.
+
+    Spare states of the plant, which nothing moves and nothing reads, hold the law's first ones: with the paper's servo
+    there are 16 then instead of 20, and products take a third of the time less.
+    """
+    names = plant.automaton.names
+    spare = [k for k, name in enumerate(names) if name.startswith("spare")]
+    count, places = len(names), dict[str, int]()
     for name, exists in (
         ("integral", True),
         ("derivative", True),
@@ -71,8 +76,11 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         ("past", controller.velocity_feedforward != 0.0),
         ("ahead", controller.velocity_feedforward != 0.0),
     ):
-        places[name] = count if exists else -1
-        count += exists
+        places[name] = -1
+        if exists and spare:
+            places[name] = spare.pop(0)
+        elif exists:
+            places[name], count = count, count + 1
     waiting, reference = (count if delay else -1), count + delay
     states = reference + reference_degree + 1
     return Places(

@@ -71,6 +71,35 @@ def _prepare(
         filled[slot] = 1
 
 
+@subroutine
+def _sample_states(
+    memory: LiftedMemory, places: Places, slot: int, rows: Array, begin: int, stop: int, stride: int, start: Array,
+    traces: Array,
+) -> None:  # fmt: skip
+    """Samples by way of the state at each of them: for few samples the tables of the outputs do not pay."""
+    n, lifted = places.states, memory.lifted
+    z, change = memory.out[:n], memory.out[n : 2 * n]
+    for sample in range(-(-begin // stride), -(-stop // stride)):
+        coarse, fine = divmod(sample * stride - begin, FINE)
+        for i in range(n):
+            z[i] = start[i]
+        if coarse > 0:
+            product(lifted.jump_coarse, (slot * n * COARSE + coarse - 1) * n, COARSE * n, n, start, change)
+            for i in range(n):
+                z[i] += change[i]
+        if fine > 0:
+            product(lifted.jump_fine, (slot * n * FINE + fine - 1) * n, FINE * n, n, z, change)
+            for i in range(n):
+                z[i] += change[i]
+        # The tick changes the voltage alone of all that outputs read.
+        voltage = 0.0
+        for i in range(n):
+            voltage += memory.voltage_rows[slot * n + i] * z[i]
+        z[places.voltage] = voltage
+        for o in range(len(rows)):
+            traces[o, sample] = dot(rows[o], 0, z)
+
+
 @bare
 def sample_lifted(
     segments: Segments,
@@ -96,6 +125,9 @@ def sample_lifted(
         if slot == TICKED:
             for o in range(outputs):
                 traces[o, first] = dot(rows[o], 0, start)
+            continue
+        if stride > 1 and slot >= 0 and memory.filled[slot] == 1:
+            _sample_states(memory, places, slot, rows, begin, stop, stride, start, traces)
             continue
         parts = 1
         if slot <= VAST:

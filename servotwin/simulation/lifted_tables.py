@@ -14,7 +14,8 @@ from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import product
-from servotwin.hybrid.lifted import LiftedTables, LiftedWorkspace, add_square, cubic_weights, deepen_slot, fill_slot
+from servotwin.hybrid.lifted import LiftedTables, LiftedWorkspace, add_square, cubic_weights, fill_slot
+from servotwin.hybrid.lifted_vast import deepen_slot
 from servotwin.hybrid.tables import NODES_COARSE, NODES_FINE, TERMS, Tables
 
 LINEAR, LIMITED, RATE_LIMITED = 0, 1, 2

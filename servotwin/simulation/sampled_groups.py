@@ -16,7 +16,7 @@ from servotwin.hybrid.automaton import Array, shared_flows, speeds
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
-from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables, nothing_pending
+from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.servo import Servo
@@ -228,7 +228,7 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         resets=family.resets,
         step=family.step,
         # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
-        blocks=family.searches >= NODES_FINE,
+        reach=family.searches,
     )
     return SampledWorker(
         tables,

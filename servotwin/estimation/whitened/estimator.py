@@ -145,7 +145,7 @@ class WindowFit:
             fault = likely_fault(self.window, self.angle, self.servo, evidence.unexplained, self.second)
             reasons = (*fault, *reasons)
         if status is GapStatus.OK:
-            evidence = replace(evidence, doubt=self._doubt(evidence))
+            evidence = replace(evidence, doubt=self._doubt(evidence), learnt=self.learnt is not None)
         stated = _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
         if self.learnt is None or not teaches:
             return stated
@@ -287,7 +287,6 @@ def _stated(
 ) -> GapEstimate:
     """Fill a blank estimate from the evidence."""
     fitted = evidence.aligned.whitened
-    systematic = math.hypot(settings.model_error, evidence.doubt)
     result = replace(
         blank,
         status=status,
@@ -300,17 +299,23 @@ def _stated(
         return replace(result, gap=bound, std=math.inf, std_total=math.inf, interval=(bound, math.inf))
     if status is not GapStatus.OK:
         return result
-    total = math.hypot(evidence.std, systematic)
     first = evidence.aligned.first + 0.5 * fitted.point.gap * fitted.point.place
-    result = replace(result, gap=fitted.point.gap, std=evidence.std, std_total=total, theta_d0=first)
-    result = replace(result, interval=_widened(fitted.point.gap, evidence.interval, systematic))
+    total, interval = _widened(evidence, settings)
+    result = replace(result, gap=fitted.point.gap, std=evidence.std, std_total=total, theta_d0=first, interval=interval)
     return _combined(result, prior) if settings.combine and isinstance(prior, GapEstimate) else result
 
 
-def _widened(gap: float, interval: Interval, systematic: float) -> Interval:
-    """A statistical interval with a systematic standard deviation (rad) added on both sides."""
-    extra = NORMAL_95 * systematic
-    return max(0.0, gap - math.hypot(gap - interval[0], extra)), gap + math.hypot(interval[1] - gap, extra)
+def _widened(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[float, Interval]:
+    """Standard deviation (rad) and interval of the gap with errors outside the model and the doubt in it.
+
+    Beside a machine that is being learnt the doubt is one more random part. The doubt in a model that is taken as exact
+    contains that model's own error, the same in all windows: it adds as it is.
+    """
+    gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
+    random = math.hypot(settings.model_error, evidence.doubt if evidence.learnt else 0.0)
+    added = 0.0 if evidence.learnt else evidence.doubt
+    below, above = (math.hypot(part, NORMAL_95 * random) + NORMAL_95 * added for part in (gap - low, high - gap))
+    return math.hypot(evidence.std, random) + added, (max(0.0, gap - below), gap + above)
 
 
 def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:

@@ -150,6 +150,8 @@ class FitEvidence:
     doubt : float
         rad, root mean square of what machines and sensors that are not as assumed can do to the gap; computed for
         gaps that are accepted.
+    learnt : bool
+        True: the model's numbers are free in `std` already.
     colour : float
         Share of the noise's variance that is predicted beyond that of decimated white noise; 0: white.
     """
@@ -167,6 +169,7 @@ class FitEvidence:
     count: float = 0.0
     scale: float = 0.0
     doubt: float = 0.0
+    learnt: bool = False
     colour: float = 0.0
 
     @property

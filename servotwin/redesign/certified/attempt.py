@@ -216,6 +216,8 @@ class Attempt:
 
 def with_feedforward(setting: Design, feedforward: float) -> Design:
     """The setting with another feedforward, V."""
+    if setting.controller.feedforward == feedforward:
+        return setting
     return Design(setting.controller.replace(feedforward=feedforward), setting.tolerance)
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import islice
 from time import perf_counter
 
@@ -183,14 +184,22 @@ def candidates_of(
     """
     integral = demands.integral if disturbed else (0.0,)
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
-    laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
-    plain = [Design(law) for law in laws]
-    plain += [stopped for law in laws if law.Ki for stopped in _stopped(servo, law, uncertainty.step[0], demands)]
+    plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     zone = servo.tolerance_for(uncertainty.gap[1])
-    hysteretic = [
+    if not (0.0 < zone <= demands.tolerance and noisy):
+        return plain
+    laws = [each.controller for each in plain if not each.tolerance]
+    return plain + [
         Design(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
     ]
-    return plain + hysteretic if 0.0 < zone <= demands.tolerance and noisy else plain
+
+
+@lru_cache(maxsize=16)
+def _without_zone(servo: Servo, within: tuple[Controller, ...], demands: Demands, step: float) -> tuple[Design, ...]:
+    """Candidates without a dead zone that stops the whole law, the same for every gap, for a smallest step (m)."""
+    laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
+    stopped = [each for law in laws if law.Ki for each in _stopped(servo, law, step, demands)]
+    return (*(Design(law) for law in laws), *stopped)
 
 
 def _with_velocity(servo: Servo, law: Controller, demands: Demands) -> list[Controller]:
