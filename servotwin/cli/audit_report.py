@@ -195,6 +195,8 @@ def _sent_update(update: JsonObject) -> str:
     if gains:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {gains['feedforward'] * 1e3:.1f} mV"] if gains.get("feedforward") else []
+        push = gains.get("friction_feedforward")
+        parts += [f"friction feedforward {push * 1e3:.1f} mV"] if push else []
     if verification:
         parts.append(f"verified on {verification['members']} simulated machines")
     return f"version {update['version']} sent: {', '.join(parts)}"

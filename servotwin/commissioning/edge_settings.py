@@ -46,6 +46,8 @@ _MOST_SAMPLES = 1e8  # some 10 GB of signals
 
 # Widens a box so that rounding does not exclude its own corner.
 _ROUNDING = 1.0 + 1e-9
+# Factor by which the resonance of a learnt machine may be off the model's, either way.
+_NOTCH_MOVES = 2.0
 
 
 @settings("recording")
@@ -170,12 +172,16 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     kick = max(abs(law.velocity_feedforward) / law.velocity_time for law in laws)
     widest = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values())
     factor = max(widest, kick / abs(middle["Kp"]) if kick else 0.0) * _ROUNDING
+    notches = [law.notch_hz for law in laws if law.notch_hz]
     leave = max([law.leave for law in laws] + [leave for _, leave in demands.hysteresis])
     limits = Limits(
         maximum=demands.tolerance,
         gain_factor=factor,
         integral_factor=max(demands.integral, default=0.0) * _ROUNDING,
         feedforward=policy.feedforward_limit * _ROUNDING,
+        # The centre follows the learnt machine.
+        notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,
+        notch_max_hz=max(notches, default=0.0) * _NOTCH_MOVES,
         patience_s=PATIENCE * scales(policy.servo).time,
     )
     return limits, Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, max(leave, own.leave) / factor)

@@ -1,7 +1,7 @@
 """The controller as a description: gains, dead zone, limits; frozen and validated."""
 
 from dataclasses import dataclass, fields, replace
-from math import expm1, inf, isfinite, pi, sqrt
+from math import exp, expm1, inf, isfinite, pi, sin, sqrt
 from typing import Annotated, TypedDict, Unpack
 
 from servotwin.config.keys import check, items_of, key, settings
@@ -31,6 +31,10 @@ class ControllerChanges(TypedDict, total=False):
     integral_only: bool
     velocity_feedforward: float
     velocity_time: float
+    friction_feedforward: float
+    notch_hz: float
+    notch_damping: float
+    notch_depth: float
 
 
 @settings("controller")
@@ -116,6 +120,33 @@ class Controller:
     velocity_time: Annotated[
         float, key("velocity_time_s", above=0.0, help="Time constant of the velocity feedforward's low-pass filter.")
     ] = 0.1
+    friction_feedforward: Annotated[
+        float,
+        key(
+            "friction_feedforward_v",
+            help="Voltage added with the sign of the reference's last change; it cancels Coulomb friction on the way. "
+            "The loop's margins do not depend on it.",
+        ),
+    ] = 0.0
+    notch_hz: Annotated[
+        float,
+        key(
+            minimum=0.0,
+            help="Centre of a notch on the voltage of proportional, integral and derivative action; 0: none.",
+        ),
+    ] = 0.0
+    notch_damping: Annotated[
+        float,
+        key(
+            "notch_damping",
+            above=0.0,
+            maximum=1.0,
+            help="Damping ratio of the notch's poles: half of its relative width.",
+        ),
+    ] = 0.5
+    notch_depth: Annotated[
+        float, key("notch_depth", minimum=0.0, maximum=1.0, help="Gain of the notch at its centre; 1 elsewhere.")
+    ] = 0.1
 
     def __post_init__(self) -> None:
         check(self)
@@ -163,6 +194,11 @@ class Controller:
             return self.tracking_time
         return sqrt(abs(self.Kd / self.Ki)) if self.Kd != 0.0 else abs(self.Kp / self.Ki)
 
+    @property
+    def notch_gain(self) -> float:
+        """Share of its band-pass that the notch takes away; 0: there is no notch."""
+        return 2.0 * self.notch_damping * (1.0 - self.notch_depth) if self.notch_hz else 0.0
+
     def thresholds(self, tolerance: float | None) -> tuple[float, float]:
         """Absolute (enter, leave) in m for a tolerance in m; (-1, -1), which no error meets, without dead zone.
 
@@ -187,6 +223,7 @@ class Controller:
         step = 1.0 / self.sample_rate
         # expm1: with a fast tick 1 - exp(-step / Tf) would lose the digits that decide the filter's pole.
         enter, leave = self.thresholds(tolerance)
+        notch = _notch_step(2.0 * pi * self.notch_hz, self.notch_damping, step)
         return LawParameters(
             Kp=float(self.Kp),
             integral_step=self.Ki / self.sample_rate,
@@ -204,4 +241,21 @@ class Controller:
             acting_inside=1.0 if self.integral_only else 0.0,
             velocity_gain=self.velocity_feedforward / self.velocity_time,
             velocity_step=-expm1(-step / self.velocity_time),
+            friction=float(self.friction_feedforward),
+            notch_gain=self.notch_gain,
+            notch_fall=notch[0],
+            notch_rise=notch[1],
+            notch_turn=notch[2],
         )
+
+
+def _notch_step(omega: float, damping: float, step: float) -> tuple[float, float, float]:
+    """Exact zero-order-hold step of band-pass a and low-pass b: a' = omega (v - b) - 2 damping omega a, b' = omega a.
+
+    Returns 1 - F_aa, 1 - F_bb and F_ba = -F_ab of its transition matrix F.
+    """
+    decay, spread = damping * omega * step, omega * step * sqrt(1.0 - damping * damping)
+    # exp(M) = exp(-decay) (cos I + sin / spread (M + decay I)); 1 - cos without cancellation.
+    fade, ratio = exp(-decay), sin(spread) / spread if spread else 1.0
+    common = -expm1(-decay) + 2.0 * fade * sin(0.5 * spread) ** 2
+    return common + fade * ratio * decay, common - fade * ratio * decay, fade * ratio * omega * step

@@ -42,6 +42,13 @@ class LawParameters(NamedTuple):
         Velocity feedforward over the time constant of its low-pass filter, V/m.
     velocity_step : float
         The exact zero-order-hold step of that filter.
+    friction : float
+        V, added with the sign of the reference's last change: none before its first one.
+    notch_gain : float
+        Share of its band-pass that the notch takes out of the PIDF's voltage: 2 zeta (1 - depth); 0.0: no notch.
+    notch_fall, notch_rise, notch_turn : float
+        The exact zero-order-hold step of the notch's two states: what the band-pass loses of itself, and the low-pass
+        of its distance; and what each gives the other.
     """
 
     Kp: float
@@ -59,6 +66,11 @@ class LawParameters(NamedTuple):
     acting_inside: float = 0.0
     velocity_gain: float = 0.0
     velocity_step: float = 1.0
+    friction: float = 0.0
+    notch_gain: float = 0.0
+    notch_fall: float = 0.0
+    notch_rise: float = 0.0
+    notch_turn: float = 0.0
 
 
 class LawState(NamedTuple):
@@ -84,6 +96,10 @@ class LawState(NamedTuple):
     ahead : float
         What the reference was ahead of its low-pass in the velocity feedforward, m: where the reference rests it
         fades beyond all rounding.
+    direction : float
+        Sign of the reference's last change; 0.0 before the first one.
+    notch_band, notch_low : float
+        The PIDF's voltage behind the notch's band-pass and low-pass, V.
     """
 
     integral: float
@@ -94,11 +110,14 @@ class LawState(NamedTuple):
     offset: float = 0.0
     reference: float = 0.0
     ahead: float = 0.0
+    direction: float = 0.0
+    notch_band: float = 0.0
+    notch_low: float = 0.0
 
 
 def start(measurement: float) -> LawState:
     """State at rest at `measurement` (m), the loop closed."""
-    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0, measurement, 0.0)
+    return LawState(0.0, 0.0, measurement, 0.0, 1.0, 0.0, measurement, 0.0, 0.0, 0.0, 0.0)
 
 
 def tick(parameters: LawParameters, state: LawState, reference: float, measurement: float) -> LawState:
@@ -120,8 +139,8 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     -----
     Inside the dead zone the PIDF's input is zero, so its integral holds and its filter decays, and it gives no voltage
     (erratum E16): what is left is feedforward and offset. A law with `acting_inside` stops its integral there
-    and nothing else. With limits off the voltage equals the continuous PIDF's driven by the held error. The limits act
-    on the sum.
+    and nothing else. With limits off the voltage equals the continuous PIDF's driven by the held error. A notch acts on
+    the PIDF's voltage; where the loop opens, it rings out. The limits act on the sum.
     """
     filtered = measurement + (1.0 - parameters.loop_step) * (state.filtered - measurement)
     error = reference - filtered
@@ -138,8 +157,21 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     driven = error * acting
     slope = driven - state.derivative
     pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
-    ahead = (1.0 - parameters.velocity_step) * state.ahead + (reference - state.reference)
-    unlimited = pidf + (parameters.feedforward + state.offset + parameters.velocity_gain * ahead)
+    moved = reference - state.reference
+    ahead = (1.0 - parameters.velocity_step) * state.ahead + moved
+    direction = state.direction
+    if moved > 0.0:
+        direction = 1.0
+    elif moved < 0.0:
+        direction = -1.0
+    band, low, through = state.notch_band, state.notch_low, pidf
+    if parameters.notch_gain != 0.0:
+        through = pidf - parameters.notch_gain * band
+        behind = pidf - low
+        low = low + (parameters.notch_turn * band + parameters.notch_rise * behind)
+        band = band + (parameters.notch_turn * behind - parameters.notch_fall * band)
+    fed = parameters.feedforward + parameters.friction * direction
+    unlimited = through + (fed + state.offset + parameters.velocity_gain * ahead)
     voltage = unlimited
     if voltage > parameters.voltage_limit:
         voltage = parameters.voltage_limit
@@ -155,7 +187,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     integral = state.integral + parameters.integral_step * driven * active + correction
     derivative = state.derivative + parameters.filter_step * slope
     offset = state.offset * (1.0 - parameters.release_step)
-    return LawState(integral, derivative, filtered, voltage, active, offset, reference, ahead)
+    return LawState(integral, derivative, filtered, voltage, active, offset, reference, ahead, direction, band, low)
 
 
 def replaced(integral: float, feedforward: float) -> float:
@@ -194,4 +226,10 @@ def transfer(old: LawParameters, new: LawParameters, state: LawState, reference:
         integral -= replaced(integral, new.feedforward - old.feedforward)
     moved = state._replace(integral=integral, offset=0.0)
     unlimited = new._replace(voltage_limit=inf, rate_step=inf)
+    if new.notch_gain == 0.0:
+        moved = moved._replace(notch_band=0.0, notch_low=0.0)
+    elif old.notch_gain == 0.0:
+        # A notch that is new starts at rest at what it filters: at zero it would ring.
+        bare = unlimited._replace(notch_gain=0.0, feedforward=0.0, velocity_gain=0.0)
+        moved = moved._replace(notch_band=0.0, notch_low=tick(bare, moved, reference, measurement).voltage)
     return moved._replace(offset=voltage - tick(unlimited, moved, reference, measurement).voltage)

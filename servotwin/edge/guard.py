@@ -97,8 +97,18 @@ class Limits:
         ),
     ] = inf
     feedforward: Annotated[
-        float, key("feedforward_v", minimum=0.0, infinite=True, help="Largest feedforward, either sign.")
+        float,
+        key(
+            "feedforward_v",
+            minimum=0.0,
+            infinite=True,
+            help="Largest feedforward, and largest friction feedforward, either sign.",
+        ),
     ] = 0.25
+    notch_min_hz: Annotated[float, key(minimum=0.0, help="Least centre of a notch.")] = 0.0
+    notch_max_hz: Annotated[
+        float, key(minimum=0.0, infinite=True, help="Largest centre of a notch; 0: updates set none.")
+    ] = 0.0
     patience_s: Annotated[
         float,
         key(
@@ -125,8 +135,11 @@ class Limits:
         """True where gains lie in the box around the servo's own."""
         scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
         kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
-        fed = abs(gains.feedforward) <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
-        return scaled and gains.leave <= self.gain_factor * own.leave and fed
+        voltages = max(abs(gains.feedforward), abs(gains.friction_feedforward))
+        fed = voltages <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
+        # A notch adds phase lag below its centre.
+        notch = gains.notch_hz == 0.0 or self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
+        return scaled and gains.leave <= self.gain_factor * own.leave and fed and notch
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
         """True where gains may change from old to new, `since` seconds after the last change."""

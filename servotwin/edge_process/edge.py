@@ -204,4 +204,6 @@ def _gains(law: Controller | None) -> dict[str, Value]:
         "kd_v_s_per_m": law.Kd,
         "feedforward_v": law.feedforward,
         "velocity_feedforward_v_s_per_m": law.velocity_feedforward,
+        "friction_feedforward_v": law.friction_feedforward,
+        "notch_hz": law.notch_hz,
     }

@@ -141,7 +141,7 @@ def _voltage_from_best_start(parameters: LawParameters, voltage: Array, referenc
             # A voltage at its limit corrects the integral: what is left of its first value shows before that.
             first = int(np.argmax(limited)) if limited.any() else limited.size
             free = np.arange(limited.size) < first if first >= _FEWEST else ~limited
-            state = _corrected(parameters, state, voltage - given, acting, free)
+            state = _corrected(parameters, state, voltage - given, acting, free, reference)
         given, _ = run_law(parameters, state, reference, position)
         if (error := _rms(voltage - given)) < least:
             best, least = given, error
@@ -149,7 +149,12 @@ def _voltage_from_best_start(parameters: LawParameters, voltage: Array, referenc
 
 
 def _corrected(
-    parameters: LawParameters, state: LawState, left: Array, acting: Array, free: NDArray[np.bool_]
+    parameters: LawParameters,
+    state: LawState,
+    left: Array,
+    acting: Array,
+    free: NDArray[np.bool_],
+    reference: Array,
 ) -> LawState:
     """Correct the initial state by what it would have to be for the voltage left (n,) to vanish where it is free."""
     count = np.arange(left.size)
@@ -160,6 +165,13 @@ def _corrected(
         columns["derivative"] = -parameters.derivative_gain * acting * (1.0 - parameters.filter_step) ** count
     if parameters.velocity_gain != 0.0:
         columns["ahead"] = parameters.velocity_gain * (1.0 - parameters.velocity_step) ** (count + 1)
+    if parameters.friction != 0.0:
+        # Which way the reference moved before the window holds until it moves in it.
+        columns["direction"] = parameters.friction * (np.cumsum(reference != reference[0]) == 0)
+    if parameters.notch_gain != 0.0:
+        for name in columns.keys() & {"integral", "derivative"}:
+            columns[name] = behind_notch(parameters, np.asarray(columns[name], dtype=float), 0.0, 0.0)
+        columns |= _notch_columns(parameters, left.size)
     matrix = np.stack([column[free] for column in columns.values()], axis=1)
     values = _least_squares(matrix, left[free])
     return state._replace(
@@ -175,13 +187,35 @@ def _factors(
     stated = {name: term for name, term in terms.gains.items() if np.any(term != 0.0)}
     steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
     # What the law's state before the window leaves in it.
-    initial = (terms.acting, *(1.0 - steps) ** np.arange(voltage.size))
+    initial = [terms.acting, *(1.0 - steps) ** np.arange(voltage.size)]
+    if parameters.friction != 0.0:
+        initial += [np.where(np.cumsum(reference != reference[0]) == 0, 1.0, 0.0)]
+    initial += _notch_columns(parameters, voltage.size).values() if parameters.notch_gain != 0.0 else ()
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
     values = _least_squares(columns, measured)
     if _rms(measured - columns @ values) > tolerated:
         return {}
     return {name: float(value) for name, value in zip(stated, values, strict=False)}
+
+
+def _notch_columns(parameters: LawParameters, count: int) -> dict[str, Array]:
+    """Voltages (count,) that unit states of the notch before a window leave in it."""
+    nothing = np.zeros(count)
+    starts = {"notch_band": (1.0, 0.0), "notch_low": (0.0, 1.0)}
+    return {name: behind_notch(parameters, nothing, *start) for name, start in starts.items()}
+
+
+@compiled
+def behind_notch(parameters: LawParameters, values: Array, band: float, low: float) -> Array:
+    """Filter voltages (n,) by the notch, from its states before them on."""
+    result = np.empty(values.size)
+    for k in range(values.size):
+        result[k] = values[k] - parameters.notch_gain * band
+        behind = values[k] - low
+        low += parameters.notch_turn * band + parameters.notch_rise * behind
+        band += parameters.notch_turn * behind - parameters.notch_fall * band
+    return result
 
 
 @compiled
@@ -216,10 +250,11 @@ def _law_terms(parameters: LawParameters, reference: Array, position: Array) -> 
         "Ki": {"integral_step": parameters.integral_step},
         "Kd": {"derivative_gain": parameters.derivative_gain},
         "velocity feedforward": {"velocity_gain": parameters.velocity_gain},
+        "friction feedforward": {"friction": parameters.friction},
     }
     nothing = parameters._replace(
         voltage_limit=math.inf, rate_step=math.inf, tracking_step=0.0, feedforward=0.0,
-        Kp=0.0, integral_step=0.0, derivative_gain=0.0, velocity_gain=0.0,
+        Kp=0.0, integral_step=0.0, derivative_gain=0.0, velocity_gain=0.0, friction=0.0,
     )  # fmt: skip
     _, acting = run_law(nothing, start, reference, position)
     runs = {name: run_law(nothing._replace(**gain), start, reference, position)[0] for name, gain in stated.items()}

@@ -22,6 +22,10 @@ class Gains(Struct, frozen=True):
         True: inside the dead zone only the integral stops; otherwise the loop opens there.
     velocity_feedforward, velocity_time : float
         V s/m, and s of its low-pass filter.
+    friction_feedforward : float
+        V, with the sign of the reference's last change.
+    notch_hz, notch_damping, notch_depth : float
+        Centre of the notch (Hz; 0: none), damping ratio of its poles, gain at its centre.
     """
 
     Kp: float
@@ -34,12 +38,19 @@ class Gains(Struct, frozen=True):
     integral_only: bool = False
     velocity_feedforward: float = 0.0
     velocity_time: float = 0.1
+    friction_feedforward: float = 0.0
+    notch_hz: float = 0.0
+    notch_damping: float = 0.5
+    notch_depth: float = 0.1
 
     def __post_init__(self) -> None:
         for name in self.__struct_fields__:
             require(isfinite(getattr(self, name)), f"gains {name} {getattr(self, name)} is not finite")
         for name in ("Tf", "velocity_time"):
             require(getattr(self, name) > 0.0, f"gains {name} {getattr(self, name)} s is not positive")
+        require(self.notch_hz >= 0.0, f"gains notch_hz {self.notch_hz} Hz is negative")
+        require(0.0 < self.notch_damping <= 1.0, f"gains notch_damping {self.notch_damping} is not within 0 and 1")
+        require(0.0 <= self.notch_depth <= 1.0, f"gains notch_depth {self.notch_depth} is not within 0 and 1")
         require(0.0 <= self.enter <= self.leave, f"gains enter {self.enter}, leave {self.leave}: not in order")
 
 

@@ -41,6 +41,8 @@ class Shape:
         A state "friction" (N m, Coulomb's on the motor's shaft) and the modes of stick and slip.
     feedforward, offset : bool
         States of those names (V, always added to the controller's voltage); the offset decays.
+    push : bool
+        A state "push" (V, always added): the friction feedforward with the sign of the reference's last change.
     """
 
     reference: int = 0
@@ -52,6 +54,7 @@ class Shape:
     friction: bool = False
     feedforward: bool = False
     offset: bool = False
+    push: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,13 +164,16 @@ def degree(pieces: PiecewiseCubic) -> int:
 
 
 def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
-    """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in the feedforward only."""
+    """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in constant feedforwards
+    only."""
     return _one_continuous_loop(servo, without_feedforward(controller), shape)
 
 
 def without_feedforward(controller: Controller) -> Controller:
-    """Controller without its feedforward, which the automaton holds as a state: equal ones share an automaton."""
-    return controller.replace(feedforward=0.0) if controller.feedforward else controller
+    """Controller without the feedforwards that the automaton holds as states: equal ones share an automaton."""
+    if not (controller.feedforward or controller.friction_feedforward):
+        return controller
+    return controller.replace(feedforward=0.0, friction_feedforward=0.0)
 
 
 @lru_cache(maxsize=64)
@@ -191,6 +197,11 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
             flow[..., basis["filtered"], :] = rate * (sensed - basis.row("filtered"))
         if "lagging" in basis:
             flow[..., basis["lagging"], :] = (basis.row("reference") - basis.row("lagging")) / controller.velocity_time
+        if "notch band" in basis:
+            omega = 2.0 * np.pi * controller.notch_hz
+            band, low = basis.row("notch band"), basis.row("notch low")
+            flow[..., basis["notch band"], :] = omega * (zone.pidf - low - 2.0 * controller.notch_damping * band)
+            flow[..., basis["notch low"], :] = omega * band
         if shape.offset:
             flow[..., basis["offset"], :] = -basis.row("offset") / controller.release_time
         flows.append(flow)
@@ -208,7 +219,7 @@ def sampled_parts(servo: PlantNumbers, gap_degree: int, bias: bool, friction: bo
     names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(bias, friction)]
     basis = Basis(tuple(names))
     zero = np.zeros(len(basis.names))
-    system = _System(servo, basis, (Zone("held", basis.row("voltage"), zero, zero),), friction)
+    system = _System(servo, basis, (Zone("held", basis.row("voltage"), zero, zero, zero),), friction)
     return system.parts(
         [
             mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
@@ -249,10 +260,12 @@ def mechanical_flow(
 
 @dataclass(frozen=True)
 class Zone:
-    """One linear piece of the controller: rows of the voltage and of its states' derivatives, and its guards."""
+    """One linear piece of the controller: rows of the voltage, of the PIDF before its notch and of its states'
+    derivatives, and its guards."""
 
     name: str
     voltage: Array
+    pidf: Array
     integral: Array
     derivative: Array
     guards: tuple[GuardRow, ...] = ()
@@ -263,13 +276,17 @@ def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, err
 
     With `integral_only` the integral stops inside, and the rest goes on.
     """
-    # The feedforward and the offset act inside the dead zone too.
-    always = basis.row("feedforward") + basis.row("offset")
+    # Feedforwards and the offset act inside the dead zone too.
+    always = basis.row("feedforward") + basis.row("offset") + basis.row("push")
     if "lagging" in basis:
         ahead = basis.row("reference") - basis.row("lagging")
         always = always + controller.velocity_feedforward / controller.velocity_time * ahead
     slope = error - basis.row("derivative")
-    unlimited = always + controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
+    pidf = controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
+    if "notch band" in basis:
+        # It rings on inside the dead zone too.
+        always = always - controller.notch_gain * basis.row("notch band")
+    unlimited = always + pidf
     tolerance = basis.row("tolerance")
     # Pure integral action has a tracking time of zero: a thousandth of the filter's stands for it in the flow.
     back_calculation = 1.0 / np.maximum(controller.tracking, controller.Tf * 1e-3)
@@ -277,7 +294,7 @@ def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, err
     for side in (-1, 1) if dead_zone else (0,):
         name = {-1: "-", 0: "on", 1: "+"}[side]
         guards = (GuardRow(controller.enter * tolerance - side * error, "inside", None, "enter", side),) if side else ()
-        linear = Zone(name, unlimited, controller.Ki * error, slope / controller.Tf, guards)
+        linear = Zone(name, unlimited, pidf, controller.Ki * error, slope / controller.Tf, guards)
         zones += _saturated(linear, basis, back_calculation)
     if dead_zone:
         leave = tuple(
@@ -285,9 +302,9 @@ def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, err
         )
         zero = np.zeros(len(basis.names))
         if controller.integral_only:
-            inside = Zone("inside", unlimited, zero, slope / controller.Tf, leave)
+            inside = Zone("inside", unlimited, pidf, zero, slope / controller.Tf, leave)
         else:
-            inside = Zone("inside", always, zero, -basis.row("derivative") / controller.Tf, leave)
+            inside = Zone("inside", always, zero, zero, -basis.row("derivative") / controller.Tf, leave)
         zones += _saturated(inside, basis, 0.0) if inside.voltage.any() else [inside]
     return tuple(zones)
 
@@ -305,7 +322,7 @@ def _saturated(zone: Zone, basis: Basis, rate: float | Array) -> list[Zone]:
     for side, suffix in ((1, " high"), (-1, " low")):
         leave = (*zone.guards, GuardRow(limit - side * unlimited, zone.name, None, "saturate", 0))
         integral = zone.integral + rate * (side * limit - unlimited)
-        zones.append(Zone(zone.name + suffix, side * limit, integral, zone.derivative, leave))
+        zones.append(Zone(zone.name + suffix, side * limit, zone.pidf, integral, zone.derivative, leave))
     return zones
 
 
@@ -315,11 +332,12 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
         + ["integral", "derivative"]
         + (["filtered"] if controller.loop_filter_hz is not None else [])
         + (["lagging"] if np.any(controller.velocity_feedforward) else [])
+        + (["notch band", "notch low"] if np.any(controller.notch_hz) else [])
     )
     names += [name for key in INPUTS for name in input_names(key, getattr(shape, key))]
     names += ["voltage limit"] if controller.voltage_limit is not None else []
     names += ["noise"] if shape.noise else []
-    names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
+    names += [name for name in ("feedforward", "offset", "push") if getattr(shape, name)]
     return names + _constants(shape.bias, shape.friction)
 
 

@@ -121,6 +121,21 @@ class LawNumbers(Protocol):
         ...
 
     @property
+    def notch_hz(self) -> float | Array:
+        """Centre of the notch; 0: none."""
+        ...
+
+    @property
+    def notch_damping(self) -> float | Array:
+        """Damping ratio of its poles."""
+        ...
+
+    @property
+    def notch_gain(self) -> float | Array:
+        """Share of its band-pass that it takes away."""
+        ...
+
+    @property
     def release_time(self) -> float | Array:
         """Time constant of an offset, s."""
         ...

@@ -81,14 +81,25 @@ def plant_system(motor: Motor, structure: Structure, pitch: float) -> LinearSyst
 
 
 def pidf(controller: Controller) -> LinearSystem:
-    """C_PIDF = Kp + Ki/s + Kd s/(Tf s + 1) (Eq 14); terms whose gain is zero have no state."""
+    """C_PIDF = Kp + Ki/s + Kd s/(Tf s + 1) (Eq 14) and the notch behind it; terms whose gain is zero have no state."""
     system = gain(controller.Kp)
     if controller.Ki != 0.0:
         system = parallel(system, integrator(controller.Ki))
     if controller.Kd != 0.0:
         rate = controller.Kd / controller.Tf
         system = parallel(system, parallel(gain(rate), lag(-rate, controller.Tf)))
-    return system
+    return series(system, notch(controller)) if controller.notch_hz else system
+
+
+def notch(controller: Controller) -> LinearSystem:
+    """Notch on the PIDF's voltage, or 1 where there is none."""
+    if controller.notch_hz == 0.0:
+        return gain(1.0)
+    omega, poles = 2.0 * math.pi * controller.notch_hz, controller.notch_damping
+    A = omega * np.array([[-2.0 * poles, -1.0], [1.0, 0.0]])
+    zeros = poles * controller.notch_depth
+    numerator, denominator = (np.array([omega * omega, 2.0 * zeta * omega, 1.0]) for zeta in (zeros, poles))
+    return LinearSystem(A, np.array([omega, 0.0]), np.array([-controller.notch_gain, 0.0]), 1.0, numerator, denominator)
 
 
 def loop_filter(controller: Controller) -> LinearSystem:
@@ -137,6 +148,7 @@ def sampled_law(controller: Controller) -> StateMatrices:
         raise InvalidInput("controller sample_rate = None: a sampled loop needs a rate in Hz")
     law = controller.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).law(None)
     names = ["derivative"] + ["integral"] * (controller.Ki != 0.0) + ["filtered"] * (law.loop_step < 1.0)
+    names += ["notch_band", "notch_low"] * (law.notch_gain != 0.0)
     rest = LawState(0.0, 0.0, 0.0, 0.0, 1.0)
     starts = [rest._replace(**{name: 1.0}) for name in names]
     ticks = [tick(law, start, 0.0, 0.0) for start in starts] + [tick(law, rest, 0.0, 1.0)]

@@ -78,6 +78,9 @@ class LawStack:
     release_time: Array
     velocity_feedforward: Array
     velocity_time: Array
+    notch_hz: Array
+    notch_damping: Array
+    notch_gain: Array
     loop_filter_hz: Array | None
     voltage_limit: Array | None
     integral_only: bool
@@ -86,7 +89,7 @@ class LawStack:
     def of(cls, laws: Sequence[Controller]) -> LawStack:
         """Numbers of controllers."""
         names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "tracking", "release_time"]
-        names += ["velocity_feedforward", "velocity_time"]
+        names += ["velocity_feedforward", "velocity_time", "notch_hz", "notch_damping", "notch_gain"]
         optional = ("loop_filter_hz", "voltage_limit")
         columns: dict[str, Any] = {name: _column(laws, name) for name in names}
         columns |= {name: None if getattr(laws[0], name) is None else _column(laws, name) for name in optional}

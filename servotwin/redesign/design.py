@@ -44,12 +44,15 @@ class Design:
         """Voltage (V rms) caused by white measurement noise of `noise` (m rms) within `band` (Hz).
 
         The loop is left out: it does not answer at frequencies far above its crossover. Gains as in Eq 14, behind the
-        loop filter.
+        loop filter, and the notch.
         """
         law = self.controller
         hertz = np.geomspace(*band, _GRID)
         s = 2j * math.pi * hertz
         gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
+        if law.notch_hz:
+            relative = s / (2.0 * math.pi * law.notch_hz)
+            gain = gain * (1.0 - law.notch_gain * relative / (relative**2 + 2.0 * law.notch_damping * relative + 1.0))
         if law.loop_filter_hz is not None:
             gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
         return noise * float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))

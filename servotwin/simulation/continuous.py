@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_
 from servotwin.plant.noise import NoiseSource
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.plant.turns import direction_after, turns_of
 from servotwin.simulation.inputs import RunInputs, about, quantised
 
 _NOISE_BLOCK = 4096
@@ -46,7 +48,10 @@ class ContinuousEngine:
         if self.noise is not None:
             set_states(self.loop, state, {"noise": self.noise.block(1)[0]})
         followers = ("filtered", "lagging")
-        set_states(self.loop, state, dict.fromkeys(followers, self.loop.rows["measured_position"][0] @ state))
+        position = float(self.loop.rows["measured_position"][0] @ state)
+        set_states(self.loop, state, dict.fromkeys(followers, position))
+        self.direction = direction_after(signals["reference"], 0.0, position, 0.0)
+        set_states(self.loop, state, {"push": self.controller.friction_feedforward * self.direction})
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
         mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
@@ -64,6 +69,7 @@ class ContinuousEngine:
             friction=self.inputs.friction != 0.0,
             feedforward=controller.feedforward != 0.0,
             offset=offset,
+            push=controller.friction_feedforward != 0.0,
         )
         return continuous_loop(self.servo, controller, shape)
 
@@ -96,6 +102,11 @@ class ContinuousEngine:
                 knots.setdefault(time, {}).update(self.loop.input_values(name, coefficients))
             if name == "gap":
                 opening = {float(time) for time in pieces.jumps}
+        for time, direction in self._turns(span):
+            self.direction = direction
+            knots.setdefault(time, {})[self.loop.automaton.index("push")] = (
+                self.controller.friction_feedforward * direction
+            )
         if self.noise is not None:
             times = self.inputs.times(self.index + 1, index + 1).tolist()
             for time, value in zip(times, self.noise.block(len(times)).tolist(), strict=True):
@@ -104,21 +115,35 @@ class ContinuousEngine:
         jumps = [Jump(min(t, end), knots[t], self.loop.opened if t in opening else None) for t in sorted(knots)]
         self.trajectory.advance(index, jumps)
 
+    def _turns(self, span: tuple[float, float]) -> list[tuple[float, float]]:
+        """Times (s) within a span of samples at which the reference may change its direction, and that then."""
+        if self.controller.friction_feedforward == 0.0:
+            return []
+        turns = turns_of(self.inputs.reference)
+        times = np.array([time for time, _ in turns]) * self.inputs.sample_rate
+        return turns[slice(*np.searchsorted(times, span, side="right"))]
+
     def set_tolerance(self, tolerance: float) -> None:
         """Set a constant tolerance from now on."""
         self.trajectory.set(self.loop.input_values("tolerance", np.array([tolerance, 0.0, 0.0, 0.0])))
 
     def set_reference(self, reference: PiecewiseCubic) -> None:
         """Follow another reference from now on, already part of the inputs; a higher degree needs another automaton."""
-        now = about(reference, self.index / self.inputs.sample_rate)
+        time = self.index / self.inputs.sample_rate
+        now = about(reference, time)
+        before = float(self.trajectory.state[self.loop.automaton.index("reference")])
         if len(self.loop.input_values("reference", now)) <= degree(reference):
             self.set_controller(self.controller, None)
-        self.trajectory.set(self.loop.input_values("reference", now))
+        self.direction = direction_after(reference, time, before, self.direction)
+        values = self.loop.input_values("reference", now)
+        if self.controller.friction_feedforward != 0.0:
+            values[self.loop.automaton.index("push")] = self.controller.friction_feedforward * self.direction
+        self.trajectory.set(values)
 
     def set_controller(self, controller: Controller, tolerance: float | None) -> None:
         """Change the controller from now on without a jump of the voltage; a constant tolerance unless None."""
         _refuse_rate_limit(controller)
-        values = controller_constants(controller)
+        values = controller_constants(controller) | {"push": controller.friction_feedforward * self.direction}
         if tolerance is not None:
             names = [name for name in self.loop.automaton.names if name.startswith("tolerance")]
             values |= dict.fromkeys(names, 0.0) | {"tolerance": tolerance}
@@ -262,8 +287,13 @@ def _with_states(
         error, tolerance = float(loop.rows["error"][0] @ state), common["tolerance"]
         zone = _zone_after(zone, error, controller.enter * tolerance, controller.leave * tolerance)
     # Contact and stick-slip modes stay: both automata number them alike.
-    mechanics = now.mode // len(now.loop.zones)
-    return LoopState(loop, state, mechanics * len(loop.zones) + loop.zones.index(zone))
+    mode = now.mode // len(now.loop.zones) * len(loop.zones) + loop.zones.index(zone)
+    names = loop.automaton.names
+    if "notch low" in names and "notch low" not in common:
+        # At rest at what it filters, which drives the band-pass.
+        driven = float(loop.automaton.flows[mode][loop.automaton.index("notch band")] @ state)
+        state[loop.automaton.index("notch low")] = driven / (2.0 * math.pi * controller.notch_hz)
+    return LoopState(loop, state, mode)
 
 
 def _zone_after(zone: str, error: float, enter: float, leave: float) -> str:

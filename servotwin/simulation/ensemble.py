@@ -112,6 +112,7 @@ class EnsembleMembers:
             bias=self.constants["input_bias"][member] != 0.0,
             friction=self.constants["friction"][member] > 0.0,
             feedforward=self.controllers[member].feedforward != 0.0,
+            push=self.controllers[member].friction_feedforward != 0.0,
         )
 
     def _group(self, which: NDArray[np.int64], shape: Shape, outputs: Sequence[str]) -> Group:
@@ -122,6 +123,10 @@ class EnsembleMembers:
         loops = continuous_loops([servo for servo, _ in places], [law for _, law in places], shape)
         constants = {name: values[which] for name, values in self.constants.items()} | _constants_of(laws)
         states = starts_of(loops, automaton, constants)
+        if shape.push:
+            moved = constants["reference"] - np.sum(states * loops.rows["measured_position"][automaton, 0], axis=1)
+            push = np.array([law.friction_feedforward for law in laws])
+            states[:, loops.first.automaton.index("push")] = push * np.sign(moved)
         enter = np.array([law.enter for law in laws]) * constants["tolerance"]
         modes = _modes_at(loops, automaton, states, enter)
         for name in outputs:
@@ -338,7 +343,7 @@ def check_constants(constants: dict[str, Array]) -> None:
 
 def _structure_of(servo: Servo, law: Controller) -> tuple[object, ...]:
     limits = law.voltage_limit is None, law.loop_filter_hz is None
-    return servo.n, servo.rigid, *limits, law.integral_only, law.velocity_feedforward == 0.0
+    return servo.n, servo.rigid, *limits, law.integral_only, law.velocity_feedforward == 0.0, law.notch_hz == 0.0
 
 
 def _constants_of(laws: list[Controller]) -> dict[str, Array]:

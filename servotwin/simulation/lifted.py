@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.control import law
-from servotwin.control.law import LawState
+from servotwin.control.law import LawParameters, LawState
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import bare, inlined, subroutine, verbatim
 from servotwin.hybrid.flow import LINGERING, Scratch
@@ -88,21 +88,47 @@ def set_reference(places: Places, coefficients: Array, elapsed: float, z: Array)
         z[at + 3] = 6.0 * c3
 
 
+@inlined
+def latest_direction(moved: float, before: float) -> float:
+    """Sign of the last change of the reference, after a move (m), which may be none."""
+    direction = before
+    if moved > 0.0:
+        direction = 1.0
+    elif moved < 0.0:
+        direction = -1.0
+    return direction
+
+
+@inlined
+def with_feedforward_of(parameters: LawParameters, places: Places, z: Array) -> LawParameters:
+    """The law's parameters with all that is always added as one feedforward, which is a state."""
+    p = parameters
+    fed = z[places.feedforward] if places.feedforward >= 0 else 0.0
+    return LawParameters(
+        p.Kp, p.integral_step, p.derivative_gain, p.filter_step, p.enter, p.leave, p.voltage_limit, p.rate_step,
+        p.loop_step, p.tracking_step, fed, p.release_step, p.acting_inside, p.velocity_gain, p.velocity_step, 0.0,
+        p.notch_gain, p.notch_fall, p.notch_rise, p.notch_turn,
+    )  # fmt: skip
+
+
 @bare
 def take_tick(loop: LiftedLoop, places: Places, z: Array, place: Place) -> float:
     """The edge's tick on the state; return the error that was measured."""
-    p, y = loop.parameters, z[places.position]
+    p, y = with_feedforward_of(loop.parameters, places, z), z[places.position]
     last = z[places.waiting + places.delay - 1] if places.delay > 0 else z[places.voltage]
     filtered = z[places.filtered] if places.filtered >= 0 else y
     active = 1.0 if place.at[2] == 1 else 0.0
     past, ahead = (z[places.past], z[places.ahead]) if places.ahead >= 0 else (z[places.reference], 0.0)
-    state = LawState(z[places.integral], z[places.derivative], filtered, last, active, 0.0, past, ahead)
+    band, low = (z[places.notch], z[places.notch_low]) if places.notch >= 0 else (0.0, 0.0)
+    state = LawState(z[places.integral], z[places.derivative], filtered, last, active, 0.0, past, ahead, 0.0, band, low)
     new = tick(p, state, z[places.reference], y)
     z[places.integral], z[places.derivative] = new.integral, new.derivative
     if places.filtered >= 0:
         z[places.filtered] = new.filtered
     if places.ahead >= 0:
         z[places.past], z[places.ahead] = new.reference, new.ahead
+    if places.notch >= 0:
+        z[places.notch], z[places.notch_low] = new.notch_band, new.notch_low
     if places.delay > 0:
         z[places.voltage] = z[places.waiting]
         for i in range(places.waiting, places.waiting + places.delay - 1):

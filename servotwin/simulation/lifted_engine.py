@@ -29,6 +29,7 @@ from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.lifted import (
     TICKED,
     UNFILLED,
+    latest_direction,
     more_segments,
     new_segments,
     run_lifted,
@@ -45,8 +46,11 @@ _TICKS_PER_RUN, _TICKS_PER_PIECE = 20_000, 64
 
 def advances_in_blocks(servo: Servo, controller: Controller, inputs: RunInputs, samples: int) -> bool:
     """True for a noise-free run that `LiftedEngine` can do: a sampled law, an ideal sensor, ticks at every sample, and
-    many ticks, inputs of few pieces with a tolerance that is constant in each."""
+    many ticks, inputs of few pieces with a tolerance that is constant in each; a friction feedforward needs such a
+    reference."""
     if controller.sample_rate is None or servo.position_resolution != 0.0:
+        return False
+    if controller.friction_feedforward != 0.0 and degree(inputs.reference) > 0:
         return False
     ratio = controller.sample_rate / inputs.sample_rate
     if round(ratio) < 1 or abs(ratio - round(ratio)) > ON_GRID * ratio:
@@ -72,9 +76,11 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         ("derivative", True),
         ("filtered", controller.loop_filter_hz is not None),
         ("rate", controller.rate_limit is not None),
-        ("feedforward", controller.feedforward != 0.0),
+        ("feedforward", controller.feedforward != 0.0 or controller.friction_feedforward != 0.0),
         ("past", controller.velocity_feedforward != 0.0),
         ("ahead", controller.velocity_feedforward != 0.0),
+        ("notch", controller.notch_hz != 0.0),
+        ("notch_low", controller.notch_hz != 0.0),
     ):
         places[name] = -1
         if exists and spare:
@@ -156,6 +162,7 @@ class LiftedEngine:
                 self.state[follower] = start[self.places.position]
         if self.places.feedforward >= 0:
             self.state[self.places.feedforward] = self.controller.feedforward
+        self.past, self.direction = float(start[self.places.position]), 0.0
         modes, law = len(self.plant.automaton.modes), self.controller.law(None)
         dead_zone = self.inputs.tolerance is not None and bool(np.any(self.inputs.tolerance.coeffs[:, 0] > 0.0))
         self.loop = LiftedLoop(law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes)
@@ -205,7 +212,13 @@ class LiftedEngine:
         if self.inputs.tolerance is not None:
             tolerance = float(self.inputs.tolerance.coeffs[_piece(self.inputs.tolerance, time, self.rate), 0])
             self.loop = self.loop._replace(parameters=self.controller.law(tolerance))
-        return self.inputs.reference.coeffs[piece], float(self.inputs.reference.times[piece])
+        coefficients = self.inputs.reference.coeffs[piece]
+        if (push := self.controller.friction_feedforward) != 0.0:
+            # The reference is constant in every piece.
+            self.direction = latest_direction(float(coefficients[0]) - self.past, self.direction)
+            self.past = float(coefficients[0])
+            self.state[self.places.feedforward] = self.controller.feedforward + push * self.direction
+        return coefficients, float(self.inputs.reference.times[piece])
 
     def _run(self, end: int) -> None:
         coefficients, origin = self._now()

@@ -37,6 +37,8 @@ class Places(NamedTuple):
     feedforward: int
     past: int  # reference of the last tick
     ahead: int
+    notch: int  # its band-pass
+    notch_low: int
     waiting: int  # first of the voltages on their way, the next one to be applied
     delay: int  # how many
     reference: int  # and its derivatives
@@ -89,6 +91,20 @@ def _clear(row: Array) -> None:
         row[i] = 0.0
 
 
+@inlined
+def _fill_notch(p: LawParameters, places: Places, demand: Array, m: Array) -> None:
+    """Fill the notch's part of the tick's map, while `demand` is the PIDF's row, and make it the notch's."""
+    n, band, low = places.states, places.notch, places.notch_low
+    for i in range(n):
+        m[low * n + i] += p.notch_rise * demand[i]
+        m[band * n + i] += p.notch_turn * demand[i]
+    m[low * n + low] -= p.notch_rise
+    m[low * n + band] += p.notch_turn
+    m[band * n + low] -= p.notch_turn
+    m[band * n + band] -= p.notch_fall
+    demand[band] -= p.notch_gain
+
+
 @subroutine
 def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory: LiftedMemory) -> None:
     """Fill the tick's map; the rows of the error and of the voltage demanded remain in `change` and `sizes`."""
@@ -109,6 +125,8 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
             demand[i] = (p.Kp + p.derivative_gain) * error[i]
         demand[places.integral] += 1.0
         demand[places.derivative] -= p.derivative_gain
+    if places.notch >= 0:
+        _fill_notch(p, places, demand, m)
     if places.feedforward >= 0:
         demand[places.feedforward] += 1.0
     if places.ahead >= 0:

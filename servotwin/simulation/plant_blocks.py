@@ -25,7 +25,7 @@ from servotwin.hybrid.response import (
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.ticks import Output, Port, TickInputs, measured, tick_between, to_hold
 
-_LAW = 8
+_LAW = len(LawState._fields)
 LAW_STATES = _LAW * TICKS
 """Numbers of the law's states after the ticks of a block."""
 _UNNOTED = 64
@@ -77,13 +77,15 @@ def store(state: LawState, law_states: Array, j: int) -> None:
     law_states[at + np.uint64(2)], law_states[at + np.uint64(3)] = state.filtered, state.voltage
     law_states[at + np.uint64(4)], law_states[at + np.uint64(5)] = state.active, state.offset
     law_states[at + np.uint64(6)], law_states[at + np.uint64(7)] = state.reference, state.ahead
+    law_states[at + np.uint64(8)] = state.direction
+    law_states[at + np.uint64(9)], law_states[at + np.uint64(10)] = state.notch_band, state.notch_low
 
 
 @inlined
 def stored(law_states: Array, j: int) -> LawState:
     """The law's state after a tick of the block."""
     s = law_states[j * _LAW : j * _LAW + _LAW]
-    return LawState(s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7])
+    return LawState(s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], s[8], s[9], s[10])
 
 
 @inlined

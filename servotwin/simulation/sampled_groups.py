@@ -73,7 +73,10 @@ class SampledGroup:
 
 
 def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
-    """True for members that advance in blocks: an ideal sensor, and ticks at every sample of the output."""
+    """True for members that advance in blocks: an ideal sensor, and ticks at every sample of the output; with a
+    friction feedforward a reference that is constant in every piece."""
+    if members.controllers[member].friction_feedforward != 0.0 and degree(span.shape) > 0:
+        return False
     ratio = (members.controllers[member].sample_rate or 0.0) / span.rate
     whole = round(ratio)
     return members.constants["resolution"][member] == 0.0 and whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
@@ -92,9 +95,10 @@ def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
     servo, law = members.servos[member], members.controllers[member]
     here = {name: float(values[member]) for name, values in members.constants.items()}
     limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None
-    feedforwards = law.feedforward == 0.0, law.velocity_feedforward == 0.0
+    always = law.feedforward == 0.0 and law.friction_feedforward == 0.0
+    feedforwards = always, law.velocity_feedforward == 0.0
     switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    return servo.n, servo.rigid, *limits, *feedforwards, *switches
+    return servo.n, servo.rigid, *limits, law.notch_hz == 0.0, *feedforwards, *switches
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:

@@ -15,7 +15,16 @@ from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, RunRecord
 from servotwin.hybrid.members import figures_of
 from servotwin.hybrid.tables import Tables
-from servotwin.simulation.lifted import TICKED, UNFILLED, Segments, note, run_lifted, set_reference, take_tick
+from servotwin.simulation.lifted import (
+    TICKED,
+    UNFILLED,
+    Segments,
+    latest_direction,
+    note,
+    run_lifted,
+    set_reference,
+    take_tick,
+)
 from servotwin.simulation.lifted_output import sample_lifted
 from servotwin.simulation.lifted_tables import LiftedLoop, LiftedMemory, Place, Places, fill_here
 
@@ -105,7 +114,7 @@ def run_one(
     p, rate = family.laws[law], family.rate[law]
     parameters = LawParameters(
         p[0], p[1], p[2], p[3], starts.enter[k], starts.leave[k], p[6], p[7], p[8], p[9], p[10], p[11], p[12], p[13],
-        p[14],
+        p[14], p[15], p[16], p[17], p[18], p[19],
     )  # fmt: skip
     loop = LiftedLoop(
         parameters, family.dead_zone, family.searches[plant], family.step[plant], family.flows[plant], family.modes
@@ -115,6 +124,7 @@ def run_one(
     for i in range(len(worker.place.at)):
         worker.place.at[i] = 0
     worker.place.at[1], worker.place.at[2], worker.place.sign[0] = family.mode, 1, 0.0
+    past, direction = z[places.position], 0.0
     segments.size[0] = segments.size[1] = record.size[0] = record.size[1] = 0
     for piece in range(len(family.times)):
         stop = end
@@ -124,6 +134,11 @@ def run_one(
             continue
         for i in range(4):
             worker.coefficients[i] = starts.reference[k] * family.coefficients[piece, i]
+        if parameters.friction != 0.0:
+            # The reference is constant in every piece.
+            direction = latest_direction(worker.coefficients[0] - past, direction)
+            past = worker.coefficients[0]
+            z[places.feedforward] = parameters.feedforward + parameters.friction * direction
         status = UNFILLED
         while status == UNFILLED:
             status = run_lifted(

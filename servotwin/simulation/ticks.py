@@ -87,6 +87,11 @@ def tick_between(
         parameters.acting_inside,
         parameters.velocity_gain,
         parameters.velocity_step,
+        parameters.friction,
+        parameters.notch_gain,
+        parameters.notch_fall,
+        parameters.notch_rise,
+        parameters.notch_turn,
     )
     return tick(now, state, reference, y)
 

@@ -270,6 +270,28 @@ def test_the_law_is_homogeneous_bit_for_bit(power: int, seed: int) -> None:
     assert [s.voltage * scale for s in plain] == [s.voltage for s in scaled]
 
 
+def test_the_friction_feedforward_has_the_sign_of_the_last_change_of_the_reference() -> None:
+    """None before the first change; it holds where the reference rests, and in the dead zone; the limit acts on it."""
+    law = Controller(0.0, 0.0, 0.0, 0.1, sample_rate=1000.0, friction_feedforward=0.05, feedforward=0.01)
+    references = [0.0, 0.0, 1e-4, 1e-4, 3e-4, 2e-4, 2e-4, -1e-4, -1e-9]
+    signs = [0.0, 0.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, 1.0]
+    for tolerance in (None, 1e-3):
+        voltages = [state.voltage for state in run(law.law(tolerance), references)]
+        assert voltages == pytest.approx([0.01 + 0.05 * sign for sign in signs], abs=1e-15)
+    limited = run(law.replace(voltage_limit=0.03).law(), references)
+    assert [state.voltage for state in limited] == pytest.approx(np.clip(voltages, -0.03, 0.03).tolist(), abs=1e-15)
+
+
+def test_a_new_friction_feedforward_fades_in() -> None:
+    old = PAPER.replace(Ki=0.0, release_time=0.2).law()
+    new = PAPER.replace(Ki=0.0, release_time=0.2, friction_feedforward=0.05).law()
+    state = run(old, [1e-3] * 500)[-1]
+    moved = transfer(old, new, state, 1e-3, 0.0)
+    assert tick(new, moved, 1e-3, 0.0).voltage == pytest.approx(tick(old, state, 1e-3, 0.0).voltage, abs=1e-12)
+    later = run(new, [1e-3] * 20_000, moved)[-1].voltage - run(old, [1e-3] * 20_000, state)[-1].voltage
+    assert later == pytest.approx(0.05, abs=1e-9)
+
+
 _compiled_tick: Any = numba.njit(tick)
 
 
@@ -278,7 +300,8 @@ def _compiled_run(parameters: Any, state: Any, references: Any, measurements: An
         state = _compiled_tick(parameters, state, references[k], measurements[k])
         out[k, 0], out[k, 1], out[k, 2] = state.integral, state.derivative, state.filtered
         out[k, 3], out[k, 4], out[k, 5] = state.voltage, state.active, state.offset
-        out[k, 6], out[k, 7] = state.reference, state.ahead
+        out[k, 6], out[k, 7], out[k, 8] = state.reference, state.ahead, state.direction
+        out[k, 9], out[k, 10] = state.notch_band, state.notch_low
 
 
 def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
@@ -291,19 +314,20 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
 
 STOPPED = LIMITED.replace(integral_only=True, Ki=300.0, voltage_limit=1.0, rate_limit=150.0)
 BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
-FED = LIMITED.replace(velocity_feedforward=190.0, velocity_time=0.03)
+FED = LIMITED.replace(velocity_feedforward=190.0, velocity_time=0.03, friction_feedforward=0.07)
+NOTCHED = LIMITED.replace(notch_hz=4.3, notch_damping=0.4)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("controller", "samples"),
-    [(LIMITED, 1_000_000), *((controller, 250_000) for controller in (PAPER, BIASED, STOPPED, FED))],
-    ids=["limits, hysteresis, filter", "paper", "offset, feedforward", "integral only", "velocity feedforward"],
+    [(LIMITED, 1_000_000), *((controller, 250_000) for controller in (PAPER, BIASED, STOPPED, FED, NOTCHED))],
+    ids=["limits, hysteresis, filter", "paper", "offset, feedforward", "integral only", "fed forward", "notch"],
 )
 def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller, samples: int) -> None:
     law = controller.law(1e-3)
     reference, measurement = _signals(samples)
-    compiled = np.empty((samples, 8))
+    compiled = np.empty((samples, len(LawState._fields)))
     first = start(0.0)._replace(offset=2.3)
     numba.njit(_compiled_run)(law, first, reference, measurement, compiled)
     state, interpreted = first, array("d")

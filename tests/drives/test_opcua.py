@@ -91,7 +91,13 @@ def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
     with server(tmp_path, ring=LONG) as (url, _), closing(drive_at(url)) as drive:
         scenario = Scenario.load(tmp_path / "scenario.toml")
         softer = scenario.start_law.replace(
-            Kp=1000.0, Ki=9000.0, leave=1.3, velocity_feedforward=150.0, velocity_time=0.05
+            Kp=1000.0,
+            Ki=9000.0,
+            leave=1.3,
+            velocity_feedforward=150.0,
+            velocity_time=0.05,
+            friction_feedforward=0.02,
+            notch_hz=4.0,
         )
         drive.connect()
         blocks = [drive.read(), drive.read(37)]
@@ -118,12 +124,16 @@ def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_without_velocity_feedforward_refuses_it_and_takes_other_gains(tmp_path: Path) -> None:
+def test_a_drive_without_feedforwards_refuses_them_and_takes_other_gains(tmp_path: Path) -> None:
     with server(tmp_path, optional=False) as (url, _), closing(drive_at(url)) as drive:
         drive.connect()
         law = Scenario.load(tmp_path / "scenario.toml").start_law
         with pytest.raises(DriveRefused, match="VelocityFeedforward"):
             drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(velocity_feedforward=150.0)))))
+        with pytest.raises(DriveRefused, match="FrictionFeedforward"):
+            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(friction_feedforward=0.02)))))
+        with pytest.raises(DriveRefused, match="NotchHz"):
+            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(notch_hz=4.0)))))
         with pytest.raises(DriveRefused, match="IntegralOnly"):
             drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(integral_only=True)))))
         drive.write(Parameters(6, Setting(3e-5, gains_of(law))))

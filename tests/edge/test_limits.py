@@ -48,14 +48,24 @@ def judged(gains: Gains, limits: Limits, old: Gains = OWN, seconds: float = 10.0
         ({"leave": 4.1}, False),
         ({"feedforward": -0.25}, True),
         ({"feedforward": 0.26}, False),
+        ({"friction_feedforward": -0.25}, True),
+        ({"friction_feedforward": 0.26}, False),
         ({"velocity_feedforward": -400.0}, True),
         ({"velocity_feedforward": 401.0}, False),
         ({"velocity_feedforward": 401.0, "velocity_time": 0.2}, True),
+        ({"notch_hz": 4.0}, False),
     ],
 )
 def test_gains_stay_in_the_box(changes: dict[str, float], inside: bool) -> None:
     expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
     assert judged(replace(OWN, **changes), Limits()) is expected
+
+
+@pytest.mark.parametrize(("hertz", "inside"), [(0.0, True), (1.9, False), (2.0, True), (8.0, True), (8.1, False)])
+def test_a_notch_stays_where_the_limits_allow_it(hertz: float, inside: bool) -> None:
+    limits = Limits(notch_min_hz=2.0, notch_max_hz=8.0)
+    expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(OWN, notch_hz=hertz), limits) is expected
 
 
 def test_integral_action_has_a_bound_of_its_own() -> None:

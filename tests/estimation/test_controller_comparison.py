@@ -48,13 +48,16 @@ def by_hand(controller, tolerance, state=None, count=4000, scale=1.0, rate=2000.
         LAW.replace(Ki=0.0, feedforward=0.3),
         LAW.replace(voltage_limit=2.5),
         LAW.replace(integral_only=True, velocity_feedforward=20.0),
+        LAW.replace(velocity_feedforward=20.0, friction_feedforward=0.3),
         LAW.replace(enter=0.5, leave=1.5),
+        LAW.replace(Ki=0.03 * LAW.Ki, notch_hz=4.3),
     ],
-    ids=["paper", "without integral", "limited", "integral only", "hysteresis"],
+    ids=["paper", "without integral", "limited", "integral only", "fed forward", "hysteresis", "notch"],
 )
 def test_a_law_explains_its_own_voltage_whatever_its_state_was_at_the_beginning(controller):
     tolerance = 2e-4
     state = start(0.0)._replace(integral=0.7, derivative=4e-4, offset=-0.2, voltage=0.4, reference=-1e-3)
+    state = state._replace(notch_band=0.3, notch_low=0.5)
     if controller.Ki == 0.0:
         state = state._replace(integral=0.0)
     made = compare_controller(by_hand(controller, tolerance, state), controller, tolerance)
@@ -82,6 +85,14 @@ def test_an_edge_that_ignores_the_velocity_feedforward_is_said_so():
     halved = by_hand(stated.replace(velocity_feedforward=200.0, Kp=0.6 * LAW.Kp), 0.0)
     factors = compare_controller(halved, stated, 0.0).factors
     assert [factors[name] for name in ("Kp", "velocity feedforward")] == pytest.approx([0.6, 0.5], abs=0.02)
+
+
+def test_an_edge_that_ignores_the_friction_feedforward_is_said_so():
+    stated = LAW.replace(friction_feedforward=3.0)
+    made = compare_controller(by_hand(LAW, 0.0), stated, 0.0)
+    assert not made.agrees
+    assert [made.factors[name] for name in ("Kp", "Ki", "Kd")] == pytest.approx([1.0] * 3, abs=0.02)
+    assert made.factors["friction feedforward"] == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.parametrize("stated", [0.0, 3.0 * ZONE])

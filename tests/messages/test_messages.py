@@ -334,6 +334,8 @@ def test_gains_of_the_version_before_open_the_loop_in_the_dead_zone() -> None:
     before = b'{"Kp":1.0,"Ki":2.0,"Kd":0.0,"Tf":0.1,"enter":0.5,"leave":1.5,"feedforward":0.0}'
     assert msgspec.json.decode(before, type=Gains) == Gains(1.0, 2.0, 0.0, 0.1, 0.5, 1.5)
     assert msgspec.json.decode(before, type=Gains).velocity_feedforward == 0.0
+    assert msgspec.json.decode(before, type=Gains).friction_feedforward == 0.0
+    assert msgspec.json.decode(before, type=Gains).notch_hz == 0.0
 
 
 def test_an_unknown_schema_version_is_named() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from servotwin.control.gains import gains_of
@@ -136,3 +137,37 @@ def test_a_motor_whose_friction_is_told_from_its_bias_counts_before_it_is_known_
     assert (least, most) == pytest.approx((-1.96 * std, 1.96 * std), rel=0.01)
     assert friction_of(first) == pytest.approx((0.054 - 1.96 * std, 0.054 + 1.96 * std), rel=0.01)
     assert friction_of(replace(evidence([small]), motor=motor)) == (0.0, 0.0)
+
+
+def test_friction_is_learnt_in_volts_and_is_a_torque_of_the_learnt_motor() -> None:
+    """A gain of the motor that was learnt to be 10 % higher: the same voltage stalls 10 % more torque."""
+    std, lag, known = 1.9e-3, 1.0 / 1.1 - 1.0, 1e-3
+    covariance = np.diag(np.square([known, known, std, std]))
+    motor = LearntMotor((0.0, lag, 0.054, 0.0), tuple(covariance.ravel().tolist()), 0.0)
+    held = replace(evidence([Disturbance(-0.054, 1e-5, 0.0, 0.3, 0.0)]), motor=motor)
+    assert friction_of(held) == pytest.approx((0.054 - 1.96 * std, 0.054 + 1.96 * std), rel=0.01)
+    stated = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1), k_T=0.2))
+    low, high = stated._friction(held)
+    assert (low / STALL, high / STALL) == pytest.approx([1.1 * each for each in friction_of(held)], rel=0.01)
+
+
+def test_a_rest_at_which_friction_and_bias_cancel_takes_nothing_back() -> None:
+    """The rest before it was of both; a motor known to 2.9 mV told them apart there, and does so still."""
+    std = 1.5e-3
+    motor = LearntMotor((0.0, 0.0, 0.06, -0.06), (*[0.0] * 10, std**2, *[0.0] * 4, std**2), 0.0)
+    both, cancelled = (Disturbance(bias, 1e-5, 0.0, 0.3, 0.0) for bias in (-0.12, 0.001))
+    seen = replace(evidence([both, cancelled]), motor=motor)
+    assert friction_of(seen) == pytest.approx((0.06 - 1.96 * std, 0.06 + 1.96 * std), rel=0.01)
+    assert friction_of(replace(seen, rests=()))[0] == 0.0
+
+
+def test_a_window_that_tells_friction_shows_more_than_integral_action_answers_to() -> None:
+    """Where the gap's estimate is unusable too; a friction that is not known has integral action in force."""
+    std, gains = 1e-4, gains_of(CALM.replace(Ki=0.02 * SERVO.controller.Ki))
+    motor = LearntMotor((0.0, 0.0, 0.06, 0.0), (*[0.0] * 10, std**2, *[0.0] * 4, std**2), 0.0)
+    rest = Disturbance(-0.06, 1e-5, 0.0, 0.3, 0.0)
+    unusable = replace(ESTIMATE, status=GapStatus.UNIDENTIFIABLE)
+    seen = replace(evidence([rest, rest]), estimate=unusable, motor=motor, setting=Setting(0.0, gains))
+    assert POLICY._shows_more(seen)
+    apart = [rest, replace(rest, bias=0.06)]
+    assert not POLICY._shows_more(replace(seen, motor=None, disturbance=apart[1], rests=(apart[0].bias,)))

@@ -259,7 +259,7 @@ def test_a_running_setting_that_is_hardly_dearer_stays(share: float, stays: bool
 @pytest.mark.slow
 def test_settings_are_compared_on_the_steps_that_the_machine_makes_and_verified_on_all() -> None:
     """A gentle loop is the cheaper one where the gap is a large part of the step."""
-    one = replace(SMALL, shapes=((1.0, 1.0),), learnt_shapes=())
+    one = replace(SMALL, shapes=((1.0, 1.0),), learnt_shapes=(), notch=False)
     policy = CertifiedPolicy(SERVO, Uncertainty(), replace(one, scales=(0.3, 0.5, 0.7, 1.0)))
     gap, spread = 25.0 * DEG, 0.02 * DEG
     estimate = GapEstimate(gap, spread, spread, (gap - spread, gap + spread), GapStatus.OK, 1.0)

@@ -128,9 +128,18 @@ def test_the_presets_against_exponentials(preset: str) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("changes", [{"integral_only": True}, {"velocity_feedforward": 150.0, "velocity_time": 0.08}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"integral_only": True},
+        {"velocity_feedforward": 150.0, "velocity_time": 0.08},
+        {"notch_hz": 4.3, "integral_only": True},
+        {"notch_hz": 6.0, "notch_damping": 0.3, "notch_depth": 0.4},
+    ],
+)
 def test_what_the_paper_lacks_against_exponentials(changes: dict[str, float]) -> None:
-    """Weak integral action, which the dead zone stops while the rest of the law acts on; or a velocity feedforward."""
+    """Weak integral action, which the dead zone stops while the rest of the law acts on; or a velocity feedforward;
+    or a notch, which rings on where the dead zone opens the loop."""
     compared = 0
     for seed in range(40, 60):
         drawn = random_case(seed)

@@ -21,7 +21,7 @@ LIMITED = PAPER.controller.replace(
 def test_members_are_runs() -> None:
     servos = np.array([PAPER, PAPER.replace(k=8e3, c=50.0)])[:, None, None]
     stopped = LIMITED.replace(sample_rate=1e3, integral_only=True, Ki=500.0)
-    fed = LIMITED.replace(sample_rate=1e3, velocity_feedforward=150.0)
+    fed = LIMITED.replace(sample_rate=1e3, velocity_feedforward=150.0, notch_hz=4.0)
     others = [PAPER.controller.replace(sample_rate=5e3), LIMITED.replace(sample_rate=1e3)]
     laws = np.array([*others, stopped, fed])[:, None]
     tolerances = np.array([0.0, PAPER.tolerance_for(2.0 * DEGREE)])

@@ -56,6 +56,7 @@ def options_of(rate: float | None, **changes: object) -> dict:
     noisy=st.booleans(),
     integral_only=st.booleans(),
     velocities=st.tuples(*[st.sampled_from([0.0, 180.0])] * 2),
+    notches=st.sampled_from([(0.0, 0.0), (0.0, 4.0), (4.0, 0.0), (4.0, 6.0)]),
 )
 def test_the_voltage_does_not_jump(
     at: int,
@@ -69,10 +70,13 @@ def test_the_voltage_does_not_jump(
     noisy: bool,
     integral_only: bool,
     velocities: tuple[float, float],
+    notches: tuple[float, float],
 ) -> None:
     """Against the same run without the change, at the sample of the change: the inputs are identical there."""
     options = options_of(rate, friction=friction, noise=Noise(std=1e-5) if noisy else None)
-    options["controller"] = options["controller"].replace(loop_filter_hz=filters[0], velocity_feedforward=velocities[0])
+    options["controller"] = options["controller"].replace(
+        loop_filter_hz=filters[0], velocity_feedforward=velocities[0], notch_hz=notches[0]
+    )
     new = OLD.replace(
         Kp=factors[0] * OLD.Kp,
         Ki=ki,
@@ -82,6 +86,7 @@ def test_the_voltage_does_not_jump(
         feedforward=feedforward,
         integral_only=integral_only,
         velocity_feedforward=velocities[1],
+        notch_hz=notches[1],
         sample_rate=rate,
         loop_filter_hz=filters[0] if rate else filters[1],
     )

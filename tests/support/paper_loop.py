@@ -55,7 +55,8 @@ class Case:
 
 @dataclass
 class Loop:
-    """States: current, speed, motor angle, screw angle, positions, velocities, integral, filtered error and reference.
+    """States: current, speed, motor angle, screw angle, positions, velocities, integral, filtered error and reference,
+    band-pass and low-pass of the notch.
 
     A rigid screw carries the first mass with it (Eq 10), so that the positions start with the second; an elastic one
     pulls the first mass through k_d, and the load pulls the motor as long as there is contact.
@@ -70,7 +71,7 @@ class Loop:
         self.moving = range(1 if self.elastic else 2, servo.n + 1)
         self.last = self.position(servo.n)
         self.integral = SCREW + 1 + 2 * len(self.moving)
-        self.filtered, self.lagging, self.size = self.integral + 1, self.integral + 2, self.integral + 3
+        self.filtered, self.lagging, self.band, self.low, self.size = range(self.integral + 1, self.integral + 6)
 
     def position(self, mass: int) -> int:
         return SCREW + 1 + mass - self.moving[0]
@@ -121,11 +122,17 @@ class Loop:
         A[self.lagging, self.lagging], a[self.lagging] = -1.0 / law.velocity_time, 1.0 / law.velocity_time
         kick = law.velocity_feedforward / law.velocity_time / s.L
         A[CURRENT, self.lagging], a[CURRENT] = -kick, kick
+        omega = 2.0 * np.pi * law.notch_hz
+        A[CURRENT, self.band] = -2.0 * law.notch_damping * (1.0 - law.notch_depth) / s.L if omega else 0.0
+        A[self.band, self.band], A[self.band, self.low] = -2.0 * law.notch_damping * omega, -omega
+        A[self.low, self.band] = omega
         if zone or law.integral_only:
             direct = law.Kp + law.Kd / law.Tf
             A[CURRENT, self.last], a[CURRENT] = -direct / s.L, direct / s.L + kick
             A[CURRENT, self.integral] = 1.0 / s.L
             A[CURRENT, self.filtered] = -law.Kd / law.Tf / s.L
+            A[self.band, self.last], a[self.band] = -omega * direct, omega * direct
+            A[self.band, self.integral], A[self.band, self.filtered] = omega, -omega * law.Kd / law.Tf
             A[self.filtered, self.last], a[self.filtered] = -1.0 / law.Tf, 1.0 / law.Tf
         if zone:
             A[self.integral, self.last], a[self.integral] = -law.Ki, law.Ki
@@ -205,7 +212,8 @@ def by_solve_ivp(case: Case, times: Array, rtol: float = 1e-12) -> tuple[Array, 
     loop = Loop(case)
     x, side, count = np.zeros(loop.size), 0, 0
     result = np.full(len(times), np.nan)
-    scale = np.abs([1e-2, 1.0, 1.0, 1.0, *[1e-3] * len(loop.moving), *[1e-2] * len(loop.moving), 1.0, 1e-3, 1e-3])
+    masses = len(loop.moving)
+    scale = np.array([1e-2, 1.0, 1.0, 1.0, *[1e-3] * masses, *[1e-2] * masses, 1.0, 1e-3, 1e-3, 1.0, 1.0])
     for begin, end, reference in case.stretches():
         zone, t = (zone_of(case, reference - x[loop.last]) if case.tolerance else 1), begin
         while t < end:

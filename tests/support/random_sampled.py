@@ -133,6 +133,8 @@ def random_case(seed: int) -> SampledCase:
     law = law.replace(integral_only=chance(0.4))
     if chance(0.4):
         law = law.replace(velocity_feedforward=rng.uniform(0.2, 0.8) * servo.k_B / servo.p, velocity_time=0.08)
+    if chance(0.3):
+        law = law.replace(notch_hz=10.0 ** rng.uniform(0.0, 1.5), notch_damping=rng.uniform(0.1, 1.0))
     return SampledCase(servo, law, inputs, theta_d0, int(duration * rate / every) + 1, delay)
 
 

@@ -245,7 +245,12 @@ def phasors(servo: Servo, loop: ScaledLoop, prediction: Prediction, law: Control
     if law.loop_filter_hz is not None:
         measured = result[at("filtered")] = position / (1.0 + s / (2.0 * math.pi * law.loop_filter_hz))
     result[at("integral")] = -law.Ki * measured / s
-    result[at("derivative")] = -measured / (law.Tf * s + 1.0)
+    result[at("derivative")] = slow = -measured / (law.Tf * s + 1.0)
+    if law.notch_hz:
+        voltage = -law.Kp * measured + result[at("integral")] - law.Kd / law.Tf * (measured + slow)
+        relative = s / (2.0 * math.pi * law.notch_hz)
+        result[at("notch low")] = low = voltage / (relative**2 + 2.0 * law.notch_damping * relative + 1.0)
+        result[at("notch band")] = relative * low
     return np.asarray(result)
 
 

@@ -90,6 +90,8 @@ class OpcUaDrive:
         gains = parameters.setting.gains or Gains(0.0, 0.0, 0.0, 1.0)
         needed = [model.INTEGRAL_ONLY] if gains.integral_only else []
         needed += model.VELOCITY if gains.velocity_feedforward else ()
+        needed += [model.FRICTION] if gains.friction_feedforward else []
+        needed += model.NOTCH if gains.notch_hz else ()
         for name in needed:
             if not session.has(name):
                 raise DriveRefused(f"drive {self._settings.url}: has no variable {name}")

@@ -31,7 +31,13 @@ INTEGRAL_ONLY = "IntegralOnly"
 VELOCITY = ("VelocityFeedforward", "VelocityTime")
 """Double: V s/m, s; a drive that lacks them has no velocity feedforward."""
 
-OPTIONAL = (INTEGRAL_ONLY, *VELOCITY)
+FRICTION = "FrictionFeedforward"
+"""Double, V; a drive that lacks it has no friction feedforward."""
+
+NOTCH = ("NotchHz", "NotchDamping", "NotchDepth")
+"""Double: Hz, ratio, gain at the centre; a drive that lacks them has no notch."""
+
+OPTIONAL = (INTEGRAL_ONLY, *VELOCITY, FRICTION, *NOTCH)
 """Gains that not every drive has."""
 
 COMMIT = "Commit"

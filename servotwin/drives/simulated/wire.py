@@ -15,14 +15,14 @@ from msgspec import convert
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 
-MAGIC, VERSION = b"STDR", 3
+MAGIC, VERSION = b"STDR", 4
 CONTROL, SUPERVISE = 1, 2
 ROLES = {"control": CONTROL, "supervise": SUPERVISE}
 HELLO = struct.Struct("<4sHBx")  # magic, version, role
 WELCOME = struct.Struct("<4sHB x8sd")  # magic, version, role; the machine's run, rate in Hz
 SAMPLE = struct.Struct("<qdddd")  # number, reference, theta_m, position, lag in s
 VOLTAGE = struct.Struct("<d")  # V; where it is not finite the last one holds
-REQUEST = struct.Struct("<BB2xIq11d")  # kind, with gains, most; number or version; tolerance or offset, gains
+REQUEST = struct.Struct("<BB2xIq15d")  # kind, with gains, most; number or version; tolerance or offset, gains
 REPLY = struct.Struct("<B3xIqqd")  # kind, count; first, version, lag in s
 READ, WRITE, MOVE = 1, 2, 3
 DONE, REFUSED, OVER = 0, 1, 2

@@ -205,8 +205,9 @@ def arrival_error(setting: Design, model: Servo, input_bias: Array, friction: Ar
     """`nearness` for input biases (V) and frictions (N m)."""
     law = setting.controller
     # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the
-    # motor against what it answers to the error.
-    steady = (np.abs(input_bias + law.feedforward) + friction * model.R / model.k_T) / abs(law.Kp)
+    # motor against what it answers to the error; what is fed forward for it pushes to one side.
+    held = friction * model.R / model.k_T + abs(law.friction_feedforward)
+    steady = (np.abs(input_bias + law.feedforward) + held) / abs(law.Kp)
     return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
 
 

@@ -60,12 +60,17 @@ class Demands:
     ----------
     tail, tolerance : float
         m: largest error of a machine in the last part, widest dead zone.
+    friction_limit : float
+        V, largest friction feedforward.
     scales : tuple of float
         Factors on Kp and Kd.
     shapes : tuple of (float, float)
         Factors on Kd / (Kp Tf) and on Tf, tried with every scale: they move the derivative action.
     learnt_shapes : tuple of (float, float)
         Further ones, tried on a machine that was learnt.
+    notch_shapes : tuple of (float, float)
+        Shapes tried with a notch at the structure's first resonance, on a machine that was learnt; on any other one
+        only where nothing else is within the bounds.
     integral : tuple of float
         Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
     known : float
@@ -134,11 +139,27 @@ class Demands:
             "none."
         ),
     ] = True
+    friction_feedforward: Annotated[
+        bool,
+        key(
+            help="Candidates with a friction feedforward are tried too, where friction is known; false for machines "
+            "whose own controller has none."
+        ),
+    ] = True
+    notch: Annotated[
+        bool,
+        key(
+            help="Candidates with a notch at the structure's resonance are tried too; false for machines whose own "
+            "controller has none."
+        ),
+    ] = True
     tail: float = math.inf
     tolerance: float = math.inf
+    friction_limit: float = math.inf
     scales: tuple[float, ...] = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.2, 1.5, 2.0)
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))
+    notch_shapes: tuple[tuple[float, float], ...] = ((1.0, 0.25), (1.0, 1.0))
     integral: tuple[float, ...] = (0.0, 0.01, 0.02, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     velocity: tuple[float, ...] = (0.3, 0.5)

@@ -26,6 +26,7 @@ from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
+_Gains = tuple[float, float, float, float]
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
 # Time constant of a velocity feedforward's filter, in units of 1 / crossover of a motor that Kp alone moves.
@@ -171,8 +172,9 @@ def _for_disturbance(demands: Demands, disturbed: bool) -> Demands:
 def candidates_of(
     servo: Servo, uncertainty: Uncertainty, demands: Demands, disturbed: bool, noisy: bool
 ) -> list[Design]:
-    """Every combination of scales, shapes, velocity feedforward, integral action and dead zone within the bounds on Ms.
+    """Every combination of scales, shapes, feedforwards, integral action and dead zone within the bounds on Ms.
 
+    The friction that acts on every machine is fed forward, all of it or none: more would push.
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
     candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
     reference that stops the integral only.
@@ -185,6 +187,8 @@ def candidates_of(
     integral = demands.integral if disturbed else (0.0,)
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
+    fed = [each.controller for each in plain if not each.tolerance]
+    plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0], demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
     if not (0.0 < zone <= demands.tolerance and noisy):
         return plain
@@ -210,6 +214,16 @@ def _with_velocity(servo: Servo, law: Controller, demands: Demands) -> list[Cont
     return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
 
 
+def _with_friction(servo: Servo, laws: list[Controller], friction: float, demands: Demands) -> list[Controller]:
+    """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
+    every reversal what it holds against it."""
+    push = min(friction * servo.R / servo.k_T, demands.friction_limit)
+    if not demands.friction_feedforward or not push:
+        return []
+    push = math.copysign(push, servo.controller.Kp)
+    return [law.replace(friction_feedforward=push) for law in laws if not law.Ki]
+
+
 def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:
     """A law with dead zones that stop its integral only, for a smallest step (m)."""
     counts = COUNTS * servo.position_resolution
@@ -221,8 +235,8 @@ def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> li
     ]
 
 
-def _gains(law: Controller) -> tuple[float, float, float]:
-    return law.Kp, law.Kd, law.Tf
+def _gains(law: Controller) -> _Gains:
+    return law.Kp, law.Kd, law.Tf, law.notch_hz
 
 
 def _ranked_in_stages(
@@ -248,10 +262,10 @@ def _ranked_in_stages(
     return _by_moves(screening, candidates, [*always, running] if running is not None else always, running)
 
 
-def _velocities(ranked: Iterator[Design], own: tuple[float, float, float]) -> dict[tuple[float, float, float], float]:
+def _velocities(ranked: Iterator[Design], own: _Gains) -> dict[_Gains, float]:
     """Velocity feedforwards with which integral action is tried, by gains: the best for each of the best gains; for the
     own gains that of the best of all."""
-    fed, best = dict[tuple[float, float, float], float](), math.nan
+    fed, best = dict[_Gains, float](), math.nan
     for setting in ranked:
         law = setting.controller
         best = law.velocity_feedforward if math.isnan(best) else best

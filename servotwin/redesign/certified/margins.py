@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import lru_cache
 
@@ -22,6 +23,9 @@ _WORTH_TRYING = 0.5
 # The servo's own PD and the constant that was near the best at every gap with hindsight: so the search is no worse.
 _ALWAYS = (0.6, 1.0)
 _ROUNDED = 1.0 + 1e-6
+# Damping ratio of a notch's poles, and least one of its zeros: a deeper notch is a worse one as soon as the resonance
+# is a little off. Resonances up to a share of the rate; centres per octave.
+_NOTCH_DAMPING, _LEAST_DAMPING, _RESOLVED, _PER_OCTAVE = 0.5, 0.05, 0.1, 24
 
 
 def widened(uncertainty: Uncertainty, demands: Demands) -> Uncertainty:
@@ -109,14 +113,8 @@ def laws_within(
     """
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     delays = delays_of(servo.controller, uncertainty)
-    shapes = demands.shapes + (demands.learnt_shapes if uncertainty.learnt is not None else ())
-    scaled = [
-        scaled_law(servo.controller, scale, shape, share)
-        for share in integral
-        for shape in shapes
-        for scale in demands.scales
-    ]
-    laws = list(dict.fromkeys(scaled))
+    own = servo.controller
+    notched = with_notch(servo) if demands.notch else None
     known: dict[Controller, bool] = {}
 
     def passes(law: Controller) -> bool:
@@ -131,13 +129,50 @@ def laws_within(
             )
         return known[law]
 
-    fastest = next((law for law in sorted(laws, key=lambda law: -abs(law.Kp)) if passes(law)), None)
-    if fastest is None:
+    laws = _scaled_laws(own, demands, demands.shapes, integral)
+    laws += _scaled_laws(own, demands, demands.learnt_shapes, integral) if uncertainty.learnt is not None else []
+    always = {scaled_law(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
+    within = _lively(laws, passes, always)
+    if notched is not None and (uncertainty.learnt is not None or not within):
+        laws = _scaled_laws(notched, demands, demands.notch_shapes, integral)
+        within += _lively(laws, passes, set())
+    if not within:
         raise InvalidInput(_none_within(servo, uncertainty, demands, plants, laws))
-    # A loop with less than half of the gain that another one may have is slower, at every gap of the presets.
-    least = _WORTH_TRYING * abs(fastest.Kp)
-    always = {scaled_law(servo.controller, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
-    return tuple(law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law))
+    return tuple(within)
+
+
+def _scaled_laws(
+    own: Controller, demands: Demands, shapes: tuple[tuple[float, float], ...], integral: tuple[float, ...]
+) -> list[Controller]:
+    laws = [scaled_law(own, scale, shape, share) for share in integral for shape in shapes for scale in demands.scales]
+    return list(dict.fromkeys(laws))
+
+
+def _lively(laws: list[Controller], passes: Callable[[Controller], bool], always: set[Controller]) -> list[Controller]:
+    """Laws that pass and are of `always`, or have at least half of the gain of the fastest that passes: the others are
+    slower, at every gap of the presets."""
+    fastest = next((law for law in sorted(laws, key=lambda law: -abs(law.Kp)) if passes(law)), None)
+    least = math.inf if fastest is None else _WORTH_TRYING * abs(fastest.Kp)
+    return [law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law)]
+
+
+def with_notch(servo: Servo) -> Controller | None:
+    """The servo's controller with a notch at the first resonance of its structure; None: nothing resonates, or at a
+    frequency that a sampled law hardly resolves."""
+    poles = servo.plant().poles()
+    # The angle from the imaginary axis is the damping ratio's arcsine.
+    resonant = poles[(poles.imag > 0.0) & (-poles.real < _NOTCH_DAMPING * np.abs(poles))]
+    if not resonant.size:
+        return None
+    first = complex(resonant[np.argmin(np.abs(resonant))])
+    hertz, damping = abs(first) / (2.0 * math.pi), -first.real / abs(first)
+    rate = servo.controller.sample_rate
+    if rate is not None and hertz > _RESOLVED * rate:
+        return None
+    # Rounded: what a window adds to a learnt resonance is not worth another notch.
+    hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
+    depth = min(1.0, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
+    return servo.controller.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
 def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demands: Demands) -> bool:
@@ -177,7 +212,7 @@ def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share:
 def unfed(law: Controller) -> Controller:
     """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
     plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
-    return plain.replace(velocity_feedforward=0.0, velocity_time=1.0)
+    return plain.replace(velocity_feedforward=0.0, velocity_time=1.0, friction_feedforward=0.0)
 
 
 def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
@@ -195,5 +230,5 @@ def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controlle
 def with_margins(demands: Demands) -> Demands:
     """The part of the demands that the candidates depend on."""
     known = Demands()
-    names = ("Ms", "Ms_worst", "scales", "shapes", "learnt_shapes", "integral", "beyond")
+    names = ("Ms", "Ms_worst", "scales", "shapes", "learnt_shapes", "notch", "notch_shapes", "integral", "beyond")
     return replace(known, **{name: getattr(demands, name) for name in names})

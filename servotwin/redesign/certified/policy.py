@@ -181,7 +181,7 @@ class CertifiedPolicy:
         tolerance = min(self.demands.tolerance, band_of(certificate).error / leave)
         # Less than what counts as arrived for the smallest step is no error.
         tail = max(certificate.tail, NEAR * self.uncertainty.step[0])
-        return replace(self.demands, tail=min(self.demands.tail, tail), tolerance=tolerance)
+        return replace(self._limited_demands, tail=min(self.demands.tail, tail), tolerance=tolerance)
 
     def fallback(self) -> Certificate:
         """Certificate of the setting for every gap and bias of the stated range, whatever is estimated.
@@ -191,7 +191,12 @@ class CertifiedPolicy:
         InvalidInput
             No setting is verified for the whole range: state a narrower one, or lower the demands.
         """
-        return _fallback(self.servo, self.uncertainty, self.demands, self.simulations)
+        return _fallback(self.servo, self.uncertainty, self._limited_demands, self.simulations)
+
+    @property
+    def _limited_demands(self) -> Demands:
+        """Demands with the largest friction feedforward that an edge of this policy takes."""
+        return replace(self.demands, friction_limit=min(self.demands.friction_limit, self.feedforward_limit))
 
     def _estimate(self, evidence: Evidence) -> GapEstimate | None:
         if not evidence.unusable:
@@ -269,18 +274,21 @@ class CertifiedPolicy:
         fed, _ = self._input_bias(evidence)
         if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
             return True
-        sticks = self._friction(evidence)[1] > 0.0
-        if evidence.tuned_for is None and sticks and self._motor(evidence) is not None:
-            # The fallback set is verified for the stated friction only.
+        low, high = self._friction(evidence)
+        sticks = high > 0.0
+        if sticks and self._motor(evidence) is not None and (evidence.tuned_for is None or (low > 0.0 and gains.Ki)):
+            # The fallback set is verified for the stated friction only, and an integral is not all that friction allows
+            # once it is known.
             return True
         return (gains.Ki != 0.0) != sticks and len(evidence.rests) > 0
 
     def _motor(self, evidence: Evidence) -> LearntMotor | None:
         """The learnt motor, where it tells friction and bias well enough to act on them: to a small voltage, or to a
-        share of the one at rest, which is then of one or of the other."""
-        motor, enough, rest = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer, evidence.disturbance.bias
-        if math.isfinite(rest):
-            enough = max(enough, _TELLS * abs(rest))
+        share of the largest one of the last rests, which is then of one or of the other: at a single rest they may
+        cancel."""
+        motor, enough = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
+        rests = (*evidence.rests, evidence.disturbance.bias)
+        enough = max(enough, *(_TELLS * abs(rest) for rest in rests if math.isfinite(rest)))
         known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= enough
         return motor if known else None
 
@@ -294,7 +302,10 @@ class CertifiedPolicy:
         """
         disturbance, now = evidence.disturbance, evidence.gains
         low, high = self.uncertainty.friction
-        motor, torque = self._motor(evidence), self.servo.k_T / self.servo.R
+        motor, servo = self._motor(evidence), self.servo
+        learnt = learnt_servo(servo, self.uncertainty, None, evidence.motor)
+        # Learnt as a voltage: as a torque it is that of the motor on which it is simulated.
+        torque = (servo if learnt is None else learnt[0]).k_T / servo.R
         if motor is not None:
             least, most = motor.friction
             # Friction that is not significant counts at most as stated.
@@ -335,19 +346,23 @@ def _noise(evidence: Evidence) -> float:
 
 
 def alike(one: Design, other: Setting | None) -> bool:
-    """True when two settings are the same but for the feedforward."""
+    """True when two settings are the same but for what they feed forward against bias and friction."""
     if other is None or other.gains is None:
         return False
-    names = ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only", "velocity_feedforward", "velocity_time")
+    names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only", "velocity_feedforward", "velocity_time"]
+    names += ["notch_hz", "notch_damping", "notch_depth"]
     gains = ((getattr(other.gains, name), getattr(one.controller, name)) for name in names)
     pairs = (*gains, (other.tolerance, one.tolerance))
     return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
 
 
 def _in_force(setting: Design, evidence: Evidence, small: float) -> bool:
-    """True when the edge runs the setting already, by its last report, but for a `small` (V) change of feedforward."""
+    """True when the edge runs the setting already, by its last report, but for a `small` (V) change of feedforwards."""
     now, new = evidence.gains, setting.controller
-    return now is not None and abs(now.feedforward - new.feedforward) <= small and alike(setting, evidence.setting)
+    if now is None:
+        return False
+    changes = (now.feedforward - new.feedforward, now.friction_feedforward - new.friction_feedforward)
+    return max(map(abs, changes)) <= small and alike(setting, evidence.setting)
 
 
 def band_of(certificate: Certificate, noise: float = 0.0) -> Band:

@@ -25,6 +25,8 @@ _FAST = 10.0
 _FIRST = 0.125
 # Candidates that are simulated on the other machines at once, and machines on which others failed, before the rest.
 _AT_ONCE, _HARDEST = 2, 4
+# Of the largest step: steps from there on count as the largest.
+_LARGEST = 0.8
 
 
 def is_plain(setting: Design) -> bool:
@@ -46,7 +48,8 @@ def leaves_too_much(question: Question, setting: Design) -> bool:
     """
     known, servo, law = question.uncertainty, question.servo, setting.controller
     bias = max(abs(end + law.feedforward) for end in known.input_bias)
-    left = (bias + known.friction[1] * servo.R / servo.k_T) / abs(law.Kp)
+    held = max(0.0, known.friction[1] * servo.R / servo.k_T - abs(law.friction_feedforward))
+    left = (bias + held) / abs(law.Kp)
     return law.Ki == 0.0 and left > ROUNDED * question.largest_error(setting)
 
 
@@ -78,6 +81,8 @@ class Screening:
         self._first = max(1, round(_FIRST * self._members.count))
         self._order: NDArray[np.int64] | None = None
         self._known: dict[Design, MachineMeasures] = {}
+        # Of settings with a friction feedforward: whether they are off in the end after the largest steps.
+        self._far: dict[Design, bool] = {}
         # Machines on which each setting was simulated; settings that missed a demand on each machine.
         self._places: dict[Design, NDArray[np.int64]] = {}
         self._misses = np.zeros(self._members.count, dtype=np.int64)
@@ -139,6 +144,21 @@ class Screening:
         if new:
             assert self._order is not None
             self._simulate(new, self._order[: self._first])
+            self._try_largest_steps(new)
+
+    def _try_largest_steps(self, settings: list[Design]) -> None:
+        """Simulate settings with a friction feedforward on the largest stated steps, where the usual ones rank.
+
+        Friction holds what they overshoot, which grows with the step.
+        """
+        question, known = self.question, self.question.uncertainty
+        pushed = [each for each in settings if each.controller.friction_feedforward]
+        if not pushed or known.usual_step is None:
+            return
+        largest = known.replace(step=(_LARGEST * known.step[1], known.step[1]))
+        machines = draw(question.servo, largest, question.demands.screened, 2, question.demands.seed)
+        tried = assess([self._quick(each) for each in pushed], machines, question.trial.half)
+        self._far |= {each: bool(self._is_off(each, few).any()) for each, few in zip(pushed, tried, strict=True)}
 
     def _finish(self, settings: list[Design]) -> None:
         """Simulate settings on machines on which they were not yet: those on which most others failed, then the
@@ -188,7 +208,7 @@ class Screening:
         demands, few = self.question.demands, self._known[setting]
         most = self._members.count - int(np.sum(~few.settled))
         fails = most / self._members.count < demands.settled or bool(self._is_off(setting, few).any())
-        fails = fails or leaves_too_much(self.question, setting)
+        fails = fails or leaves_too_much(self.question, setting) or self._far.get(setting, False)
         missing = self._members.count - few.cost.size
         costs = np.concatenate([few.cost.ravel(), np.zeros(missing)])
         return _Rank(fails, self.question.cost(setting, costs), place)
