@@ -79,6 +79,7 @@ def text_store(folder: Path) -> str:
     return ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("service", "expected"),
     [

@@ -315,7 +315,7 @@ def _signals(samples: int) -> tuple[np.ndarray, np.ndarray]:
 STOPPED = LIMITED.replace(integral_only=True, Ki=300.0, voltage_limit=1.0, rate_limit=150.0)
 BIASED = LIMITED.replace(feedforward=-0.37, release_time=30.0)
 FED = LIMITED.replace(velocity_feedforward=190.0, velocity_time=0.03, friction_feedforward=0.07)
-NOTCHED = LIMITED.replace(notch_hz=4.3, notch_damping=0.4)
+NOTCHED = LIMITED.replace(notch_hz=4.3, notch_damping=0.4, voltage_limit=1.0, rate_limit=150.0)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import numpy as np
 from asyncua import Server, ua
 from asyncua.crypto.permission_rules import User, UserRole
 
+from servotwin.cosim.machine import compile_ahead
 from servotwin.drives.opcua import model
 from servotwin.drives.simulated.plants import SupervisedPlant
 from servotwin.drives.simulated.settings import MachineSettings
@@ -53,7 +54,9 @@ class Machine:
 
     def __init__(self, options: dict[str, Any]) -> None:
         self.options = options
-        self.plant = SupervisedPlant(MachineSettings.load(options["plant"]))
+        settings = MachineSettings.load(options["plant"])
+        compile_ahead(settings.scenario)  # before it says that it is ready: a client waits for a second
+        self.plant = SupervisedPlant(settings)
         self.rings = np.zeros((4, options.get("ring", 4000)))
         self.variables: dict[str, Any] = {}
         self.committed = 0

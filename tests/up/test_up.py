@@ -30,9 +30,7 @@ from servotwin.up import plan
 plan.SERVOS = tuple(servo._replace(model="dead-zone") for servo in plan.SERVOS[:{NUMBER}])
 
 from servotwin.cli.app import main
-from servotwin.up import command
 
-command._LINE_S = 2.0
 main()
 """
 """Without the certified policy, whose verifications would take most of the time."""

@@ -142,7 +142,9 @@ class WindowFit:
                 return replace(bound, machine=either)
             teaches = teaches and contacts.two
         if status is GapStatus.MODEL_MISMATCH:
-            fault = likely_fault(self.window, self.angle, self.servo, evidence.unexplained, self.second)
+            # A fault of a channel may have bent the machine's numbers first.
+            servo = self.servo if self.learnt is None else self.learnt.problem.servo
+            fault = likely_fault(self.window, self.angle, servo, evidence.unexplained, self.second)
             reasons = (*fault, *reasons)
         if status is GapStatus.OK:
             evidence = replace(evidence, doubt=self._doubt(evidence), learnt=self.learnt is not None)
