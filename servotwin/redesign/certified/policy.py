@@ -288,7 +288,7 @@ class CertifiedPolicy:
         cancel."""
         motor, enough = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
         rests = (*evidence.rests, evidence.disturbance.bias)
-        enough = max(enough, *(_TELLS * abs(rest) for rest in rests if math.isfinite(rest)))
+        enough = max([enough, *(_TELLS * abs(rest) for rest in rests if math.isfinite(rest))])
         known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= enough
         return motor if known else None
 
