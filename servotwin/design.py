@@ -14,7 +14,7 @@ from servotwin.analysis.tuning.tune import tune as tune_system
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.linear import LinearSystem, series
-from servotwin.plant.loop import loop_filter
+from servotwin.plant.loop import loop_filter, notch
 from servotwin.plant.servo import Servo
 
 
@@ -68,8 +68,8 @@ def tune(
 
 
 def tuned_system(servo: Servo) -> LinearSystem:
-    """System that `tune` closes the loop around: the plant with the controller's loop filter in series."""
-    return series(servo.plant(), loop_filter(servo.controller))
+    """System that `tune` closes the loop around: the plant with the controller's loop filter and notch in series."""
+    return series(series(servo.plant(), loop_filter(servo.controller)), notch(servo.controller))
 
 
 def stability_map(

@@ -197,6 +197,7 @@ def _sent_update(update: JsonObject) -> str:
         parts += [f"feedforward {gains['feedforward'] * 1e3:.1f} mV"] if gains.get("feedforward") else []
         push = gains.get("friction_feedforward")
         parts += [f"friction feedforward {push * 1e3:.1f} mV"] if push else []
+        parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     if verification:
         parts.append(f"verified on {verification['members']} simulated machines")
     return f"version {update['version']} sent: {', '.join(parts)}"

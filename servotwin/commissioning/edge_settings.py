@@ -182,6 +182,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
         # The centre follows the learnt machine.
         notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,
         notch_max_hz=max(notches, default=0.0) * _NOTCH_MOVES,
+        notch_damping=max((law.notch_damping for law in laws if law.notch_hz), default=own.notch_damping),
         patience_s=PATIENCE * scales(policy.servo).time,
     )
     return limits, Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, max(leave, own.leave) / factor)
@@ -205,7 +206,15 @@ def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
     own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
     patience = PATIENCE * scales(policy.servo).time
-    return Limits(gain_factor=_ROUNDING, feedforward=abs(own.feedforward), patience_s=patience), gains_of(own)
+    limits = Limits(
+        gain_factor=_ROUNDING,
+        feedforward=max(abs(own.feedforward), abs(own.friction_feedforward)),
+        notch_min_hz=own.notch_hz,
+        notch_max_hz=own.notch_hz,
+        notch_damping=own.notch_damping,
+        patience_s=patience,
+    )
+    return limits, gains_of(own)
 
 
 @dataclass(frozen=True)

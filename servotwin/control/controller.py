@@ -9,6 +9,8 @@ from servotwin.control.law import LawParameters
 from servotwin.errors import InvalidInput
 from servotwin.runtime.notebook import html_table
 
+# Angle per tick above which a notch has settled within the tick to all digits, unless it is very narrow.
+_BEYOND_RATE = 1e6
 _GAINS = ("Kp", "Ki", "Kd", "Tf")
 
 
@@ -145,7 +147,7 @@ class Controller:
         ),
     ] = 0.5
     notch_depth: Annotated[
-        float, key("notch_depth", minimum=0.0, maximum=1.0, help="Gain of the notch at its centre; 1 elsewhere.")
+        float, key("notch_depth", minimum=0.0, below=1.0, help="Gain of the notch at its centre; 1 elsewhere.")
     ] = 0.1
 
     def __post_init__(self) -> None:
@@ -254,6 +256,8 @@ def _notch_step(omega: float, damping: float, step: float) -> tuple[float, float
 
     Returns 1 - F_aa, 1 - F_bb and F_ba = -F_ab of its transition matrix F.
     """
+    if omega * step > _BEYOND_RATE:
+        return 1.0, 1.0, 0.0
     decay, spread = damping * omega * step, omega * step * sqrt(1.0 - damping * damping)
     # exp(M) = exp(-decay) (cos I + sin / spread (M + decay I)); 1 - cos without cancellation.
     fade, ratio = exp(-decay), sin(spread) / spread if spread else 1.0

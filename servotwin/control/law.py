@@ -159,11 +159,7 @@ def tick(parameters: LawParameters, state: LawState, reference: float, measureme
     pidf = (parameters.Kp * driven + state.integral + parameters.derivative_gain * slope) * acting
     moved = reference - state.reference
     ahead = (1.0 - parameters.velocity_step) * state.ahead + moved
-    direction = state.direction
-    if moved > 0.0:
-        direction = 1.0
-    elif moved < 0.0:
-        direction = -1.0
+    direction = state.direction if moved == 0.0 else (1.0 if moved > 0.0 else -1.0)
     band, low, through = state.notch_band, state.notch_low, pidf
     if parameters.notch_gain != 0.0:
         through = pidf - parameters.notch_gain * band
@@ -230,6 +226,6 @@ def transfer(old: LawParameters, new: LawParameters, state: LawState, reference:
         moved = moved._replace(notch_band=0.0, notch_low=0.0)
     elif old.notch_gain == 0.0:
         # A notch that is new starts at rest at what it filters: at zero it would ring.
-        bare = unlimited._replace(notch_gain=0.0, feedforward=0.0, velocity_gain=0.0)
+        bare = unlimited._replace(notch_gain=0.0, feedforward=0.0, velocity_gain=0.0, friction=0.0)
         moved = moved._replace(notch_band=0.0, notch_low=tick(bare, moved, reference, measurement).voltage)
     return moved._replace(offset=voltage - tick(unlimited, moved, reference, measurement).voltage)

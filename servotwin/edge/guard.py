@@ -109,6 +109,15 @@ class Limits:
     notch_max_hz: Annotated[
         float, key(minimum=0.0, infinite=True, help="Largest centre of a notch; 0: updates set none.")
     ] = 0.0
+    notch_damping: Annotated[
+        float,
+        key(
+            "notch_max_damping",
+            above=0.0,
+            maximum=1.0,
+            help="Largest damping ratio of a notch's poles: a wide one takes phase from the loop far below its centre.",
+        ),
+    ] = 0.5
     patience_s: Annotated[
         float,
         key(
@@ -122,6 +131,10 @@ class Limits:
         check(self)
         if not self.minimum <= self.maximum:
             raise InvalidInput(f"limits on the tolerance {self.minimum!r} m to {self.maximum!r} m: must be in order")
+        if self.notch_max_hz and not self.notch_min_hz <= self.notch_max_hz:
+            raise InvalidInput(
+                f"limits on a notch {self.notch_min_hz!r} Hz to {self.notch_max_hz!r} Hz: must be in order"
+            )
 
     def allows_tolerance(self, tolerance: float) -> bool:
         """True where a tolerance (m) is in bounds."""
@@ -137,9 +150,11 @@ class Limits:
         kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
         voltages = max(abs(gains.feedforward), abs(gains.friction_feedforward))
         fed = voltages <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
-        # A notch adds phase lag below its centre.
-        notch = gains.notch_hz == 0.0 or self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
-        return scaled and gains.leave <= self.gain_factor * own.leave and fed and notch
+        return scaled and gains.leave <= self.gain_factor * own.leave and fed and self._allows_notch(gains)
+
+    def _allows_notch(self, gains: Gains) -> bool:
+        within = self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
+        return gains.notch_hz == 0.0 or (within and gains.notch_damping <= self.notch_damping)
 
     def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
         """True where gains may change from old to new, `since` seconds after the last change."""

@@ -187,10 +187,13 @@ def _factors(
     stated = {name: term for name, term in terms.gains.items() if np.any(term != 0.0)}
     steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
     # What the law's state before the window leaves in it.
-    initial = [terms.acting, *(1.0 - steps) ** np.arange(voltage.size)]
+    fading = (1.0 - steps) ** np.arange(voltage.size)
+    initial = [terms.acting, *fading]
+    if parameters.notch_gain != 0.0:
+        initial = [behind_notch(parameters, terms.acting, 0.0, 0.0), fading[0], fading[2]]
+        initial += [behind_notch(parameters, fading[1], 0.0, 0.0), *_notch_columns(parameters, voltage.size).values()]
     if parameters.friction != 0.0:
         initial += [np.where(np.cumsum(reference != reference[0]) == 0, 1.0, 0.0)]
-    initial += _notch_columns(parameters, voltage.size).values() if parameters.notch_gain != 0.0 else ()
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
     values = _least_squares(columns, measured)

@@ -50,7 +50,7 @@ class Gains(Struct, frozen=True):
             require(getattr(self, name) > 0.0, f"gains {name} {getattr(self, name)} s is not positive")
         require(self.notch_hz >= 0.0, f"gains notch_hz {self.notch_hz} Hz is negative")
         require(0.0 < self.notch_damping <= 1.0, f"gains notch_damping {self.notch_damping} is not within 0 and 1")
-        require(0.0 <= self.notch_depth <= 1.0, f"gains notch_depth {self.notch_depth} is not within 0 and 1")
+        require(0.0 <= self.notch_depth < 1.0, f"gains notch_depth {self.notch_depth} is not within 0 and 1")
         require(0.0 <= self.enter <= self.leave, f"gains enter {self.enter}, leave {self.leave}: not in order")
 
 

@@ -76,17 +76,26 @@ def test_a_notch_comes_and_goes_without_a_bump(old: Controller, new: Controller)
     assert tick(new.law(), changed, 1e-3, 0.0).voltage == pytest.approx(expected, rel=1e-12)
 
 
-def test_a_notch_that_comes_at_rest_stays_at_rest() -> None:
-    law, new = PLAIN.law(), NOTCHED.law()
-    state = start(0.0)._replace(integral=0.37)
+@pytest.mark.parametrize("push", [0.0, 0.05])
+def test_a_notch_that_comes_at_rest_stays_at_rest(push: float) -> None:
+    law, new = (each.replace(friction_feedforward=push, feedforward=-0.02).law() for each in (PLAIN, NOTCHED))
+    state = start(0.0)._replace(integral=0.37, direction=1.0)
     state = transfer(law, new, state, 0.0, 0.0)
     for _ in range(500):
         state = tick(new, state, 0.0, 0.0)
-        assert state.voltage == pytest.approx(0.37, rel=1e-12)
+        assert state.voltage == pytest.approx(0.35 + push, rel=1e-12)
+
+
+def test_a_centre_far_beyond_the_rate_is_no_notch() -> None:
+    far, plain = PLAIN.replace(notch_hz=1e308).law(), PLAIN.law()
+    one = other = start(0.0)
+    for k in range(100):
+        one, other = tick(far, one, 1e-3, 1e-6 * k), tick(plain, other, 1e-3, 1e-6 * k)
+        assert one.voltage == pytest.approx(other.voltage, rel=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("key", "value"), [("notch_hz", -1.0), ("notch_damping", 0.0), ("notch_damping", 1.1), ("notch_depth", 1.5)]
+    ("key", "value"), [("notch_hz", -1.0), ("notch_damping", 0.0), ("notch_damping", 1.1), ("notch_depth", 1.0)]
 )
 def test_values_out_of_range_are_refused(key: str, value: float) -> None:
     with pytest.raises(InvalidInput, match=key):

@@ -68,6 +68,17 @@ def test_a_notch_stays_where_the_limits_allow_it(hertz: float, inside: bool) -> 
     assert judged(replace(OWN, notch_hz=hertz), limits) is expected
 
 
+def test_a_notch_is_no_wider_than_the_limits_allow_it() -> None:
+    limits = Limits(notch_max_hz=8.0, notch_damping=0.5)
+    assert judged(replace(OWN, notch_hz=4.0, notch_damping=0.5), limits) is Reason.APPLIED
+    assert judged(replace(OWN, notch_hz=4.0, notch_damping=0.51), limits) is Reason.GAINS_OUT_OF_BOUNDS
+
+
+def test_limits_on_a_notch_are_in_order() -> None:
+    with pytest.raises(InvalidInput, match=r"notch 9.0 Hz to 8.0 Hz: must be in order"):
+        Limits(notch_min_hz=9.0, notch_max_hz=8.0)
+
+
 def test_integral_action_has_a_bound_of_its_own() -> None:
     assert judged(replace(OWN, Ki=1000.0), Limits(integral_factor=0.05)) is Reason.APPLIED
     assert judged(replace(OWN, Ki=1001.0), Limits(integral_factor=0.05)) is Reason.GAINS_OUT_OF_BOUNDS

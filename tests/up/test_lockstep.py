@@ -151,7 +151,7 @@ def test_a_machine_in_lock_step_waits_for_a_client_whose_twin_is_slow(
         serving = threading.Thread(target=supervise.SuperviseServer(plant, None).serve, args=(theirs,))
         serving.start()
         time.sleep(0.3)
-        ours.send(wire.REQUEST.pack(wire.READ, 0, 1, 0, *(0.0,) * 11))
+        ours.send(wire.REQUEST.pack(wire.READ, 0, 1, 0, *(0.0,) * 15))
         ours.settimeout(10.0)
         assert wire.REPLY.unpack(wire.receive(ours, wire.REPLY.size))[0] == wire.OVER
         serving.join()

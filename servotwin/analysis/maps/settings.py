@@ -178,3 +178,7 @@ def _check_law(law: Controller) -> None:
             raise InvalidInput(
                 f"controller {name} = {value:g}: maps are those of the continuous law; give {name} = None"
             )
+    if law.friction_feedforward:
+        raise InvalidInput(
+            f"controller friction_feedforward = {law.friction_feedforward:g} V: maps do not simulate it; give 0"
+        )

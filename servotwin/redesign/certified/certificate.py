@@ -149,8 +149,8 @@ class Demands:
     notch: Annotated[
         bool,
         key(
-            help="Candidates with a notch at the structure's resonance are tried too; false for machines whose own "
-            "controller has none."
+            help="Candidates with a notch at the resonance of a learnt machine are tried too, on any other one where "
+            "nothing else is within the bounds; false for machines whose own controller has none."
         ),
     ] = True
     tail: float = math.inf

@@ -46,6 +46,7 @@ def learnt_servo(
                 variances.append(np.array([[relative**2]]))
     if not names:
         return None
+    # Here, because the import takes longer than the rest of this module and is rarely needed.
     from scipy.linalg import block_diag
 
     covariance = block_diag(*variances)

@@ -131,7 +131,7 @@ class CertifiedTable:
     def find(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
         """Find the certificate of the narrowest verified cell that contains a region, with the region's feedforward.
 
-        A cell up to four times as wide is preferred if its setting, but for the feedforward, is `running` already.
+        A cell up to four times as wide is preferred if its setting, but for the feedforwards, is `running` already.
         """
         if region.friction[0] < self.friction[0] or region.friction[1] > self.friction[1]:
             return NotVerified(f"friction of up to {region.friction[1]:.3g} N m is in no cell of the table")

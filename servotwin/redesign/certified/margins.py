@@ -134,8 +134,9 @@ def laws_within(
     always = {scaled_law(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
     within = _lively(laws, passes, always)
     if notched is not None and (uncertainty.learnt is not None or not within):
-        laws = _scaled_laws(notched, demands, demands.notch_shapes, integral)
-        within += _lively(laws, passes, set())
+        with_it = _scaled_laws(notched, demands, demands.notch_shapes, integral)
+        within += _lively(with_it, passes, set())
+        laws += with_it
     if not within:
         raise InvalidInput(_none_within(servo, uncertainty, demands, plants, laws))
     return tuple(within)
@@ -171,7 +172,7 @@ def with_notch(servo: Servo) -> Controller | None:
         return None
     # Rounded: what a window adds to a learnt resonance is not worth another notch.
     hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
-    depth = min(1.0, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
+    depth = min(0.9, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
     return servo.controller.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 

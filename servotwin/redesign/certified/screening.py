@@ -140,6 +140,7 @@ class Screening:
             every = np.arange(self._members.count)
             self._simulate(new[:1], every)
             self._order = np.argsort(-self._known[new[0]].cost.ravel(), kind="stable")
+            self._try_largest_steps(new[:1])
             new = new[1:]
         if new:
             assert self._order is not None
