@@ -3,15 +3,18 @@
 import math
 from dataclasses import replace
 
+import msgspec
 import pytest
 from scaling import Units, scaled
 
 from servotwin.commissioning.edge_settings import Commissioning, Recording, supervision_of
+from servotwin.control.gains import gains_of
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision
 from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.messages import Setting
 from servotwin.plant.servo import PRESETS, Servo
+from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings, long_enough
 from servotwin.twin.model import TwinModel
@@ -101,3 +104,15 @@ def test_windows_are_whole_samples_and_the_twin_may_request_longer_ones() -> Non
     assert long_enough(samples / 5000.0, round(5000.0 * request.times.pre_trigger) / 5000.0, request)
     fast = edge(scaled(SERVO, time=1e-3)).with_longest(4.0, 0.3)
     assert fast.agent_settings("axis", "boot-1").longest_window_s == fast.window
+
+
+@pytest.mark.parametrize("policy", ["hysteresis", "certified"])
+def test_the_limits_of_an_edge_admit_the_servos_own_notch_and_feedforward(policy: str) -> None:
+    law = SERVO.controller.replace(Ki=0.0, notch_hz=4.3, notch_damping=0.6, friction_feedforward=0.02)
+    demands = Demands(machines=16, conditions=4, screened=2, settled=0.8, scales=(0.6,))
+    twin = SETTINGS.replace(policy=policy, demands=demands)
+    guarded = Commissioning(SERVO.replace(controller=law), law, twin).guarding
+    assert guarded is not None
+    middle = guarded.middle
+    sent = msgspec.structs.replace(gains_of(law), Kp=middle.Kp, Kd=middle.Kd, Tf=middle.Tf)
+    assert guarded.limits.allows_gains(sent, middle)
