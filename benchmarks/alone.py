@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import accuracy, compensation, endurance, glances, push, tick
+from benchmarks import accuracy, compensation, endurance, friction_feedforward, glances, tick
 from benchmarks import windows as from_windows
 from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
@@ -42,7 +42,9 @@ ALONE: Mapping[str, QualityBenchmark] = {
     side_by_side.NAME: QualityBenchmark(side_by_side.policies, side_by_side.QUICK, side_by_side.MACHINES),
     in_the_loop.NAME: QualityBenchmark(in_the_loop.loops, in_the_loop.QUICK, in_the_loop.MACHINES),
     compensation.NAME: QualityBenchmark(compensation.compensation, compensation.QUICK, compensation.MACHINES),
-    push.NAME: QualityBenchmark(push.push, push.QUICK, push.MACHINES),
+    friction_feedforward.NAME: QualityBenchmark(
+        friction_feedforward.compare, friction_feedforward.QUICK, friction_feedforward.MACHINES
+    ),
     tick.NAME: QualityBenchmark(tick.ticks, tick.QUICK, tick.SECONDS),
     from_windows.NAME: QualityBenchmark(from_windows.windows, from_windows.QUICK, from_windows.WINDOWS),
     worth_sending.NAME: QualityBenchmark(worth_sending.novelty, worth_sending.QUICK, None),

@@ -16,7 +16,7 @@ def bench(
         list[str] | None,
         typer.Argument(
             help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, hostile, "
-            "policies, loops, compensation, push, tick, novelty, triage, fleet."
+            "policies, loops, compensation, friction, tick, novelty, triage, fleet."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,

@@ -195,8 +195,8 @@ def _sent_update(update: JsonObject) -> str:
     if gains:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {gains['feedforward'] * 1e3:.1f} mV"] if gains.get("feedforward") else []
-        push = gains.get("friction_feedforward")
-        parts += [f"friction feedforward {push * 1e3:.1f} mV"] if push else []
+        friction = gains.get("friction_feedforward")
+        parts += [f"friction feedforward {friction * 1e3:.1f} mV"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     if verification:
         parts.append(f"verified on {verification['members']} simulated machines")

@@ -148,7 +148,7 @@ HEADS = (
     "off by, um",
 )
 MORE = ("published: estimate, deg",)
-_SENT = ("after, s", "Kp, Kd", "Ki", "feedforward, mV", "verified on", "settled", "worst error, um", "Ms")
+_SENT = ("after, s", "Kp, Kd", "Ki", "notch, Hz", "feedforward, mV", "verified on", "settled", "worst error, um", "Ms")
 
 
 def cells(row: DemoStep) -> tuple[str, ...]:
@@ -159,15 +159,18 @@ def cells(row: DemoStep) -> tuple[str, ...]:
 
 
 def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
-    """Make the texts of an update, in the order of `SENT`; gains relative to the servo's own."""
+    """Make the texts of an update, in the order of `_SENT`; gains relative to the servo's own."""
     new, verification, own = update.setting.gains, update.verification, servo.controller
     if new is None or verification is None:
         return (f"{update.data_time:.0f}", *("-" for _ in _SENT[1:]))
-    gains = f"x {new.Kp / own.Kp:.2f}", f"x {new.Ki / own.Ki:.2f}", f"{new.feedforward * MM:+.2f}"
+    gains = f"x {new.Kp / own.Kp:.2f}", f"x {new.Ki / own.Ki:.2f}"
+    notch = f"{new.notch_hz:.2f}" if new.notch_hz else "-"
     worst = f"{verification.tail * UM:.1f}", f"{verification.Ms:.2f}"
     return (
         f"{update.data_time:.0f}",
         *gains,
+        notch,
+        f"{new.feedforward * MM:+.2f}",
         f"{verification.members} machines",
         f"{100.0 * verification.settled:.1f} %",
         *worst,

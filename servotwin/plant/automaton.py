@@ -9,7 +9,7 @@ constant disturbances exist only where the `Shape` requests them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
@@ -17,10 +17,11 @@ import numpy as np
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, Guard, Mode
 from servotwin.plant.backlash import OPEN, ContactMode, contact_guards, contact_modes, contact_reset, screw_rate
-from servotwin.plant.basis import Basis, GuardRow, LawNumbers, PlantNumbers, input_names, outer, plant_names, scaled
+from servotwin.plant.basis import Basis, LawNumbers, PlantNumbers, input_names, outer, plant_names, scaled
 from servotwin.plant.friction import StickSlipMode, stick_slip_guards, stick_slip_modes, stopping_speed
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.plant.zones import Zone, controller_zones
 
 INPUTS = ("reference", "gap", "tolerance")
 
@@ -41,8 +42,8 @@ class Shape:
         A state "friction" (N m, Coulomb's on the motor's shaft) and the modes of stick and slip.
     feedforward, offset : bool
         States of those names (V, always added to the controller's voltage); the offset decays.
-    push : bool
-        A state "push" (V, always added): the friction feedforward with the sign of the reference's last change.
+    friction_feedforward : bool
+        A state "friction feedforward" (V, always added), with the sign of the reference's last change.
     """
 
     reference: int = 0
@@ -54,7 +55,7 @@ class Shape:
     friction: bool = False
     feedforward: bool = False
     offset: bool = False
-    push: bool = False
+    friction_feedforward: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +188,7 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
     sensed = basis.positions(servo)[..., -1, :] + basis.row("noise")
     measured = sensed if controller.loop_filter_hz is None else basis.row("filtered")
     error = basis.row("reference") - measured
-    system = _System(servo, basis, _controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
+    system = _System(servo, basis, controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
     flows = []
     for contact, stick_slip, zone in system.combinations:
         flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
@@ -258,74 +259,6 @@ def mechanical_flow(
     return flow
 
 
-@dataclass(frozen=True)
-class Zone:
-    """One linear piece of the controller: rows of the voltage, of the PIDF before its notch and of its states'
-    derivatives, and its guards."""
-
-    name: str
-    voltage: Array
-    pidf: Array
-    integral: Array
-    derivative: Array
-    guards: tuple[GuardRow, ...] = ()
-
-
-def _controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
-    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added.
-
-    With `integral_only` the integral stops inside, and the rest goes on.
-    """
-    # Feedforwards and the offset act inside the dead zone too.
-    always = basis.row("feedforward") + basis.row("offset") + basis.row("push")
-    if "lagging" in basis:
-        ahead = basis.row("reference") - basis.row("lagging")
-        always = always + controller.velocity_feedforward / controller.velocity_time * ahead
-    slope = error - basis.row("derivative")
-    pidf = controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
-    if "notch band" in basis:
-        # It rings on inside the dead zone too.
-        always = always - controller.notch_gain * basis.row("notch band")
-    unlimited = always + pidf
-    tolerance = basis.row("tolerance")
-    # Pure integral action has a tracking time of zero: a thousandth of the filter's stands for it in the flow.
-    back_calculation = 1.0 / np.maximum(controller.tracking, controller.Tf * 1e-3)
-    zones: list[Zone] = []
-    for side in (-1, 1) if dead_zone else (0,):
-        name = {-1: "-", 0: "on", 1: "+"}[side]
-        guards = (GuardRow(controller.enter * tolerance - side * error, "inside", None, "enter", side),) if side else ()
-        linear = Zone(name, unlimited, pidf, controller.Ki * error, slope / controller.Tf, guards)
-        zones += _saturated(linear, basis, back_calculation)
-    if dead_zone:
-        leave = tuple(
-            GuardRow(s * error - controller.leave * tolerance, "+" if s > 0 else "-", None, "leave", s) for s in (1, -1)
-        )
-        zero = np.zeros(len(basis.names))
-        if controller.integral_only:
-            inside = Zone("inside", unlimited, pidf, zero, slope / controller.Tf, leave)
-        else:
-            inside = Zone("inside", always, zero, zero, -basis.row("derivative") / controller.Tf, leave)
-        zones += _saturated(inside, basis, 0.0) if inside.voltage.any() else [inside]
-    return tuple(zones)
-
-
-def _saturated(zone: Zone, basis: Basis, rate: float | Array) -> list[Zone]:
-    """The zone itself and, with a voltage limit, its two saturated zones, with back-calculation at a rate (1/s)."""
-    if "voltage limit" not in basis:
-        return [zone]
-    limit, unlimited = basis.row("voltage limit"), zone.voltage
-    ends = tuple(
-        GuardRow(side * unlimited - limit, zone.name + suffix, None, "saturate", side)
-        for side, suffix in ((1, " high"), (-1, " low"))
-    )
-    zones = [replace(zone, guards=(*zone.guards, *ends))]
-    for side, suffix in ((1, " high"), (-1, " low")):
-        leave = (*zone.guards, GuardRow(limit - side * unlimited, zone.name, None, "saturate", 0))
-        integral = zone.integral + rate * (side * limit - unlimited)
-        zones.append(Zone(zone.name + suffix, side * limit, zone.pidf, integral, zone.derivative, leave))
-    return zones
-
-
 def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> list[str]:
     names = (
         plant_names(servo)
@@ -337,7 +270,8 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
     names += [name for key in INPUTS for name in input_names(key, getattr(shape, key))]
     names += ["voltage limit"] if controller.voltage_limit is not None else []
     names += ["noise"] if shape.noise else []
-    names += [name for name in ("feedforward", "offset", "push") if getattr(shape, name)]
+    names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
+    names += ["friction feedforward"] if shape.friction_feedforward else []
     return names + _constants(shape.bias, shape.friction)
 
 

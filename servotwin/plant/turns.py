@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 
 from servotwin.plant.signals import Array, PiecewiseCubic
 
 
+@lru_cache(maxsize=8)
 def turns_of(pieces: PiecewiseCubic) -> list[tuple[float, float]]:
     """Times (s), in order, at which a signal begins to change, and the signs of the changes.
 

@@ -51,7 +51,7 @@ class ContinuousEngine:
         position = float(self.loop.rows["measured_position"][0] @ state)
         set_states(self.loop, state, dict.fromkeys(followers, position))
         self.direction = direction_after(signals["reference"], 0.0, position, 0.0)
-        set_states(self.loop, state, {"push": self.controller.friction_feedforward * self.direction})
+        set_states(self.loop, state, {"friction feedforward": self.controller.friction_feedforward * self.direction})
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
         mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
@@ -69,7 +69,7 @@ class ContinuousEngine:
             friction=self.inputs.friction != 0.0,
             feedforward=controller.feedforward != 0.0,
             offset=offset,
-            push=controller.friction_feedforward != 0.0,
+            friction_feedforward=controller.friction_feedforward != 0.0,
         )
         return continuous_loop(self.servo, controller, shape)
 
@@ -104,7 +104,7 @@ class ContinuousEngine:
                 opening = {float(time) for time in pieces.jumps}
         for time, direction in self._turns(span):
             self.direction = direction
-            knots.setdefault(time, {})[self.loop.automaton.index("push")] = (
+            knots.setdefault(time, {})[self.loop.automaton.index("friction feedforward")] = (
                 self.controller.friction_feedforward * direction
             )
         if self.noise is not None:
@@ -137,13 +137,17 @@ class ContinuousEngine:
         self.direction = direction_after(reference, time, before, self.direction)
         values = self.loop.input_values("reference", now)
         if self.controller.friction_feedforward != 0.0:
-            values[self.loop.automaton.index("push")] = self.controller.friction_feedforward * self.direction
+            values[self.loop.automaton.index("friction feedforward")] = (
+                self.controller.friction_feedforward * self.direction
+            )
         self.trajectory.set(values)
 
     def set_controller(self, controller: Controller, tolerance: float | None) -> None:
         """Change the controller from now on without a jump of the voltage; a constant tolerance unless None."""
         _refuse_rate_limit(controller)
-        values = controller_constants(controller) | {"push": controller.friction_feedforward * self.direction}
+        values = controller_constants(controller) | {
+            "friction feedforward": controller.friction_feedforward * self.direction
+        }
         if tolerance is not None:
             names = [name for name in self.loop.automaton.names if name.startswith("tolerance")]
             values |= dict.fromkeys(names, 0.0) | {"tolerance": tolerance}

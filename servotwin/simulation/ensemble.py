@@ -112,7 +112,7 @@ class EnsembleMembers:
             bias=self.constants["input_bias"][member] != 0.0,
             friction=self.constants["friction"][member] > 0.0,
             feedforward=self.controllers[member].feedforward != 0.0,
-            push=self.controllers[member].friction_feedforward != 0.0,
+            friction_feedforward=self.controllers[member].friction_feedforward != 0.0,
         )
 
     def _group(self, which: NDArray[np.int64], shape: Shape, outputs: Sequence[str]) -> Group:
@@ -123,10 +123,10 @@ class EnsembleMembers:
         loops = continuous_loops([servo for servo, _ in places], [law for _, law in places], shape)
         constants = {name: values[which] for name, values in self.constants.items()} | _constants_of(laws)
         states = starts_of(loops, automaton, constants)
-        if shape.push:
+        if shape.friction_feedforward:
             moved = constants["reference"] - np.sum(states * loops.rows["measured_position"][automaton, 0], axis=1)
-            push = np.array([law.friction_feedforward for law in laws])
-            states[:, loops.first.automaton.index("push")] = push * np.sign(moved)
+            fed = np.array([law.friction_feedforward for law in laws])
+            states[:, loops.first.automaton.index("friction feedforward")] = fed * np.sign(moved)
         enter = np.array([law.enter for law in laws]) * constants["tolerance"]
         modes = _modes_at(loops, automaton, states, enter)
         for name in outputs:

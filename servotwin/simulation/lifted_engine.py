@@ -213,11 +213,11 @@ class LiftedEngine:
             tolerance = float(self.inputs.tolerance.coeffs[_piece(self.inputs.tolerance, time, self.rate), 0])
             self.loop = self.loop._replace(parameters=self.controller.law(tolerance))
         coefficients = self.inputs.reference.coeffs[piece]
-        if (push := self.controller.friction_feedforward) != 0.0:
+        if (friction := self.controller.friction_feedforward) != 0.0:
             # The reference is constant in every piece.
             self.direction = latest_direction(float(coefficients[0]) - self.past, self.direction)
             self.past = float(coefficients[0])
-            self.state[self.places.feedforward] = self.controller.feedforward + push * self.direction
+            self.state[self.places.feedforward] = self.controller.feedforward + friction * self.direction
         return coefficients, float(self.inputs.reference.times[piece])
 
     def _run(self, end: int) -> None:

@@ -55,9 +55,11 @@ def errors_to_and_fro(
                 group.automata, group.rows, starts, 1.0 / sample_rate, samples, options, threads, ends
             )
             errors[group.which] += figures.mean_size[:, 0] / moves if move > 0 else 0.0
-            if "push" in group.automata.first.names:
-                push = np.array([members.controllers[member].friction_feedforward for member in group.which])
-                ends[:, group.automata.first.index("push")] = push * np.sign(goals[move % 2] - ends[:, place])
+            if "friction feedforward" in group.automata.first.names:
+                fed = np.array([members.controllers[member].friction_feedforward for member in group.which])
+                ends[:, group.automata.first.index("friction feedforward")] = fed * np.sign(
+                    goals[move % 2] - ends[:, place]
+                )
             ends[:, place] = goals[move % 2]
             starts = group.restarted(ends.copy())
     return errors.reshape(members.shape)

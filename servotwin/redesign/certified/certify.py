@@ -217,11 +217,11 @@ def _with_velocity(servo: Servo, law: Controller, demands: Demands) -> list[Cont
 def _with_friction(servo: Servo, laws: list[Controller], friction: float, demands: Demands) -> list[Controller]:
     """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
     every reversal what it holds against it."""
-    push = min(friction * servo.R / servo.k_T, demands.friction_limit)
-    if not demands.friction_feedforward or not push:
+    fed = min(friction * servo.R / servo.k_T, demands.friction_limit)
+    if not demands.friction_feedforward or not fed:
         return []
-    push = math.copysign(push, servo.controller.Kp)
-    return [law.replace(friction_feedforward=push) for law in laws if not law.Ki]
+    fed = math.copysign(fed, servo.controller.Kp)
+    return [law.replace(friction_feedforward=fed) for law in laws if not law.Ki]
 
 
 def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:

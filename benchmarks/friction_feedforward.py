@@ -1,4 +1,4 @@
-"""`servotwin bench push`: a known share of the Coulomb friction fed forward, beside integral action.
+"""`servotwin bench friction`: a known share of the Coulomb friction fed forward, beside integral action.
 
 Machines of the block *friction* of `bench loops` under one law throughout; the friction of each is known exactly.
 """
@@ -20,7 +20,7 @@ from benchmarks.policies.worn import WornMachine, worn_machines
 from servotwin.control.controller import Controller
 from servotwin.redesign.certified.margins import scaled_law
 
-NAME, SCHEMA = "push", "servotwin-bench-push/1"
+NAME, SCHEMA = "friction", "servotwin-bench-friction/1"
 MACHINES, QUICK, SEED = 20, 2, 1
 _INTEGRAL = 0.03
 _VELOCITY_TIME = 0.5
@@ -28,13 +28,13 @@ FORMS = tuple(itertools.product((0.6, 0.85), (0.3, 0.5), (0.0, 0.5, 0.8, 0.9, 1.
 """Factor on Kp and Kd, velocity feedforward relative to the back EMF, share of the friction that is fed forward."""
 
 
-class PushRow(NamedTuple):
+class FrictionRow(NamedTuple):
     """One law on all machines.
 
     Attributes
     ----------
     law : str
-    push : float
+    share : float
         Share of each machine's friction that is fed forward.
     median, p95 : float
         s, of the machines: integral of the absolute error per step, mean of all steps.
@@ -45,16 +45,16 @@ class PushRow(NamedTuple):
     """
 
     law: str
-    push: float
+    share: float
     median: float
     p95: float
     settled: float
     tail: float
 
 
-def push(
+def compare(
     date: str = "", output: Path | None = None, count: int = MACHINES, console: Console | None = None, seed: int = SEED
-) -> tuple[PushRow, ...]:
+) -> tuple[FrictionRow, ...]:
     """Compare laws with and without a friction feedforward; print, and write JSON if `output` is given.
 
     Parameters
@@ -83,12 +83,14 @@ def push(
     return tuple(rows)
 
 
-def _row(name: str, share: float, machines: Sequence[WornMachine], law: tuple[float, float, float]) -> PushRow:
+def _row(name: str, share: float, machines: Sequence[WornMachine], law: tuple[float, float, float]) -> FrictionRow:
     """One law on all machines, with a share of the friction of each."""
     runs = [scored(machine, machine.under(_law(machine, share, *law))) for machine in machines]
     costs, tails = [run.cost for run in runs], [run.tail for run in runs]
     (median, p95), tail = np.percentile(costs, (50.0, 95.0)), np.percentile(tails, 95.0)
-    return PushRow(name, share, float(median), float(p95), float(np.mean([run.settled for run in runs])), float(tail))
+    return FrictionRow(
+        name, share, float(median), float(p95), float(np.mean([run.settled for run in runs])), float(tail)
+    )
 
 
 def _law(machine: WornMachine, share: float, scale: float, velocity: float, integral: float) -> Controller:
@@ -101,12 +103,12 @@ def _law(machine: WornMachine, share: float, scale: float, velocity: float, inte
     )
 
 
-def _shown(rows: Sequence[PushRow]) -> Table:
+def _shown(rows: Sequence[FrictionRow]) -> Table:
     """A line for each law."""
     table = Table(title="friction fed forward, 1 kHz, machines that move to and fro", box=None, pad_edge=False)
     for heading in ("law", "of the friction", "cost median s", "cost p95 s", "settled %", "tail p95 um"):
         table.add_column(heading, justify="left" if heading == "law" else "right")
     for row in rows:
-        numbers = f"{row.push:g}", f"{row.median:.3f}", f"{row.p95:.3f}", f"{100.0 * row.settled:.0f}"
+        numbers = f"{row.share:g}", f"{row.median:.3f}", f"{row.p95:.3f}", f"{100.0 * row.settled:.0f}"
         table.add_row(row.law, *numbers, f"{1e6 * row.tail:.1f}")
     return table

@@ -1,0 +1,78 @@
+"""Zones of a continuous law: the linear pieces that dead zone and voltage limit divide it into."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servotwin.plant.basis import Basis, GuardRow, LawNumbers
+from servotwin.plant.signals import Array
+
+
+@dataclass(frozen=True)
+class Zone:
+    """One linear piece of the controller: rows of the voltage, of the PIDF before its notch and of its states'
+    derivatives, and its guards."""
+
+    name: str
+    voltage: Array
+    pidf: Array
+    integral: Array
+    derivative: Array
+    guards: tuple[GuardRow, ...] = ()
+
+
+def controller_zones(controller: LawNumbers, dead_zone: bool, basis: Basis, error: Array) -> tuple[Zone, ...]:
+    """Eq 14 driven by the dead-zone error of Eq 20, gated to zero inside (erratum E16), plus what is always added.
+
+    With `integral_only` the integral stops inside, and the rest goes on.
+    """
+    # Feedforwards and the offset act inside the dead zone too.
+    always = basis.row("feedforward") + basis.row("offset") + basis.row("friction feedforward")
+    if "lagging" in basis:
+        ahead = basis.row("reference") - basis.row("lagging")
+        always = always + controller.velocity_feedforward / controller.velocity_time * ahead
+    slope = error - basis.row("derivative")
+    pidf = controller.Kp * error + basis.row("integral") + (controller.Kd / controller.Tf) * slope
+    if "notch band" in basis:
+        # It rings on inside the dead zone too.
+        always = always - controller.notch_gain * basis.row("notch band")
+    unlimited = always + pidf
+    tolerance = basis.row("tolerance")
+    # Pure integral action has a tracking time of zero: a thousandth of the filter's stands for it in the flow.
+    back_calculation = 1.0 / np.maximum(controller.tracking, controller.Tf * 1e-3)
+    zones: list[Zone] = []
+    for side in (-1, 1) if dead_zone else (0,):
+        name = {-1: "-", 0: "on", 1: "+"}[side]
+        guards = (GuardRow(controller.enter * tolerance - side * error, "inside", None, "enter", side),) if side else ()
+        linear = Zone(name, unlimited, pidf, controller.Ki * error, slope / controller.Tf, guards)
+        zones += _saturated(linear, basis, back_calculation)
+    if dead_zone:
+        leave = tuple(
+            GuardRow(s * error - controller.leave * tolerance, "+" if s > 0 else "-", None, "leave", s) for s in (1, -1)
+        )
+        zero = np.zeros(len(basis.names))
+        if controller.integral_only:
+            inside = Zone("inside", unlimited, pidf, zero, slope / controller.Tf, leave)
+        else:
+            inside = Zone("inside", always, zero, zero, -basis.row("derivative") / controller.Tf, leave)
+        zones += _saturated(inside, basis, 0.0) if inside.voltage.any() else [inside]
+    return tuple(zones)
+
+
+def _saturated(zone: Zone, basis: Basis, rate: float | Array) -> list[Zone]:
+    """The zone itself and, with a voltage limit, its two saturated zones, with back-calculation at a rate (1/s)."""
+    if "voltage limit" not in basis:
+        return [zone]
+    limit, unlimited = basis.row("voltage limit"), zone.voltage
+    ends = tuple(
+        GuardRow(side * unlimited - limit, zone.name + suffix, None, "saturate", side)
+        for side, suffix in ((1, " high"), (-1, " low"))
+    )
+    zones = [replace(zone, guards=(*zone.guards, *ends))]
+    for side, suffix in ((1, " high"), (-1, " low")):
+        leave = (*zone.guards, GuardRow(limit - side * unlimited, zone.name, None, "saturate", 0))
+        integral = zone.integral + rate * (side * limit - unlimited)
+        zones.append(Zone(zone.name + suffix, side * limit, zone.pidf, integral, zone.derivative, leave))
+    return zones
