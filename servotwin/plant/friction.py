@@ -7,11 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import Basis, GuardRow, PlantNumbers
+from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Play
 from servotwin.plant.signals import Array
 
-# A motor has stopped at this part of the speed at which its back EMF takes as much voltage as the friction. At zero
-# itself one whose torque is the friction's to within rounding would stick and slip without end.
+# A motor has stopped at this part of the speed that its friction takes off (at which a DC motor's back EMF takes as
+# much voltage as the friction). At zero itself one whose torque is the friction's to within rounding would stick and
+# slip without end.
 _STOPPED = 1e-9
 
 
@@ -36,16 +37,17 @@ def stick_slip_modes(servo: PlantNumbers, friction: bool) -> tuple[StickSlipMode
     InvalidInput
         There is friction on an elastic screw.
     """
-    if friction and not servo.rigid:
-        raise InvalidInput(f"friction with a screw stiffness of k_d = {servo.k_d} N/m: needs a rigid screw (k_d = inf)")
+    if friction and servo.play is Play.HELD:
+        raise InvalidInput("friction with an elastic screw that is held in the gap: needs a rigid screw (k_d = inf)")
+    if friction and not np.any(servo.shaft().E):
+        raise InvalidInput("friction on the motor of a drive that follows its command whatever the load: must be 0 N m")
     return _COULOMB if friction else _FRICTIONLESS
 
 
-def stick_slip_guards(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) -> list[GuardRow]:
-    """Guards that end a mode of the friction: the motor stands still, or its torque exceeds the friction's."""
+def stick_slip_guards(servo: PlantNumbers, basis: Basis, mode: StickSlipMode, torque: Array) -> list[GuardRow]:
+    """Guards that end a mode of the friction: the motor stands still, or the torque on it (row) exceeds the
+    friction's."""
     if mode.stuck:
-        # A rigid screw's load does not act back, so the current alone drives the shaft.
-        torque = servo.k_T * basis.row("current")
         return [
             GuardRow(s * torque - basis.row("friction"), "slip +" if s > 0 else "slip -", None, "slip", s)
             for s in (1, -1)
@@ -61,4 +63,4 @@ def stick_slip_guards(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) ->
 
 def stopping_speed(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) -> Array | float:
     """Speed (row) beyond zero at which a sliding motor has stopped; 0 in the other modes."""
-    return _STOPPED * servo.R / (servo.k_T * servo.k_B) * basis.row("friction") if mode.side else 0.0
+    return _STOPPED * servo.shaft().yielding * basis.row("friction") if mode.side else 0.0

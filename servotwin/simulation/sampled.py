@@ -27,8 +27,8 @@ from servotwin.hybrid.kernel import (
 from servotwin.hybrid.tables import search_step
 from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import degree, sampled_plant
+from servotwin.plant.axis import Plant
 from servotwin.plant.noise import Noise, NoiseSource
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
@@ -43,7 +43,7 @@ class SampledEngine:
     """Engine of a `Simulation` whose controller has a sample rate; with `keep` it stores at least that many samples,
     and no events. A voltage is applied `delay` ticks after its measurement; zero until then."""
 
-    servo: Servo
+    servo: Plant
     controller: Controller
     inputs: RunInputs
     theta_d0: float
@@ -68,7 +68,7 @@ class SampledEngine:
         self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
-        self.law_state = law.start(float(self.plant.rows["position"][0] @ self.state))
+        self.law_state = law.start(float(self.plant.rows["sensed"][0] @ self.state))
         self.parameters = self.controller.law(None)
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
@@ -80,7 +80,7 @@ class SampledEngine:
         names = self.plant.automaton.names
         return Port(
             names.index("voltage"),
-            int(np.argmax(self.plant.rows["position"][0])),
+            int(np.argmax(self.plant.rows["sensed"][0])),
             self.servo.position_resolution,
             1 if self.servo.position_resolution > 0.0 else 0,
             np.array(self._recorded()),
@@ -260,7 +260,7 @@ class SampledEngine:
         # The transfer needs the measurement of the tick that is due; that tick then takes the same noise again.
         noise = self.draws.take(1)
         self.draws.put_back(noise)
-        measured = float(self.plant.rows["position"][0] @ self.state + noise[0])
+        measured = float(self.plant.rows["sensed"][0] @ self.state + noise[0])
         self.law_state = law.transfer(
             self.controller.law(planned),
             controller.law(planned if tolerance is None else tolerance),
@@ -288,7 +288,7 @@ class SampledEngine:
         ticks = np.arange(first, last) * self.record_every // self.tick_every
         out = self.output.measured[ticks - self.output.first_tick]
         if last > self.index and not self.finished:
-            present = self.channel("position", self.index, self.index + 1)
+            present = self.channel("sensed", self.index, self.index + 1)
             out[-1] = quantised(present, self.servo.position_resolution)[0]
         return out
 

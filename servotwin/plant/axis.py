@@ -1,0 +1,194 @@
+"""A servo axis made of parts: actuator, transmission, load, sensors and the controller that runs by default."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant import loop
+from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
+from servotwin.plant.basis import Play
+from servotwin.plant.linear import LinearSystem
+from servotwin.plant.load import Load
+from servotwin.plant.margins import Margins, margins
+from servotwin.plant.sensors import MOTOR, Sensors
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array, check_gap
+from servotwin.plant.structure import Chain, Structure, chain
+from servotwin.plant.transmission import Transmission
+
+_PARTS: dict[str, tuple[type, ...]] = {
+    "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
+    "transmission": (Transmission,),
+    "load": (Load,),
+    "controller": (Controller,),
+    "sensors": (Sensors,),
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Axis:
+    """One axis. The paper's servo is the combination of a DC motor, a rigid screw and a load on the ground.
+
+    Parameters
+    ----------
+    actuator : DcMotor, TorqueDrive, VelocityDrive or Stepper
+    transmission : Transmission
+    load : Load
+    controller : Controller
+        Runs when none is given. Its gains give the actuator's command (V, N m, rad/s or rad) per m, or per rad of a
+        rotary load.
+    sensors : Sensors, optional
+        Ideal by default.
+
+    Raises
+    ------
+    InvalidInput
+        A part of another type.
+    """
+
+    actuator: Actuator
+    transmission: Transmission
+    load: Load
+    controller: Controller
+    sensors: Sensors = field(default_factory=Sensors)
+
+    def __post_init__(self) -> None:
+        for each in dataclasses.fields(self):
+            part, kinds = getattr(self, each.name), _PARTS[each.name]
+            if not isinstance(part, kinds):
+                names = " or ".join(kind.__name__ for kind in kinds)
+                raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
+
+    @property
+    def n(self) -> int:
+        """Number of masses."""
+        return self.load.n
+
+    @property
+    def p(self) -> float:
+        """Travel of the load per angle of the motor, m/rad (rotary: rad/rad)."""
+        return self.transmission.p
+
+    @property
+    def play(self) -> Play:
+        """Kind of the backlash."""
+        return self.transmission.play
+
+    @property
+    def rigid(self) -> bool:
+        """True where the first mass follows the transmission."""
+        return self.transmission.rigid
+
+    @property
+    def at_motor(self) -> bool:
+        """True where the controller acts on the motor's encoder instead of the load's."""
+        return self.sensors.feedback == MOTOR
+
+    @property
+    def position_resolution(self) -> float:
+        """One count of the sensor that the controller reads, m (rotary: rad)."""
+        if self.at_motor:
+            return self.p * self.sensors.encoder_resolution
+        return self.sensors.position_resolution
+
+    @property
+    def encoder_resolution(self) -> float:
+        """One count of the motor's encoder, rad."""
+        return self.sensors.encoder_resolution
+
+    @cached_property
+    def version(self) -> str:
+        """Twelve hexadecimal digits that name the plant's numbers (the controller's do not count)."""
+        parts = (self.actuator, self.transmission, self.load, self.sensors)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+    def __repr__(self) -> str:
+        """Parts in one line."""
+        kind = type(self.actuator).__name__
+        masses = f"{self.n} mass{'es' if self.n > 1 else ''}"
+        return f"<Axis, model {self.version}: {kind}, {self.play.value} screw, {masses}, {self.controller!r}>"
+
+    def chain(self) -> Chain:
+        """Matrices of the load."""
+        return self._matrices[0]
+
+    def at_rest(self, screw: float) -> tuple[float, Array]:
+        """Angle of the driven end (rad) and state of the load at rest, for a start of the driven end at an angle.
+
+        What is free in the gap rests where no force acts: a load on the ground at zero, a free one anywhere.
+        """
+        if self.play is not Play.FREE:
+            return screw, self.chain().equilibrium(self.p * screw)
+        screw = screw if self.load.free else 0.0
+        return screw, np.concatenate([np.full(self.n, self.p * screw), np.zeros(self.n)])
+
+    def shaft(self) -> ShaftMatrices:
+        """Matrices of the actuator."""
+        return self._matrices[1]
+
+    @cached_property
+    def _matrices(self) -> tuple[Chain, ShaftMatrices]:
+        return chain(*self._structure), self.actuator.matrices()
+
+    @property
+    def _structure(self) -> Structure:
+        load, screw = self.load, self.transmission
+        return Structure(load.masses, load.stiffnesses, load.dampings, screw.k_d, screw.c_d)
+
+    def replace(self, **changes: object) -> Axis:
+        """A copy with some of its parts changed, by name.
+
+        Raises
+        ------
+        InvalidInput
+            A name is unknown.
+        """
+        names = [each.name for each in dataclasses.fields(self)]
+        for name in changes:
+            if name not in names:
+                raise InvalidInput(f"axis has no part named {name!r}; its parts are {', '.join(names)}")
+        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+
+    def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
+        """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21)."""
+        check_gap(gap)
+        return k_dz * self.p * gap
+
+    def plant(self) -> LinearSystem:
+        """Command to the measured position, without a gap."""
+        shaft = self.actuator.polynomials()
+        return loop.axis_system(self.shaft(), shaft, self._structure, self.p, self.at_motor)
+
+    def loop(self, controller: Controller | None = None) -> LinearSystem:
+        """Open loop of controller and plant in continuous time, without a gap."""
+        return loop.open_loop(self.plant(), controller or self.controller)
+
+    def closed_loop(self, controller: Controller | None = None) -> LinearSystem:
+        """Reference to the measured position in continuous time, without a gap."""
+        return loop.closed_loop(self.plant(), controller or self.controller)
+
+    def margins(self, controller: Controller | None = None) -> Margins:
+        """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
+        return margins(self.loop(controller), self.closed_loop(controller))
+
+    def check_loop(self, controller: Controller | None = None) -> None:
+        """Refuse a controller that does not stabilise the axis even without a gap, at its sample rate if it has one.
+
+        Raises
+        ------
+        InvalidInput
+            With the fastest growing pole.
+        """
+        loop.check_stable(self.plant(), controller or self.controller, "axis")
+
+
+Plant: TypeAlias = Servo | Axis
+"""A machine that can be simulated: the paper's servo, or an axis made of parts."""
