@@ -122,17 +122,22 @@ def test_the_paper_s_servo_is_one_combination() -> None:
     assert parts.margins() == PAPER.margins()
 
 
-def test_a_free_load_swings_as_two_inertias_where_a_held_screw_rests() -> None:
-    """The same numbers with the driven end held in the gap and free there: only the free one keeps a limit cycle."""
-    free = Transmission(p=1.0, k_d=3300.0, in_gap="free")
-    law = Controller(Kp=60.0, Ki=20.0, Kd=40.0, Tf=0.01)
-    swings = []
-    for transmission in (free, Transmission(p=1.0, k_d=3300.0)):
-        axis = TWO_MASS.replace(transmission=transmission, controller=law, load=Load((5.6,), (0.0,), (0.3,), "rotary"))
-        run = simulate(axis, 60.0, reference=0.1, gap=math.radians(0.2), sample_rate=200.0)
-        swings.append(float(np.ptp(run.position[-4000:])))
-    assert swings[0] > 1e-4
-    assert swings[1] < 1e-2 * swings[0]
+def test_integral_action_swings_in_the_gap_and_rests_without() -> None:
+    """The limit cycle of two inertias, which a driven end that is held in the gap hides."""
+    axis = TWO_MASS.replace(
+        actuator=TorqueDrive(0.4, 1e-3, 2.0),
+        transmission=Transmission(1.0, 3300.0, in_gap="free"),
+        load=Load((5.6,), (0.0,), (6.0,), "rotary"),
+        controller=Controller(20.0, 10.0, 20.0, 0.02),
+    )
+    swings = [
+        np.ptp(simulate(axis, 60.0, reference=0.1, gap=gap, sample_rate=200.0).position[-4000:])
+        for gap in (0.0, math.radians(0.1), math.radians(0.2))
+    ]
+    assert swings[0] < 1e-9
+    assert swings[2] > 1e-4
+    # All but the gap and the reference's first step scale with it.
+    assert swings[2] == pytest.approx(2.0 * swings[1], rel=1e-3)
 
 
 @pytest.mark.parametrize(
