@@ -49,7 +49,8 @@ def compile_once(dispatcher: Any) -> None:
 
 def is_cached(dispatcher: Any, signature: Any) -> bool:
     """True where the process has compiled or loaded a signature, or the index on disk has it."""
-    if tuple(normalize_signature(signature)[0]) in dispatcher.overloads:
+    normalised: Any = normalize_signature  # untyped
+    if tuple(normalised(signature)[0]) in dispatcher.overloads:
         return True
     cached = dispatcher._cache
     return cached._index_key(signature, dispatcher.targetctx.codegen()) in cached._cache_file._load_index()
