@@ -1,4 +1,4 @@
-"""Benchmarks of quality, which run alone: estimator, windows, edge, policies, novelty, triage, ticks, fleet."""
+"""Benchmarks of quality, which run alone: estimator, windows, edge, policies, loops, novelty, triage, ticks, fleet."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import accuracy, compensation, endurance, friction_feedforward, glances, tick
+from benchmarks import accuracy, certificates, compensation, endurance, friction_feedforward, glances, tick
 from benchmarks import windows as from_windows
 from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
@@ -45,10 +45,14 @@ ALONE: Mapping[str, QualityBenchmark] = {
     friction_feedforward.NAME: QualityBenchmark(
         friction_feedforward.compare, friction_feedforward.QUICK, friction_feedforward.MACHINES
     ),
+    certificates.NAME: QualityBenchmark(certificates.certificates, certificates.QUICK, certificates.MACHINES),
     tick.NAME: QualityBenchmark(tick.ticks, tick.QUICK, tick.SECONDS),
     from_windows.NAME: QualityBenchmark(from_windows.windows, from_windows.QUICK, from_windows.WINDOWS),
     worth_sending.NAME: QualityBenchmark(worth_sending.novelty, worth_sending.QUICK, None),
 }
+
+SEEDED = (from_windows.NAME, in_the_loop.NAME, certificates.NAME)
+"""Benchmarks whose machines follow a seed that can be chosen."""
 
 
 def run_alone(
@@ -62,7 +66,7 @@ def run_alone(
 ) -> bool:
     """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
-    `full` applies to the fleet only: the full length of the documented figures. `seed` applies to the windows only.
+    `full` applies to the fleet only: the full length of the documented figures. `seed` applies to those of `SEEDED`.
 
     Raises
     ------
@@ -72,8 +76,8 @@ def run_alone(
     name = next((name for name in names if name in ALONE), None)
     if full and (tuple(names) != (whole.NAME,) or quick):
         raise InvalidInput(f"--full: only bench {whole.NAME} takes it, and not with --quick")
-    if seed is not None and tuple(names) != (from_windows.NAME,):
-        raise InvalidInput(f"--seed: only bench {from_windows.NAME} takes it")
+    if seed is not None and not (len(names) == 1 and names[0] in SEEDED):
+        raise InvalidInput(f"--seed: only bench {', '.join(SEEDED[:-1])} or {SEEDED[-1]} takes it")
     if name is None:
         return False
     if len(names) > 1 or others:
@@ -83,5 +87,5 @@ def run_alone(
     if seed is None:
         chosen.run(date, output, scale)
     else:
-        chosen.run(date, output, scale, seed)
+        chosen.run(date, output, scale, seed=seed)
     return True

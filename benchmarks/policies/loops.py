@@ -15,6 +15,7 @@ from benchmarks import report
 from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachine, worn_machines
 from servotwin.analysis.maps.pool import shared, workplace
 from servotwin.cosim import Cosimulation, SimulatedMachine
+from servotwin.messages.updates import Update
 from servotwin.redesign.certified.margins import scaled_law
 from servotwin.redesign.registry import certified_policy
 from servotwin.simulation import Run
@@ -46,7 +47,9 @@ class LoopScores(NamedTuple):
     tail : float
         m, largest error in the last third of the last step.
     updates, off, worst : float
-        Number of updates applied, of those whose gap was off by more than 0.05 deg, and the largest such error, rad.
+        Number of updates applied, of those whose gap was off by more than 0.05 deg, and the largest error, rad.
+    outside : float
+        Of those that were off: the gap lay outside of the interval.
     fallbacks : float
     """
 
@@ -57,6 +60,7 @@ class LoopScores(NamedTuple):
     updates: float = 0.0
     off: float = 0.0
     worst: float = 0.0
+    outside: float = 0.0
     fallbacks: float = 0.0
 
 
@@ -158,14 +162,24 @@ def with_twin(machine: WornMachine) -> LoopScores:
     loop = cosimulation.loop(simulation.run())
     applied = {receipt.version for receipt in loop.receipts if receipt.applied}
     times = {(window.boot, window.sequence): window.middle for window in loop.windows}
-    estimates = [u for u in loop.updates if u.version in applied and u.gap is not None and u.status == "ok"]
-    off = [abs(u.gap - float(np.interp(times[u.window], loop.run.time, loop.run.gap))) for u in estimates if u.gap]
+    estimates = [u for u in loop.updates if u.version in applied and u.status == "ok"]
+    true = [float(np.interp(times[update.window], loop.run.time, loop.run.gap)) for update in estimates]
+    errors, outside = zip(*map(_off, estimates, true), strict=True) if estimates else ((), ())
     return scored(machine, loop.run)._replace(
         updates=float(len(applied)),
-        off=float(sum(error > _GAP_OFF for error in off)),
-        worst=max(off, default=0.0),
+        off=float(sum(error > _GAP_OFF for error in errors)),
+        worst=max(errors, default=0.0),
+        outside=float(sum(error > _GAP_OFF and out for error, out in zip(errors, outside, strict=True))),
         fallbacks=float(len(loop.fallbacks)),
     )
+
+
+def _off(update: Update, gap: float) -> tuple[float, bool]:
+    """Error of an update's gap, rad, and if the true one lies outside of its interval."""
+    if update.gap is None:
+        return 0.0, False
+    low, high = update.interval
+    return abs(update.gap - gap), (low is not None and gap < low) or (high is not None and gap > high)
 
 
 def scored(machine: WornMachine, run: Run) -> LoopScores:
@@ -190,7 +204,7 @@ def shown(rows: Sequence[LoopRow]) -> Table:
     for heading in ("block", "contender"):
         result.add_column(heading)
     numbers = ("machines", "settled\n%", "cost med\ns", "cost p95\ns", "later p95\ns", "tail p95\num")
-    for heading in (*numbers, "updates", "gap off\n> 0.05 deg", "worst\ndeg", "fallbacks"):
+    for heading in (*numbers, "updates", "gap off\n> 0.05 deg", "outside", "worst\ndeg", "fallbacks"):
         result.add_column(heading, justify="right")
     for row in rows:
         result.add_row(
@@ -202,7 +216,7 @@ def shown(rows: Sequence[LoopRow]) -> Table:
             f"{row.at('cost', 95.0):.3f}",
             f"{row.at('later', 95.0):.3f}",
             f"{1e6 * row.at('tail', 95.0):.1f}",
-            *(f"{row.total(name):.0f}" for name in ("updates", "off")),
+            *(f"{row.total(name):.0f}" for name in ("updates", "off", "outside")),
             f"{math.degrees(row.at('worst', 100.0)):.3f}",
             f"{row.total('fallbacks'):.0f}",
         )

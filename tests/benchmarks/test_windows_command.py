@@ -56,6 +56,6 @@ def test_document(tmp_path, monkeypatch: pytest.MonkeyPatch):
     assert document["tallies"][0]["false"] == 1
 
 
-def test_only_windows_take_a_seed():
-    with pytest.raises(InvalidInput, match="--seed"):
+def test_only_some_take_a_seed():
+    with pytest.raises(InvalidInput, match="--seed: only bench windows, loops or certificates"):
         alone.run_alone(("estimator",), "", None, True, False, seed=3)
