@@ -9,7 +9,6 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from servotwin.estimation.output_error.shaft import run_shaft
 from servotwin.plant.axis import Axis
@@ -18,7 +17,8 @@ from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
 _FASTEST = 1.2  # of a sample: the largest rate of the flow times the interval, for the Taylor series to converge
-_RELAXED = 3.0  # a shaft that relaxes faster than that in a sample is taken as relaxed
+_EXPONENTIAL = 20  # terms of the series, for a norm below one
+_RELAXED = 12.0  # a shaft that relaxes faster than that in a sample is taken as relaxed
 
 
 class Motion(NamedTuple):
@@ -165,13 +165,26 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
     flows[1, : 2 * n, 2 * n], flows[1, : 2 * n, 2 * n + 1] = links.B_position, links.B_velocity
     flows[1, 2 * n, 2 * n + 1] = 1.0
     flows[0, 2 * n, n] = 1.0
-    if rate * interval < _RELAXED * 4.0:
+    if rate * interval < _RELAXED:
         flows[0, 2 * n, [0, 2 * n]] = rate, -rate
     push[: 2 * n], push[2 * n :] = links.reaction, (k_d, c_d)
     fastest = max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
     fine = max(1, math.ceil(fastest * interval / _FASTEST))
-    steps = np.array([expm(flow * interval / fine) for flow in flows])
+    steps = np.array([_exponential(flow * interval / fine) for flow in flows])
     return flows, steps, push, fine
+
+
+def _exponential(matrix: Array) -> Array:
+    """Exponential of a small matrix by its series, scaled and squared: scipy's starts threads for it."""
+    halvings = max(0, math.ceil(math.log2(max(1e-300, float(np.abs(matrix).sum(axis=1).max())))))
+    part = matrix / 2.0**halvings
+    term = result = np.eye(len(matrix))
+    for k in range(1, _EXPONENTIAL):
+        term = term @ part / k
+        result = result + term
+    for _ in range(halvings):
+        result = result @ result
+    return result
 
 
 @dataclass(frozen=True)
