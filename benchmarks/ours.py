@@ -142,6 +142,7 @@ def comparable(workload: SweepWorkload) -> NDArray[np.bool_]:
 
 
 def _refined(simulation: Simulation) -> Array:
+    assert isinstance(simulation.controller, Controller)
     engine = ContinuousEngine(simulation.servo, simulation.controller, simulation.inputs, refine=REFINED)
     engine.advance(simulation.samples - 1)
     return engine.channel("position", 0, simulation.samples)
