@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeAlias
@@ -14,7 +15,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import Guide, Play
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import Load
 from servotwin.plant.margins import Margins, margins
@@ -66,6 +67,11 @@ class Axis:
             if not isinstance(part, kinds):
                 names = " or ".join(kind.__name__ for kind in kinds)
                 raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
+        if self.n == 1 and self.rigid and (self.load.friction or self.load.force):
+            raise InvalidInput(
+                "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
+                "nothing; give a finite stiffness, or the friction at the motor"
+            )
 
     @property
     def n(self) -> int:
@@ -86,6 +92,20 @@ class Axis:
     def rigid(self) -> bool:
         """True where the first mass follows the transmission."""
         return self.transmission.rigid
+
+    @property
+    def motor_friction(self) -> float:
+        """Coulomb friction of the motor's shaft, N m."""
+        return self.actuator.coulomb
+
+    @cached_property
+    def guide(self) -> Guide:
+        """Forces on the last mass."""
+        load = self.load
+        behind = load.k[-1] if self.n > 1 else self.transmission.k_d
+        mass = load.m[-1]
+        resisting = load.c[-1] + math.sqrt(mass * behind) if math.isfinite(behind) else 1.0
+        return Guide(load.friction, load.force, mass, 1.0 / resisting)
 
     @property
     def at_motor(self) -> bool:

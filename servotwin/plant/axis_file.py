@@ -70,9 +70,11 @@ def linear_load(
         tuple[float, ...],
         key("damping_n_s_per_m", minimum=0.0, help="As the stiffness; the first is viscous friction of a free load."),
     ] = (0.0,),
+    friction: Annotated[float, key("friction_n", minimum=0.0, help="Coulomb friction on the last mass.")] = 0.0,
+    force: Annotated[float, key("force_n", help="Constant force on the last mass, gravity for one.")] = 0.0,
 ) -> Load:
     """Masses on a line."""
-    return Load(m, k, c, LINEAR)
+    return Load(m, k, c, LINEAR, friction, force)
 
 
 def rotary_load(
@@ -93,9 +95,11 @@ def rotary_load(
             help="As the stiffness; the first is viscous friction of a free load.",
         ),
     ] = (0.0,),
+    friction: Annotated[float, key("friction_n_m", minimum=0.0, help="Coulomb friction on the last inertia.")] = 0.0,
+    force: Annotated[float, key("torque_n_m", help="Constant torque on the last inertia, gravity for one.")] = 0.0,
 ) -> Load:
     """Inertias on a shaft."""
-    return Load(m, k, c, ROTARY)
+    return Load(m, k, c, ROTARY, friction, force)
 
 
 TRANSMISSIONS = {"screw": screw, "gear": gear}
@@ -197,9 +201,13 @@ def axis_values(axis: Axis) -> Values:
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
         "transmission": {"kind": kind, **_transmission_values(axis.transmission, kind)},
         "load": {"kind": motion, **values_of(axis.load, LOADS[motion])},
-        "sensors": values_of(axis.sensors),
+        "sensors": {_sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
         "controller": controller,
     }
+
+
+def _sensor_key(name: str, motion: str) -> str:
+    return "position_resolution_rad" if motion == ROTARY and name == "position_resolution_m" else name
 
 
 def _transmission_values(transmission: Transmission, kind: str) -> Values:
