@@ -5,26 +5,42 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import math
+import os
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import resources
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
+from servotwin.config.toml import dumps
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
+from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
 from servotwin.plant.basis import Guide, Play
 from servotwin.plant.linear import LinearSystem
-from servotwin.plant.load import Load
+from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.sensors import MOTOR, Sensors
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Array, check_gap
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
+AXES = (
+    "two-mass-drive",
+    "ball-screw",
+    "robot-joint",
+    "telescope",
+    "stepper-stage",
+    "micro-positioner",
+    "gantry",
+)
+"""Names of the presets of axes."""
 _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
@@ -72,6 +88,50 @@ class Axis:
                 "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
                 "nothing; give a finite stiffness, or the friction at the motor"
             )
+
+    @classmethod
+    def preset(cls, name: str) -> Axis:
+        """An axis of the shelf; each file names the source of every number.
+
+        Raises
+        ------
+        InvalidInput
+            There is none of that name.
+        """
+        if name not in AXES:
+            hint = did_you_mean(name, AXES)
+            raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(AXES)}")
+        text = resources.files("servotwin.plant").joinpath("shelf", f"{name}.toml").read_text(encoding="utf-8")
+        return cls.loads(text, f"{name}.toml")
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Axis:
+        """An axis from a TOML file, as `dumps` writes it.
+
+        Raises
+        ------
+        InvalidInput
+            The file cannot be read, a key is missing or unknown, a value is out of its range, parts do not fit, or the
+            loop is unstable.
+        """
+        return cls._from_table(read_toml(path))
+
+    @classmethod
+    def loads(cls, text: str, source: str) -> Axis:
+        """An axis from TOML text; `source` is its name in messages."""
+        return cls._from_table(parse_toml(text, source))
+
+    @classmethod
+    def _from_table(cls, table: Table) -> Axis:
+        with named(table):
+            axis = cls(**read_parts(table)._asdict())
+            axis.check_loop()
+            return axis
+
+    def dumps(self) -> str:
+        """The axis as TOML that `from_file` reads back to an equal axis."""
+        parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
+        return dumps(values_of_parts(parts))
 
     @property
     def n(self) -> int:
@@ -207,8 +267,30 @@ class Axis:
         InvalidInput
             With the fastest growing pole.
         """
-        loop.check_stable(self.plant(), controller or self.controller, "axis")
+        position = "m" if self.load.motion == LINEAR else "rad"
+        loop.check_stable(self.plant(), controller or self.controller, "axis", self.actuator.unit, position)
 
 
 Plant: TypeAlias = Servo | Axis
 """A machine that can be simulated: the paper's servo, or an axis made of parts."""
+
+
+def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
+    """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
+
+    Raises
+    ------
+    InvalidInput
+        There is no such preset or file, or the file is not valid.
+    """
+    if name_or_path in PRESETS:
+        return Servo.preset(name_or_path)
+    path = Path(folder) / name_or_path
+    if name_or_path in AXES:
+        return Axis.preset(name_or_path)
+    # A bare word that is no file is a misspelt preset.
+    if not (path.suffix or path.exists()):
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(name_or_path, every)
+        raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
+    return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)

@@ -1,28 +1,21 @@
-"""Files and presets of axes: TOML with the unit in every key."""
+"""File of an axis: TOML with the unit in every key."""
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import items_of, key, unit_of
-from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
-from servotwin.config.toml import Values, dumps, part, read, read_kind, values_of
+from servotwin.config.table import Table
+from servotwin.config.toml import Values, part, read, read_kind, values_of
 from servotwin.control.controller import Controller
-from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
-from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.sensors import Sensors
-from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.transmission import FREE, HELD, Transmission
 
-AXES = ()
-"""Names of the presets of axes."""
 # Commands by their unit: the end of a key, and the word for its limit.
 _COMMANDS = {"V": ("v", "voltage"), "N m": ("n_m", "torque"), "rad/s": ("rad_per_s", "speed"), "rad": ("rad", "angle")}
 _IN_GAP = key(
@@ -107,30 +100,24 @@ LOADS = {"linear": linear_load, "rotary": rotary_load}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
 
 
-def loads_axis(text: str, source: str) -> Axis:
-    """An axis from TOML text; `source` is its name in messages.
+class Parts(NamedTuple):
+    """Parts of an axis, as its file describes them."""
+
+    actuator: Actuator
+    transmission: Transmission
+    load: Load
+    controller: Controller
+    sensors: Sensors
+
+
+def read_parts(table: Table) -> Parts:
+    """Read the parts of an axis from its file's table, to the last key.
 
     Raises
     ------
     InvalidInput
-        A key is missing or unknown, a value is out of its range, parts do not fit, the loop is unstable.
+        A key is missing or unknown, a value is out of its range, the load is not of the transmission's kind.
     """
-    return axis_of(parse_toml(text, source))
-
-
-def load_axis(path: str | os.PathLike[str]) -> Axis:
-    """An axis from a TOML file, as `dumps_axis` writes it.
-
-    Raises
-    ------
-    InvalidInput
-        As `loads_axis`; or the file cannot be read.
-    """
-    return axis_of(read_toml(path))
-
-
-def axis_of(table: Table) -> Axis:
-    """An axis from a file's table."""
     tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
     actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
     kind = tables["transmission"].text("kind", choices=tuple(TRANSMISSIONS))
@@ -144,10 +131,7 @@ def axis_of(table: Table) -> Axis:
     controller.done()
     sensors: Sensors = part(table, "sensors", Sensors)
     table.done()
-    with named(table):
-        axis = Axis(actuator, transmission, load, law, sensors)
-        axis.check_loop()
-    return axis
+    return Parts(actuator, transmission, load, law, sensors)
 
 
 def controller_keys(unit: str, motion: str) -> Mapping[str, str]:
@@ -185,13 +169,8 @@ def _suffix(name: str) -> str:
     return next((end for end in ends if unit_of(f"x_{end}") == unit and unit.name), "")
 
 
-def dumps_axis(axis: Axis) -> str:
-    """The axis as TOML that `load_axis` reads back to an equal one."""
-    return dumps(axis_values(axis))
-
-
-def axis_values(axis: Axis) -> Values:
-    """The tables of an axis's file."""
+def values_of_parts(axis: Parts) -> Values:
+    """The tables of an axis's file, which `read_parts` reads back to equal parts."""
     motion = axis.load.motion
     kind = next(kind for kind, moves in _MOTIONS.items() if moves == motion)
     actuator = next(name for name, maker in ACTUATORS.items() if isinstance(axis.actuator, maker))
@@ -218,39 +197,3 @@ def _transmission_values(transmission: Transmission, kind: str) -> Values:
     ratio = next((each for each in close if 1.0 / each == transmission.p), near)
     names = ("k_d", "c_d", "in_gap")
     return {"ratio": ratio, **values_of(transmission, gear, only=names)}
-
-
-def preset_axis(name: str) -> Axis:
-    """A preset of an axis.
-
-    Raises
-    ------
-    InvalidInput
-        There is none of that name.
-    """
-    if name not in AXES:
-        raise InvalidInput(f"preset {name!r} does not exist{did_you_mean(name, AXES)}; give one of {', '.join(AXES)}")
-    text = resources.files("servotwin.plant").joinpath("shelf", f"{name}.toml").read_text(encoding="utf-8")
-    return loads_axis(text, f"{name}.toml")
-
-
-def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
-    """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
-
-    Raises
-    ------
-    InvalidInput
-        There is no such preset or file, or the file is not valid.
-    """
-    path = Path(folder) / name_or_path
-    if name_or_path in AXES:
-        return preset_axis(name_or_path)
-    if not path.suffix and not path.exists() and name_or_path not in PRESETS:
-        every = (*PRESETS, *AXES)
-        raise InvalidInput(
-            f"preset {name_or_path!r} does not exist{did_you_mean(name_or_path, every)}; give one of {', '.join(every)}"
-        )
-    if name_or_path in PRESETS:
-        return Servo.preset(name_or_path)
-    table = read_toml(path)
-    return axis_of(table) if "actuator" in table.values else Servo.load(path)
