@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.contest import Contestant
 from benchmarks.workloads import NoisyWorkload, SweepWorkload, WearWorkload
+from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.continuous import ContinuousEngine

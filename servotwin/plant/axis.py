@@ -4,29 +4,46 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import math
+import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import resources
+from pathlib import Path
 from typing import TypeAlias
 
 import numpy as np
 
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
+from servotwin.config.toml import dumps
 from servotwin.control.controller import Controller
 from servotwin.control.laws import Law
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
-from servotwin.plant.basis import PlantNumbers, Play
+from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
+from servotwin.plant.basis import Guide, PlantNumbers, Play
 from servotwin.plant.law_loop import LawLoop
 from servotwin.plant.linear import LinearSystem
-from servotwin.plant.load import Load
+from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.sensors import MOTOR, Sensors
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Array, check_gap
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
+AXES = (
+    "two-mass-drive",
+    "ball-screw",
+    "robot-joint",
+    "telescope",
+    "stepper-stage",
+    "micro-positioner",
+    "gantry",
+)
+"""Names of the presets of axes."""
 _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
@@ -69,6 +86,63 @@ class Axis:
             if not isinstance(part, kinds):
                 names = " or ".join(kind.__name__ for kind in kinds)
                 raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
+        if self.n == 1 and self.rigid and (self.load.friction or self.load.force):
+            raise InvalidInput(
+                "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
+                "nothing; give a finite stiffness, or the friction at the motor"
+            )
+
+    @classmethod
+    def preset(cls, name: str) -> Axis:
+        """An axis of the shelf; each file names the source of every number.
+
+        Raises
+        ------
+        InvalidInput
+            There is none of that name.
+        """
+        if name not in AXES:
+            hint = did_you_mean(name, AXES)
+            raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(AXES)}")
+        text = resources.files("servotwin.plant").joinpath("shelf", f"{name}.toml").read_text(encoding="utf-8")
+        return cls.loads(text, f"{name}.toml")
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Axis:
+        """An axis from a TOML file, as `dumps` writes it.
+
+        Raises
+        ------
+        InvalidInput
+            The file cannot be read, a key is missing or unknown, a value is out of its range, parts do not fit, or the
+            loop is unstable.
+        """
+        return cls._from_table(read_toml(path))
+
+    @classmethod
+    def loads(cls, text: str, source: str) -> Axis:
+        """An axis from TOML text; `source` is its name in messages."""
+        return cls._from_table(parse_toml(text, source))
+
+    @classmethod
+    def _from_table(cls, table: Table) -> Axis:
+        with named(table):
+            axis = cls(**read_parts(table)._asdict())
+            axis.check_loop()
+            return axis
+
+    def dumps(self) -> str:
+        """The axis as TOML that `from_file` reads back to an equal axis.
+
+        Raises
+        ------
+        InvalidInput
+            Its controller is a linear law.
+        """
+        if not isinstance(self.controller, Controller):
+            raise InvalidInput(f"axis controller = {self.controller!r}: a file of an axis holds a Controller only")
+        parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
+        return dumps(values_of_parts(parts))
 
     @property
     def n(self) -> int:
@@ -89,6 +163,20 @@ class Axis:
     def rigid(self) -> bool:
         """True where the first mass follows the transmission."""
         return self.transmission.rigid
+
+    @property
+    def motor_friction(self) -> float:
+        """Coulomb friction of the motor's shaft, N m."""
+        return self.actuator.coulomb
+
+    @cached_property
+    def guide(self) -> Guide:
+        """Forces on the last mass."""
+        load = self.load
+        behind = load.k[-1] if self.n > 1 else self.transmission.k_d
+        mass = load.m[-1]
+        resisting = load.c[-1] + math.sqrt(mass * behind) if math.isfinite(behind) else 1.0
+        return Guide(load.friction, load.force, mass, 1.0 / resisting)
 
     @property
     def at_motor(self) -> bool:
@@ -206,7 +294,8 @@ class Axis:
         if isinstance(law, LinearLaw):
             self._law_loop(law).check("axis")
         else:
-            loop.check_stable(self.plant(), law, "axis")
+            position = "m" if self.load.motion == LINEAR else "rad"
+            loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)
 
 
 Plant: TypeAlias = Servo | Axis
@@ -225,3 +314,24 @@ def check_encoders(plant: PlantNumbers, law: Law) -> None:
         raise InvalidInput(
             'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be "load"'
         )
+
+
+def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
+    """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
+
+    Raises
+    ------
+    InvalidInput
+        There is no such preset or file, or the file is not valid.
+    """
+    if name_or_path in PRESETS:
+        return Servo.preset(name_or_path)
+    path = Path(folder) / name_or_path
+    if name_or_path in AXES:
+        return Axis.preset(name_or_path)
+    # A bare word that is no file is a misspelt preset.
+    if not (path.suffix or path.exists()):
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(name_or_path, every)
+        raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
+    return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)

@@ -58,14 +58,15 @@ class SampledEngine:
         assert self.controller.sample_rate is not None
         self.tick_every, self.record_every = _divide(self.controller.sample_rate, self.inputs.sample_rate)
         self.rate = self.inputs.sample_rate * self.record_every
-        bias, friction = self.inputs.input_bias, self.inputs.friction
-        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias != 0.0, friction != 0.0)
+        constants = self.inputs.constants(self.servo)
+        bias, friction = constants["input bias"] != 0.0, constants["friction"] != 0.0
+        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias, friction)
         step, searches = search_step(self.plant.automaton, 1.0 / self.rate)
         self.step, self.tables = step, tables_for(self.plant.automaton, step)
         self.state = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             self.state[index] = value
-        set_states(self.plant, self.state, {"input bias": bias, "friction": friction})
+        set_states(self.plant, self.state, constants)
         self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
