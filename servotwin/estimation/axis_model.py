@@ -44,7 +44,8 @@ def servo_of(axis: Axis) -> Servo:
     if isinstance(motor, DcMotor):
         J, R, k_T, k_B, L = motor.J, motor.R, motor.k_T, motor.k_B, motor.L or 1.0
     return Servo(
-        m=load.m, k=springs, c=load.c, J=J, p=axis.p, L=L, R=R, k_T=k_T, k_B=k_B, controller=_filtered_pid(axis), n=load.n,
+        m=load.m, k=springs, c=load.c, J=J, p=axis.p, L=L, R=R, k_T=k_T, k_B=k_B, n=load.n,
+        controller=_filtered_pid(axis),
         k_d=axis.transmission.k_d, encoder_resolution=axis.encoder_resolution,
         position_resolution=axis.sensors.position_resolution,
     )  # fmt: skip

@@ -10,13 +10,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, Unpack
 
 import numpy as np
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
-from servotwin.control.controller import Controller
+from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.control.laws import Law
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
@@ -44,6 +44,18 @@ AXES = (
     "gantry",
 )
 """Names of the presets of axes."""
+
+
+class AxisChanges(ControllerChanges, total=False):
+    """The keywords of `Axis.replace`: its parts and the fields of its controller, each of them optional."""
+
+    actuator: Actuator
+    transmission: Transmission
+    load: Load
+    controller: Law
+    sensors: Sensors
+
+
 _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
@@ -234,24 +246,40 @@ class Axis:
         load, screw = self.load, self.transmission
         return Structure(load.masses, load.stiffnesses, load.dampings, screw.k_d, screw.c_d)
 
-    def replace(self, **changes: object) -> Axis:
-        """A copy with some of its parts changed, by name.
+    def replace(self, **changes: Unpack[AxisChanges]) -> Axis:
+        """A copy with some of its parts changed, or some values of its controller.
+
+        Parameters
+        ----------
+        **changes
+            Parts of the axis, and fields of its controller, by name: ``axis.replace(load=load, Kp=500.0)``.
 
         Raises
         ------
         InvalidInput
-            A name is unknown.
+            A name is unknown, or a value is out of its range.
         """
-        names = [each.name for each in dataclasses.fields(self)]
-        for name in changes:
-            if name not in names:
-                raise InvalidInput(f"axis has no part named {name!r}; its parts are {', '.join(names)}")
-        return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
+        parts = {name: value for name, value in changes.items() if name in _PARTS}
+        law = {name: value for name, value in changes.items() if name not in _PARTS}
+        known = [each.name for each in dataclasses.fields(parts.get("controller", self.controller))]  # type: ignore[arg-type]
+        for name in law:
+            if name not in known:
+                every = [*_PARTS, *known]
+                hint = did_you_mean(name, every)
+                raise InvalidInput(f"axis has no part or gain named {name!r}{hint}; allowed are {', '.join(every)}")
+        changed = dataclasses.replace(self, **parts)  # type: ignore[arg-type]
+        if not law:
+            return changed
+        return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **law))  # type: ignore[arg-type]
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21)."""
         check_gap(gap)
         return k_dz * self.p * gap
+
+    def G2(self) -> LinearSystem:
+        """Angle of the driven end to the position of the last mass."""
+        return loop.structure_system(self._structure, self.p)
 
     def plant(self) -> LinearSystem:
         """Command to the measured position, without a gap."""
@@ -335,3 +363,8 @@ def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Pl
         hint = did_you_mean(name_or_path, every)
         raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
     return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)
+
+
+def plant_of(text: str, source: str) -> Plant:
+    """A servo or an axis from the text of its file; `source` is its name in messages."""
+    return Axis.loads(text, source) if "actuator" in parse_toml(text, source).values else Servo.loads(text, source)

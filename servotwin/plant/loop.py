@@ -135,8 +135,9 @@ def check_stable(plant: LinearSystem, law: Controller, described: str, command: 
         names = ("Kp", "Ki", "Kd", "Tf")
         gains = ", ".join(f"{name} = {getattr(law, name):g} {unit}" for name, unit in zip(names, units, strict=True))
         raise InvalidInput(
-            f"the controller with {gains}{rate} is unstable on this {described} even without a gap: its closed loop "
-            f"has a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
+            f"the controller with {gains}{rate} is unstable on this {described} even without a gap: "
+            f"its closed loop has a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, "
+            "and every pole must have a negative real part"
         )
 
 
