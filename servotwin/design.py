@@ -12,14 +12,15 @@ from servotwin.analysis.maps.settings import MapSettings
 from servotwin.analysis.tuning.tune import Specification, Tuning
 from servotwin.analysis.tuning.tune import tune as tune_system
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Plant
 from servotwin.plant.linear import LinearSystem, series
 from servotwin.plant.loop import loop_filter, notch
-from servotwin.plant.servo import Servo
 
 
 def tune(
-    servo: Servo,
+    servo: Plant,
     crossover: float,
     phase_margin: float,
     *,
@@ -32,7 +33,7 @@ def tune(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         Its own controller gives the loop filter, dead zone and limits of the result.
     crossover : float
         Gain crossover, rad/s.
@@ -63,17 +64,18 @@ def tune(
             f" math.radians({phase_margin:g})?"
         )
     specification = Specification(crossover, phase_margin, kind, Ms_max, prefer)
-    law = servo.controller.replace(sample_rate=None)
+    law = filtered_pid(servo.controller).replace(sample_rate=None)
     return tune_system(tuned_system(servo), specification, delay, law)
 
 
-def tuned_system(servo: Servo) -> LinearSystem:
+def tuned_system(servo: Plant) -> LinearSystem:
     """System that `tune` closes the loop around: the plant with the controller's loop filter and notch in series."""
-    return series(series(servo.plant(), loop_filter(servo.controller)), notch(servo.controller))
+    law = filtered_pid(servo.controller)
+    return series(series(servo.plant(), loop_filter(law)), notch(law))
 
 
 def stability_map(
-    servo: Servo,
+    servo: Plant,
     *,
     controller: Controller | None = None,
     tolerance: Sequence[float] | None = None,
@@ -95,7 +97,7 @@ def stability_map(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     controller : Controller, optional
         Continuous; the servo's own by default.
     tolerance, gap : sequence of float, optional

@@ -68,9 +68,9 @@ class DcMotor:
     friction: Annotated[
         float, key("viscous_friction_n_m_s_per_rad", minimum=0.0, help="Viscous friction of the shaft.")
     ] = 0.0
+    coulomb: Annotated[float, key("coulomb_friction_n_m", minimum=0.0, help="Coulomb friction of the shaft.")] = 0.0
 
     unit = "V"
-    yields = True
 
     def __post_init__(self) -> None:
         check(self)
@@ -115,9 +115,9 @@ class TorqueDrive:
     friction: Annotated[
         float, key("viscous_friction_n_m_s_per_rad", minimum=0.0, help="Viscous friction of the shaft.")
     ] = 0.0
+    coulomb: Annotated[float, key("coulomb_friction_n_m", minimum=0.0, help="Coulomb friction of the shaft.")] = 0.0
 
     unit = "N m"
-    yields = True
 
     def __post_init__(self) -> None:
         check(self)
@@ -154,8 +154,7 @@ class VelocityDrive:
 
     lag: Annotated[float, key("velocity_loop_time_s", above=0.0, help="Time constant of the drive's velocity loop.")]
 
-    unit = "rad/s"
-    yields = False
+    unit, coulomb = "rad/s", 0.0
 
     def __post_init__(self) -> None:
         check(self)
@@ -186,8 +185,7 @@ class Stepper:
         key("smoothing_time_s", above=0.0, help="Time constant (twice) of the driver's smoothing between two steps."),
     ]
 
-    unit = "rad"
-    yields = False
+    unit, coulomb = "rad", 0.0
 
     def __post_init__(self) -> None:
         check(self)

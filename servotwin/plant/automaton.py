@@ -9,7 +9,7 @@ constant disturbances exist only where the `Shape` requests them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -28,6 +28,7 @@ from servotwin.plant.backlash import (
 )
 from servotwin.plant.basis import (
     Basis,
+    GuardRow,
     LawNumbers,
     PlantNumbers,
     Play,
@@ -37,7 +38,14 @@ from servotwin.plant.basis import (
     rows_times,
     scaled,
 )
-from servotwin.plant.friction import StickSlipMode, stick_slip_guards, stick_slip_modes, stopping_speed
+from servotwin.plant.friction import (
+    FRICTIONLESS,
+    SMOOTH,
+    StickSlipMode,
+    stick_slip_guards,
+    stick_slip_modes,
+    stopping_speed,
+)
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.zones import Zone, controller_zones
 
@@ -235,7 +243,7 @@ def sampled_plant(servo: Plant, gap_degree: int, bias: bool = False, friction: b
 
 def sampled_parts(servo: PlantNumbers, gap_degree: int, bias: bool, friction: bool) -> LoopParts:
     """Modes, guards and outputs of plants under a constant voltage."""
-    names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(bias, friction)]
+    names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(servo, bias, friction)]
     # The tick reads one state: a measurement that none of them is becomes one.
     names += ["sensed"] if servo.at_motor or servo.chain().D[-1] else []
     basis = Basis(tuple(names))
@@ -259,7 +267,7 @@ def mechanical_flow(
     motor = slice(0, screw)
     flow[..., motor, motor] = shaft.A
     flow[..., motor, :] += outer(shaft.B, voltage + basis.row("input bias"))
-    flow[..., motor, :] -= outer(shaft.E, stick_slip.side * basis.row("friction"))
+    flow[..., motor, :] -= outer(shaft.E, stick_slip.motor.side * basis.row("friction"))
     flow[..., screw, :] = screw_rate(servo, basis, contact)
     if contact.side == 0 and servo.play is Play.FREE:
         flow[..., states, states] = chain.A_open
@@ -273,8 +281,16 @@ def mechanical_flow(
     elif contact.side and servo.play is not Play.RIGID:
         force = screw_force(servo, basis, flow[..., screw, :])
         flow[..., motor, :] -= scaled(servo.p, outer(shaft.E, force))
-    if stick_slip.stuck:
+    if stick_slip.motor.stuck:
         flow[..., basis["speed"], :] = 0.0
+    if "load force" in basis or "load friction" in basis:
+        last, pushed = (
+            basis.last_speed(servo),
+            basis.row("load force") - stick_slip.load.side * basis.row("load friction"),
+        )
+        flow[..., last, :] += pushed / servo.guide.mass
+        if stick_slip.load.stuck:
+            flow[..., last, :] = 0.0
     # A polynomial input is a chain of integrators: every derivative drives the one before it.
     for name in basis.names:
         if name + "'" in basis:
@@ -297,11 +313,17 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
     names += ["noise"] if shape.noise else []
     names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
     names += ["friction feedforward"] if shape.friction_feedforward else []
-    return names + _constants(shape.bias, shape.friction)
+    return names + _constants(servo, shape.bias, shape.friction)
 
 
-def _constants(bias: bool, friction: bool) -> list[str]:
-    return (["input bias"] if bias else []) + (["friction"] if friction else [])
+def _constants(servo: PlantNumbers, bias: bool, friction: bool) -> list[str]:
+    present = {
+        "input bias": bias,
+        "friction": friction,
+        "load force": servo.guide.force != 0.0,
+        "load friction": servo.guide.friction != 0.0,
+    }
+    return [name for name, there in present.items() if there]
 
 
 class _System:
@@ -333,7 +355,7 @@ class _System:
         # Friction first: where the motor stops on a flank, the screw stays in contact.
         ends += [
             (guard, (contact.name, guard.target, zone.name))
-            for guard in stick_slip_guards(self.servo, self.basis, stick_slip, self._torque(contact, zone))
+            for guard in self._stick_slip_guards(contact, stick_slip, zone)
         ]
         stopping = stopping_speed(self.servo, self.basis, stick_slip)
         sides = (0, contact.side) if contact.resting else ()
@@ -345,6 +367,17 @@ class _System:
         return tuple(
             Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends
         )
+
+    def _stick_slip_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Zone) -> list[GuardRow]:
+        if stick_slip == FRICTIONLESS:
+            return []
+        force = np.zeros(len(self.basis.names))
+        if stick_slip.load.stuck:
+            sliding = replace(stick_slip, load=SMOOTH)
+            flow = mechanical_flow(self.servo, self.basis, contact, sliding, zone.voltage)
+            force = self.servo.guide.mass * flow[..., self.basis.last_speed(self.servo), :]
+        torque = self._torque(contact, zone)
+        return stick_slip_guards(self.servo, self.basis, stick_slip, torque, force)
 
     def _torque(self, contact: ContactMode, zone: Zone) -> Array:
         """Row of the torque that drives the motor's shaft against its friction, N m."""
@@ -360,7 +393,7 @@ class _System:
 
     def _acceleration(self, side: int, zone: Zone) -> Array:
         """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
-        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), StickSlipMode(""), zone.voltage)
+        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), FRICTIONLESS, zone.voltage)
         return np.asarray(flow[..., self.basis["speed"], :])
 
     def _outputs(self) -> dict[str, Array]:

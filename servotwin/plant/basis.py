@@ -24,6 +24,27 @@ class Play(Enum):
     of Nordin and Gutman)."""
 
 
+class Guide(NamedTuple):
+    """Forces on the last mass beside those of its neighbours: of a linear load N, of a rotary one N m.
+
+    Attributes
+    ----------
+    friction : float
+        Coulomb friction.
+    force : float
+        Constant, gravity for one; positive pushes forwards.
+    mass : float
+        The last mass, kg or kg m^2.
+    yielding : float
+        m/s (rad/s) that a force of one N (N m) takes off the last mass's speed in its own time.
+    """
+
+    friction: float = 0.0
+    force: float = 0.0
+    mass: float = 1.0
+    yielding: float = 1.0
+
+
 class PlantNumbers(Protocol):
     """Numbers of a plant that its automaton needs: of one, or of many with one structure on leading axes."""
 
@@ -40,6 +61,11 @@ class PlantNumbers(Protocol):
     @property
     def p(self) -> float | Array:
         """m/rad; (P, 1) for many plants, as the others."""
+        ...
+
+    @property
+    def guide(self) -> Guide:
+        """Forces on the last mass."""
         ...
 
     @property
@@ -184,6 +210,10 @@ class Basis:
         """Places of the structure's states, which follow the screw's."""
         first = self["theta_d"] + 1
         return slice(first, first + chain.A.shape[-1])
+
+    def last_speed(self, servo: PlantNumbers) -> int:
+        """Place of the last mass's speed, which must be a state."""
+        return self.chain_states(servo.chain()).stop - 1
 
     def positions(self, servo: PlantNumbers) -> Array:
         """(..., n, states) rows of the masses' positions."""

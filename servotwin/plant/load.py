@@ -27,6 +27,10 @@ class Load:
         first mass and the ground (0: a free load, and one without viscous friction), the others between a mass and the
         one before it.
     motion : {"linear", "rotary"}
+    friction : float
+        Coulomb friction on the last mass, N (rotary: N m).
+    force : float
+        Constant force on the last mass, gravity for one, N (rotary: N m); positive pushes forwards.
 
     Raises
     ------
@@ -38,6 +42,8 @@ class Load:
     k: tuple[float, ...] = (0.0,)
     c: tuple[float, ...] = (0.0,)
     motion: str = LINEAR
+    friction: float = 0.0
+    force: float = 0.0
 
     def __post_init__(self) -> None:
         if self.motion not in _UNITS:
@@ -51,6 +57,12 @@ class Load:
                 least = "positive" if self._positive(name, i) else "0 or more"
                 if not (math.isfinite(value) and (value > 0.0 if least == "positive" else value >= 0.0)):
                     raise InvalidInput(f"load {name}[{i}] = {value!r} {unit}: must be finite and {least}")
+
+        unit = _UNITS[self.motion][3]
+        if not (math.isfinite(self.friction) and self.friction >= 0.0):
+            raise InvalidInput(f"load friction = {self.friction!r} {unit}: must be finite and 0 or more")
+        if not math.isfinite(self.force):
+            raise InvalidInput(f"load force = {self.force!r} {unit}: must be finite")
 
     @staticmethod
     def _positive(name: str, place: int) -> bool:

@@ -113,8 +113,15 @@ def axis_system(
     return LinearSystem(A, np.concatenate([shaft.B, np.zeros(size)]), C, 0.0, numerator, denominator)
 
 
-def check_stable(plant: LinearSystem, law: Controller, described: str) -> None:
+def check_stable(plant: LinearSystem, law: Controller, described: str, command: str = "V", position: str = "m") -> None:
     """Refuse a controller that does not stabilise a plant, at its sample rate if it has one.
+
+    Parameters
+    ----------
+    described : str
+        The plant in words.
+    command, position : str
+        Units of the gains.
 
     Raises
     ------
@@ -124,10 +131,13 @@ def check_stable(plant: LinearSystem, law: Controller, described: str) -> None:
     worst = slowest_pole(plant, law)
     if not worst.real < 0.0:
         rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
-        gains = f"Kp = {law.Kp:g} V/m, Ki = {law.Ki:g} V/(m s), Kd = {law.Kd:g} V s/m, Tf = {law.Tf:g} s{rate}"
+        units = f"{command}/{position}", f"{command}/({position} s)", f"{command} s/{position}", "s"
+        names = ("Kp", "Ki", "Kd", "Tf")
+        gains = ", ".join(f"{name} = {getattr(law, name):g} {unit}" for name, unit in zip(names, units, strict=True))
         raise InvalidInput(
-            f"the controller with {gains} is unstable on this {described} even without a gap: its closed loop has a "
-            f"pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
+            f"the controller with {gains}{rate} is unstable on this {described} even without a gap: "
+            f"its closed loop has a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, "
+            "and every pole must have a negative real part"
         )
 
 

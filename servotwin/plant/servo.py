@@ -22,7 +22,7 @@ from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import ShaftMatrices
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import Guide, Play
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
@@ -287,7 +287,7 @@ class Servo:
         """True when the first mass follows the screw (k_d infinite)."""
         return math.isinf(self.k_d)
 
-    at_motor = False
+    at_motor, guide, motor_friction = False, Guide(), 0.0
 
     @property
     def play(self) -> Play:

@@ -47,7 +47,7 @@ class PlantStack:
 
     def __init__(self, servos: Sequence[Servo]) -> None:
         self.count, self.n, self.play = len(servos), servos[0].n, servos[0].play
-        self.at_motor = servos[0].at_motor
+        self.at_motor, self.guide = servos[0].at_motor, servos[0].guide
         self.p = _column(servos, "p")
         m, k, c = (
             np.array([_spread(getattr(servo, name), self.n) for servo in servos], dtype=float)

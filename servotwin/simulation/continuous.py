@@ -43,7 +43,7 @@ class ContinuousEngine:
         for name, pieces in signals.items():
             for index, value in self.loop.input_values(name, at_zero(pieces)).items():
                 state[index] = value
-        constants = {"input bias": self.inputs.input_bias, "friction": self.inputs.friction}
+        constants = self.inputs.constants(self.servo)
         set_states(self.loop, state, constants | controller_constants(self.controller))
         if self.noise is not None:
             set_states(self.loop, state, {"noise": self.noise.block(1)[0]})
@@ -66,7 +66,7 @@ class ContinuousEngine:
             dead_zone=self.inputs.tolerance is not None,
             noise=self.noise is not None,
             bias=self.inputs.input_bias != 0.0,
-            friction=self.inputs.friction != 0.0,
+            friction=self.inputs.friction + self.servo.motor_friction != 0.0,
             feedforward=controller.feedforward != 0.0,
             offset=offset,
             friction_feedforward=controller.friction_feedforward != 0.0,

@@ -146,15 +146,16 @@ class LiftedEngine:
         rate = self.controller.sample_rate
         assert rate is not None
         self.rate, self.every = rate, round(rate / self.inputs.sample_rate)
-        bias, friction = self.inputs.input_bias, self.inputs.friction
-        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias != 0.0, friction != 0.0)
+        constants = self.inputs.constants(self.servo)
+        bias, friction = constants["input bias"] != 0.0, constants["friction"] != 0.0
+        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias, friction)
         self.step, searches = search_step(self.plant.automaton, 1.0 / rate)
         self.tables = tables_for(self.plant.automaton, self.step)
         self.places = places_of(self.plant, self.controller, self.delay, degree(self.inputs.reference))
         start = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             start[index] = value
-        set_states(self.plant, start, {"input bias": bias, "friction": friction})
+        set_states(self.plant, start, constants)
         self.state = np.zeros(self.places.states)
         self.state[: self.places.plant] = start
         for follower in (self.places.filtered, self.places.past):

@@ -48,6 +48,25 @@ AXES = {
         0.2,
         0.03,
     ),
+    "friction of motor and load, gravity": (
+        TWO_MASS.replace(
+            actuator=TorqueDrive(J=0.4, lag=1e-3, friction=0.05, coulomb=0.2),
+            load=Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.8, force=-0.3),
+            controller=SOFT,
+        ),
+        0.2,
+        0.03,
+    ),
+    "friction of the second mass": (
+        Axis(
+            DcMotor(5e-6, 12.0, 0.8, 0.1, 1e-3, coulomb=0.01),
+            SCREW,
+            Load((5.2,) * 2, (1e4,) * 2, (36.9,) * 2, friction=3.0, force=1.0),
+            Controller(300.0, 900.0, 0.0, 0.1),
+        ),
+        1e-3,
+        0.3,
+    ),
     "DC motor without inductance": (
         Axis(DcMotor(5e-6, 12.0, 0.8, 0.1), SCREW, ON_SCREW, PAPER.controller),
         1e-3,
@@ -85,7 +104,7 @@ def test_an_axis_agrees_with_an_independent_integrator(name: str) -> None:
     assert np.abs(run.position[:-1] - expected).max() < 1e-8 * amplitude
     events = run.events[np.isin(run.events.kind, ("contact", "release"))].time
     assert len(changes) >= 3
-    assert events == pytest.approx(changes, abs=1e-7)
+    assert events == pytest.approx(changes, abs=1e-6)
 
 
 @pytest.mark.parametrize("name", AXES)
@@ -136,8 +155,8 @@ def test_integral_action_swings_in_the_gap_and_rests_without() -> None:
     ]
     assert swings[0] < 1e-6
     assert swings[2] > 1e-4
-    # All but the gap and the reference's first step scale with it.
-    assert swings[2] == pytest.approx(2.0 * swings[1], rel=1e-3)
+    # A limit cycle is as large as the gap.
+    assert swings[2] == pytest.approx(2.0 * swings[1], rel=0.02)
 
 
 @pytest.mark.parametrize(

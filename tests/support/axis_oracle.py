@@ -6,6 +6,7 @@ what is left of the angle across both, and contact lasts as long as the shaft's 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -28,6 +29,9 @@ class AxisOracle:
     reference: float = 0.0
     side: int = 0
     changes: list[float] = field(default_factory=list)
+    # Directions in which motor and last mass slide; 0: stuck.
+    sliding: list[int] = field(default_factory=lambda: [0, 0])
+    slips: list[float] = field(default_factory=list)
 
     def start(self) -> Array:
         """At rest, the motor in the middle of the gap."""
@@ -84,7 +88,9 @@ class AxisOracle:
         dx = np.zeros_like(x)
         rigid = self.axis.rigid
         force = 0.0 if rigid else self.force(x)
-        dx[0], dx[1] = self.motor(x, u, -p * force)
+        dx[0], dx[1] = self.motor(x, u, -p * force - self.sliding[0] * self.axis.motor_friction)
+        if self.axis.motor_friction and not self.sliding[0]:
+            dx[1] = 0.0
         dx[2] = x[1]
         if rigid:
             dx[3] = x[1] if self.side else 0.0
@@ -99,7 +105,10 @@ class AxisOracle:
             pull = -k[i] * (q[i] - (q[i - 1] if i else 0.0)) - c[i] * (v[i] - (v[i - 1] if i else 0.0))
             if i + 1 < n:
                 pull += k[i + 1] * (q[i + 1] - q[i]) + c[i + 1] * (v[i + 1] - v[i])
+            pull += self.axis.load.force - self.sliding[1] * self.axis.load.friction if i == n - 1 else 0.0
             dx[4 + i], dx[4 + n + i] = v[i], (pull + (force if i == 0 else 0.0)) / m[i]
+        if self.axis.load.friction and not self.sliding[1]:
+            dx[3 + 2 * n] = 0.0
         dx[-2], dx[-1] = law.Ki * error, (error - x[-1]) / law.Tf
         return dx
 
@@ -107,6 +116,7 @@ class AxisOracle:
         """State at the end and states at times in [begin, end)."""
         found, now = [], begin
         while now < end:
+            self.slide_off(x)
             inside = times[(times >= now) & (times < end)]
             solution = solve_ivp(
                 self.rates, (now, end), x, method="DOP853", rtol=1e-12, atol=1e-15, events=self.events(),
@@ -118,9 +128,15 @@ class AxisOracle:
                 found.append(solution.sol(inside).T)
             x, now = solution.y[:, -1].copy(), stop
             if solution.status == 1:
-                x = self.changed(x)
-                self.changes.append(now)
+                which = next(k for k, times_of in enumerate(solution.t_events) if times_of.size)
+                x = self.changed(x, now, which)
         return x, np.concatenate(found) if found else np.zeros((0, x.size))
+
+    def slide_off(self, x: Array) -> None:
+        """What the reference's jump or a contact drives beyond its friction slides at once."""
+        for body, friction in enumerate((self.axis.motor_friction, self.axis.load.friction)):
+            if friction and not self.sliding[body] and abs(self.driven(body, x)) > friction * (1.0 + 1e-9):
+                self.sliding[body] = int(np.sign(self.driven(body, x)))
 
     def events(self) -> list[object]:
         """Ends of the present mode."""
@@ -132,12 +148,50 @@ class AxisOracle:
         def leaving(_t: float, x: Array) -> float:
             return self.side * (x[1] if rigid else self.force(x))
 
-        chosen = apart if self.side == 0 else leaving
-        chosen.terminal, chosen.direction = True, -1.0  # type: ignore[attr-defined]
-        return [chosen]
+        # A motor with friction leaves its flank as it slides off.
+        grips = self.side != 0 and rigid and self.axis.motor_friction > 0.0
+        chosen = [lambda _t, _x: 1.0] if grips else [apart if self.side == 0 else leaving]
+        for body, friction in enumerate((self.axis.motor_friction, self.axis.load.friction)):
+            if friction:
+                chosen.append(self.grip(body, friction))
+        for each in chosen:
+            each.terminal, each.direction = True, -1.0  # type: ignore[attr-defined]
+        return list(chosen)
 
-    def changed(self, x: Array) -> Array:
+    def speed(self, body: int) -> int:
+        """Place of the speed of motor (0) or last mass (1)."""
+        return 1 if body == 0 else 3 + 2 * self.axis.n
+
+    def driven(self, body: int, x: Array) -> float:
+        """Torque on the motor or force on the last mass without friction."""
+        before, self.sliding[body] = self.sliding[body], 2  # neither stuck nor, of no friction, sliding
+        friction = (self.axis.motor_friction, self.axis.load.friction)[body]
+        inertia = (getattr(self.axis.actuator, "J", 1.0), self.axis.load.m[-1])[body]
+        rate = self.rates(0.0, x)[self.speed(body)] * inertia
+        self.sliding[body] = before
+        return float(rate + 2 * friction)
+
+    def grip(self, body: int, friction: float) -> Callable[[float, Array], float]:
+        """Event that ends sticking or sliding."""
+        if self.sliding[body]:
+            return lambda _t, x: self.sliding[body] * float(x[self.speed(body)])
+        return lambda _t, x: friction - abs(self.driven(body, x))
+
+    def changed(self, x: Array, now: float, which: int) -> Array:
         """The mode behind an event."""
+        if which:
+            body = 0 if self.axis.motor_friction and which == 1 else 1
+            friction = (self.axis.motor_friction, self.axis.load.friction)[body]
+            x[self.speed(body)] = 0.0
+            drive = self.driven(body, x)
+            stays = self.sliding[body] != 0 and abs(drive) <= friction
+            self.sliding[body] = 0 if stays else int(np.sign(drive))
+            self.slips.append(now)
+            if self.axis.rigid and body == 0 and self.side and self.sliding[0] == -self.side:
+                self.side = 0
+                self.changes.append(now)
+            return x
+        self.changes.append(now)
         if self.side:
             self.side = 0
             return x

@@ -20,9 +20,10 @@ from servotwin.analysis.limit_cycles.orbit import ClosedOrbit, Orbit, closed_orb
 from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section, guard_events
 from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 
 # The first part of the run is 32 characteristic times of the loop long, each of the others twice as long as the one
 # before: with little integral action a cycle is that slow.
@@ -66,7 +67,7 @@ class CycleResult:
 
 
 def limit_cycle(
-    servo: Servo,
+    servo: Plant,
     gap: float,
     tolerance: float | None = None,
     controller: Controller | None = None,
@@ -76,7 +77,7 @@ def limit_cycle(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     gap : float
         rad, total gap, constant.
     tolerance : float, optional
@@ -99,7 +100,7 @@ def limit_cycle(
     if not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
     loop = scaled_loop(servo, gap, tolerance, controller, step)
-    law = servo.controller if controller is None else controller
+    law = filtered_pid(servo.controller) if controller is None else controller
     if gap == 0.0 and not tolerance and law.voltage_limit is None:
         return _linear(servo, law)
     try:
@@ -108,7 +109,7 @@ def limit_cycle(
         return CycleResult(CycleStatus.CHATTERS, None, str(error))
 
 
-def _linear(servo: Servo, controller: Controller) -> CycleResult:
+def _linear(servo: Plant, controller: Controller) -> CycleResult:
     """Result without gap, dead zone and limit: the poles decide, nothing is simulated."""
     if servo.closed_loop(controller).is_stable():
         return CycleResult(CycleStatus.SETTLES, None, "without gap, dead zone and limit the loop is linear and stable")
