@@ -64,7 +64,8 @@ class WindowCase:
 
 
 def cut(run: Run, start: float, duration: float, words: str = "") -> WindowCase:
-    """The window of a run from `start` (s) on, `duration` (s) long."""
+    """The window of a servo's run from `start` (s) on, `duration` (s) long."""
+    assert isinstance(run.servo, Servo)
     window = Window.from_run(run, start, duration)
     first = round(window.start * run.sample_rate)
     screw = run.theta_d[first : first + window.position.size]

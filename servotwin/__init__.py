@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Axis": "servotwin.plant.axis",
     "Certificate": "servotwin.redesign.certified.certificate",
     "Controller": "servotwin.control",
     "CycleResult": "servotwin.analysis.limit_cycles.cycle",
+    "DcMotor": "servotwin.plant.actuator",
     "Demands": "servotwin.redesign.certified.certificate",
     "GapEstimate": "servotwin.estimation.estimate",
     "GapStatus": "servotwin.estimation.estimate",
     "InvalidInput": "servotwin.errors",
+    "Load": "servotwin.plant.load",
     "Loop": "servotwin.cosim",
     "Noise": "servotwin.plant.noise",
     "PiecewiseCubic": "servotwin.plant.signals",
@@ -22,14 +25,19 @@ _HOMES = {
     "SCurve": "servotwin.plant.signals",
     "Samples": "servotwin.plant.signals",
     "Scenario": "servotwin.cosim.scenario",
+    "Sensors": "servotwin.plant.sensors",
     "Servo": "servotwin.plant.servo",
     "Simulation": "servotwin.simulation",
     "SquareWave": "servotwin.plant.signals",
     "StabilityMap": "servotwin.analysis.maps.result",
     "Step": "servotwin.plant.signals",
+    "Stepper": "servotwin.plant.actuator",
+    "TorqueDrive": "servotwin.plant.actuator",
+    "Transmission": "servotwin.plant.transmission",
     "Trend": "servotwin.estimation.learning.trend",
     "Tuning": "servotwin.analysis.tuning.tune",
     "Uncertainty": "servotwin.redesign.certified.uncertainty",
+    "VelocityDrive": "servotwin.plant.actuator",
     "Window": "servotwin.estimation.window",
     "certify": "servotwin.redesign.certified.certify",
     "cosimulate": "servotwin.cosim",
@@ -55,9 +63,14 @@ if TYPE_CHECKING:
     from servotwin.estimation.joint.estimator import estimate_jointly
     from servotwin.estimation.learning.trend import Trend
     from servotwin.estimation.window import Window
+    from servotwin.plant.actuator import DcMotor, Stepper, TorqueDrive, VelocityDrive
+    from servotwin.plant.axis import Axis
+    from servotwin.plant.load import Load
     from servotwin.plant.noise import Noise
+    from servotwin.plant.sensors import Sensors
     from servotwin.plant.servo import Servo
     from servotwin.plant.signals import PiecewiseCubic, Samples, SCurve, SquareWave, Step
+    from servotwin.plant.transmission import Transmission
     from servotwin.redesign.certified.certificate import Certificate, Demands
     from servotwin.redesign.certified.certify import certify
     from servotwin.redesign.certified.uncertainty import Uncertainty
@@ -65,13 +78,16 @@ if TYPE_CHECKING:
     from servotwin.simulation.run import Run
 
 __all__ = [
+    "Axis",
     "Certificate",
     "Controller",
     "CycleResult",
+    "DcMotor",
     "Demands",
     "GapEstimate",
     "GapStatus",
     "InvalidInput",
+    "Load",
     "Loop",
     "Noise",
     "PiecewiseCubic",
@@ -79,14 +95,19 @@ __all__ = [
     "SCurve",
     "Samples",
     "Scenario",
+    "Sensors",
     "Servo",
     "Simulation",
     "SquareWave",
     "StabilityMap",
     "Step",
+    "Stepper",
+    "TorqueDrive",
+    "Transmission",
     "Trend",
     "Tuning",
     "Uncertainty",
+    "VelocityDrive",
     "Window",
     "certify",
     "cosimulate",

@@ -13,13 +13,13 @@ from servotwin.analysis.tuning.tune import Specification, Tuning
 from servotwin.analysis.tuning.tune import tune as tune_system
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Plant
 from servotwin.plant.linear import LinearSystem, series
 from servotwin.plant.loop import loop_filter, notch
-from servotwin.plant.servo import Servo
 
 
 def tune(
-    servo: Servo,
+    servo: Plant,
     crossover: float,
     phase_margin: float,
     *,
@@ -32,7 +32,7 @@ def tune(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         Its own controller gives the loop filter, dead zone and limits of the result.
     crossover : float
         Gain crossover, rad/s.
@@ -67,13 +67,13 @@ def tune(
     return tune_system(tuned_system(servo), specification, delay, law)
 
 
-def tuned_system(servo: Servo) -> LinearSystem:
+def tuned_system(servo: Plant) -> LinearSystem:
     """System that `tune` closes the loop around: the plant with the controller's loop filter and notch in series."""
     return series(series(servo.plant(), loop_filter(servo.controller)), notch(servo.controller))
 
 
 def stability_map(
-    servo: Servo,
+    servo: Plant,
     *,
     controller: Controller | None = None,
     tolerance: Sequence[float] | None = None,
@@ -95,7 +95,7 @@ def stability_map(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     controller : Controller, optional
         Continuous; the servo's own by default.
     tolerance, gap : sequence of float, optional

@@ -9,6 +9,8 @@ import threading
 from collections.abc import Generator, Iterator
 from functools import cache
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -40,6 +42,22 @@ FIRST = (
     *("up/", "edge_process/", "docs/test_operator_guide.py"),  # wait, and find all compiled: not at the end
 )
 """Folders and files in the order of their tests; all others follow. Two processes hardly ever compile the same."""
+
+
+FALLBACK_SETS = pytest.StashKey[str]()
+"""Folder of the fallback sets that this run has verified: every process of the suite would verify them again."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Give the run a cache of its own, not the user's; the processes that it starts inherit it."""
+    if not hasattr(config, "workerinput"):
+        config.stash[FALLBACK_SETS] = os.environ["SERVOTWIN_CACHE_DIR"] = mkdtemp(prefix="servotwin-tests-")
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Remove it."""
+    if FALLBACK_SETS in config.stash:
+        rmtree(config.stash[FALLBACK_SETS], ignore_errors=True)
 
 
 @pytest.hookimpl(wrapper=True)

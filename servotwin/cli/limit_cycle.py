@@ -14,7 +14,7 @@ from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
 from servotwin.analysis.limit_cycles.describing import Prediction, limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.errors import InvalidInput
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant, resolve_plant
 
 _MM = 1e3
 # Orbits whose frequencies differ by a smaller share are the same orbit.
@@ -40,7 +40,7 @@ class Findings:
     no_prediction: str
 
 
-def findings(servo: Servo, gap: float, tolerance: float | None, step: float) -> Findings:
+def findings(servo: Plant, gap: float, tolerance: float | None, step: float) -> Findings:
     """Compute the limit cycles and predictions of a servo with a gap (rad), a tolerance (m) and after a step (m)."""
     result = limit_cycle(servo, gap, tolerance, step=step)
     if tolerance:
@@ -64,7 +64,7 @@ def print_limit_cycle(
     as_json: bool,
 ) -> None:
     """Print a table, or one JSON object, on the standard output."""
-    servo = Servo.resolve(name)
+    servo = resolve_plant(name)
     # The exact orbit is that of the continuous-time loop.
     servo = servo.replace(sample_rate=None)
     servo = servo if enter is None else servo.replace(enter=enter)

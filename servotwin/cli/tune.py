@@ -15,8 +15,8 @@ from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.controller import Controller
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import resolve_plant
 from servotwin.plant.margins import Margins
-from servotwin.plant.servo import Servo
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
@@ -41,7 +41,7 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     """Print a table, or one JSON object, on the standard output."""
     if not 0.0 < request.phase_margin_deg < 180.0:
         raise InvalidInput(f"phase margin {request.phase_margin_deg:g} deg: must be above 0 and below 180 deg")
-    servo = Servo.resolve(request.servo)
+    servo = resolve_plant(request.servo)
     servo = servo.replace(sample_rate=None)
     delay = 1e-3 * request.delay_ms
     tuning = tune(

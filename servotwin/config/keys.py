@@ -73,6 +73,7 @@ _SCALED = {
     "deg_per_s": Unit("deg/s", "rad/s", _DEGREE),
     "deg": Unit("deg", "rad", _DEGREE),
     "mv": Unit("mV", "V", 1e-3),
+    "mm_per_rev": Unit("mm/rev", "m/rad", 1e-3, 2.0 * math.pi),
     "percent": Unit("%", "", divisor=100.0),
     "megabytes": Unit("MB", "bytes", 1e6),
 }
@@ -81,7 +82,7 @@ _PLAIN = {
     "m_per_s": "m/s", "rad_per_s": "rad/s", "v_per_s": "V/s", "v_per_m": "V/m", "v_per_m_s": "V/(m s)",
     "v_s_per_m": "V s/m", "kg_m2": "kg m^2", "n_m_per_a": "N m/A", "v_s_per_rad": "V s/rad", "m_per_rad": "m/rad",
     "n_per_m": "N/m", "n_s_per_m": "N s/m", "per_s": "1/s", "per_minute": "1/min", "days": "days", "bytes": "bytes",
-    "tolerances": "tolerances",
+    "tolerances": "tolerances", "n_m_per_rad": "N m/rad", "n_m_s_per_rad": "N m s/rad", "n": "N",
 }  # fmt: skip
 _SUFFIXES = {**_SCALED, **{suffix: Unit(name, name) for suffix, name in _PLAIN.items()}}
 

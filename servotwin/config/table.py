@@ -84,12 +84,37 @@ class Table:
         The parsed table.
     name : str
         Dotted path of the table inside its file; empty at the top.
+    shown : mapping
+        Names that the file has for some keys.
     """
 
     source: str
     values: Mapping[str, object]
     name: str = ""
+    shown: Mapping[str, str] = field(default_factory=dict)
     _known: set[str] = field(default_factory=set)
+
+    def renamed(self, names: Mapping[str, str]) -> Table:
+        """The same table with other names for some of its keys.
+
+        Parameters
+        ----------
+        names : mapping
+            Names by the names that the file has for them; messages show those of the file.
+
+        Raises
+        ------
+        InvalidInput
+            The file gives a key by a name that `names` replaces.
+        """
+        shown = {name: given for given, name in names.items()}
+        for given in self.values:
+            if given in shown and given not in names:
+                raise InvalidInput(
+                    f"{self.source}: unknown key '{self.path(given)}'; here its name is '{self.path(shown[given])}'"
+                )
+        values = {names.get(given, given): value for given, value in self.values.items()}
+        return Table(self.source, values, self.name, shown)
 
     def number(
         self,
@@ -201,14 +226,16 @@ class Table:
         """Refuse keys that were neither read nor declared known; raises InvalidInput."""
         for key in self.values:
             if key not in self._known:
-                allowed = _listed(sorted(self._known)) or "no key at all"
-                hint = did_you_mean(key, self._known)
+                known = [self.shown.get(name, name) for name in self._known]
+                allowed = _listed(sorted(known)) or "no key at all"
+                hint = did_you_mean(key, known)
                 where = f"table [{self.name}]" if self.name else "the top level"
                 raise InvalidInput(f"{self.source}: unknown key '{self.path(key)}'{hint}; {where} allows {allowed}")
 
     def path(self, key: str) -> str:
         """The key's dotted path inside its file."""
-        return f"{self.name}.{key}" if self.name else key
+        shown = self.shown.get(key, key)
+        return f"{self.name}.{shown}" if self.name else shown
 
     def missing(self, key: str, table: bool = False) -> InvalidInput:
         """The error for a key or a table that must be there; to be raised by the caller."""

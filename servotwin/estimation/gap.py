@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation import paper, whitened
+from servotwin.estimation.axis_model import servo_of
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.window import Window
+from servotwin.plant.axis import Plant
 from servotwin.plant.servo import Servo
 
 
@@ -39,7 +42,7 @@ METHODS: Mapping[str, Method] = {
 
 def estimate_gap(
     window: Window,
-    servo: Servo,
+    servo: Plant,
     method: str = whitened.METHOD,
     prior: float | GapEstimate | None = None,
     settings: Any = None,
@@ -49,7 +52,7 @@ def estimate_gap(
     Parameters
     ----------
     window : Window
-    servo : Servo
+    servo : Servo or Axis
         The model; its controller does not matter.
     method : str
         "whitened", the default (`servotwin.estimation.whitened`), or "paper", the published one
@@ -66,8 +69,11 @@ def estimate_gap(
         An unknown method, a prior that is not a gap, settings of another method, a window that lacks a channel or
         is too short.
     """
-    chosen = settings_of(method, settings)
-    return METHODS[method].estimate(window, servo, _usable_prior(prior), chosen)
+    chosen, known = settings_of(method, settings), _usable_prior(prior)
+    if isinstance(servo, Servo):
+        return METHODS[method].estimate(window, servo, known, chosen)
+    estimate: GapEstimate = METHODS[method].estimate(window, servo_of(servo), known, chosen)
+    return replace(estimate, model_version=servo.version)
 
 
 def settings_of(method: str, settings: Any = None) -> Any:

@@ -17,6 +17,7 @@ from numba import njit
 from numba.core.compiler import CompilerBase
 
 from servotwin.errors import InvalidInput
+from servotwin.hybrid.compile_lock import compile_once
 from servotwin.hybrid.compile_progress import show_compilation
 from servotwin.hybrid.subroutine import TRIED, SubroutineCompiler, UnoptimisedCompiler
 
@@ -99,6 +100,7 @@ def _compile(function: _Function, **options: Any) -> _Function:
     index = dispatcher._cache._cache_file
     index._source_stamp = dispatcher.stamp
     index._load_index = partial(_load_index, index._load_index)
+    compile_once(dispatcher)
     return cast(_Function, dispatcher)
 
 

@@ -9,17 +9,43 @@ constant disturbances exist only where the `Shape` requests them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, Guard, Mode
-from servotwin.plant.backlash import OPEN, ContactMode, contact_guards, contact_modes, contact_reset, screw_rate
-from servotwin.plant.basis import Basis, LawNumbers, PlantNumbers, input_names, outer, plant_names, scaled
-from servotwin.plant.friction import StickSlipMode, stick_slip_guards, stick_slip_modes, stopping_speed
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
+from servotwin.plant.backlash import (
+    OPEN,
+    ContactMode,
+    contact_guards,
+    contact_modes,
+    contact_reset,
+    screw_force,
+    screw_rate,
+)
+from servotwin.plant.basis import (
+    Basis,
+    GuardRow,
+    LawNumbers,
+    PlantNumbers,
+    Play,
+    input_names,
+    outer,
+    plant_names,
+    rows_times,
+    scaled,
+)
+from servotwin.plant.friction import (
+    FRICTIONLESS,
+    SMOOTH,
+    StickSlipMode,
+    stick_slip_guards,
+    stick_slip_modes,
+    stopping_speed,
+)
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.zones import Zone, controller_zones
 
@@ -164,7 +190,7 @@ def degree(pieces: PiecewiseCubic) -> int:
     return int(used[-1]) if used.size else 0
 
 
-def continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
+def continuous_loop(servo: Plant, controller: Controller, shape: Shape) -> ServoAutomaton:
     """Plant and law together (Figs 8 and 10a); one automaton for controllers that differ in constant feedforwards
     only."""
     return _one_continuous_loop(servo, without_feedforward(controller), shape)
@@ -178,14 +204,14 @@ def without_feedforward(controller: Controller) -> Controller:
 
 
 @lru_cache(maxsize=64)
-def _one_continuous_loop(servo: Servo, controller: Controller, shape: Shape) -> ServoAutomaton:
+def _one_continuous_loop(servo: Plant, controller: Controller, shape: Shape) -> ServoAutomaton:
     return continuous_parts(servo, controller, shape).assembled()
 
 
 def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> LoopParts:
     """Modes, guards and outputs of plants and laws together."""
     basis = Basis(tuple(_loop_names(servo, controller, shape)))
-    sensed = basis.positions(servo)[..., -1, :] + basis.row("noise")
+    sensed = basis.sensed(servo) + basis.row("noise")
     measured = sensed if controller.loop_filter_hz is None else basis.row("filtered")
     error = basis.row("reference") - measured
     system = _System(servo, basis, controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
@@ -210,14 +236,16 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
 
 
 @lru_cache(maxsize=64)
-def sampled_plant(servo: Servo, gap_degree: int, bias: bool = False, friction: bool = False) -> ServoAutomaton:
+def sampled_plant(servo: Plant, gap_degree: int, bias: bool = False, friction: bool = False) -> ServoAutomaton:
     """The plant between two ticks, under a constant voltage (zero-order hold)."""
     return sampled_parts(servo, gap_degree, bias, friction).assembled()
 
 
 def sampled_parts(servo: PlantNumbers, gap_degree: int, bias: bool, friction: bool) -> LoopParts:
     """Modes, guards and outputs of plants under a constant voltage."""
-    names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(bias, friction)]
+    names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(servo, bias, friction)]
+    # The tick reads one state: a measurement that none of them is becomes one.
+    names += ["sensed"] if servo.at_motor or servo.chain().D[-1] else []
     basis = Basis(tuple(names))
     zero = np.zeros(len(basis.names))
     system = _System(servo, basis, (Zone("held", basis.row("voltage"), zero, zero, zero),), friction)
@@ -233,29 +261,42 @@ def mechanical_flow(
     servo: PlantNumbers, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, voltage: Array
 ) -> Array:
     """(..., N, N) flow of motor, screw, chain and inputs in one mode; rows of the controller's states are zero."""
-    chain, (A, B, E) = servo.chain(), servo.motor()
-    flow = np.zeros((*A.shape[:-2], len(basis.names), len(basis.names)))
-    size, first, screw = chain.A.shape[-1], basis["chain0"], basis["theta_d"]
-    states = slice(first, first + size)
-    flow[..., :3, :3] = A
-    flow[..., :3, :] += outer(B, voltage + basis.row("input bias")) - outer(E, stick_slip.side * basis.row("friction"))
-    flow[..., screw, :] = screw_rate(basis, contact)
-    flow[..., states, states] = chain.A
-    pushed = outer(chain.B_position, basis.row("theta_d")) + outer(chain.B_velocity, flow[..., screw, :])
-    flow[..., states, :] += scaled(servo.p, pushed)
+    chain, shaft = servo.chain(), servo.shaft()
+    flow = np.zeros((*shaft.A.shape[:-2], len(basis.names), len(basis.names)))
+    states, screw = basis.chain_states(chain), basis["theta_d"]
+    motor = slice(0, screw)
+    flow[..., motor, motor] = shaft.A
+    flow[..., motor, :] += outer(shaft.B, voltage + basis.row("input bias"))
+    flow[..., motor, :] -= outer(shaft.E, stick_slip.motor.side * basis.row("friction"))
+    flow[..., screw, :] = screw_rate(servo, basis, contact)
+    if contact.side == 0 and servo.play is Play.FREE:
+        flow[..., states, states] = chain.A_open
+    else:
+        flow[..., states, states] = chain.A
+        pushed = outer(chain.B_position, basis.row("theta_d")) + outer(chain.B_velocity, flow[..., screw, :])
+        flow[..., states, :] += scaled(servo.p, pushed)
     if contact.resting:
         # The motor moves with its flank, whose half gap changes at its own rate.
         flow[..., basis["speed"], :] = 0.5 * contact.side * basis.row("gap''")
-    elif contact.side:
-        force = chain.reaction_position * servo.p * basis.row("theta_d")
-        force[..., states] += chain.reaction
-        flow[..., :3, :] -= scaled(servo.p, outer(E, force))
-    if stick_slip.stuck:
+    elif contact.side and servo.play is not Play.RIGID:
+        force = screw_force(servo, basis, flow[..., screw, :])
+        flow[..., motor, :] -= scaled(servo.p, outer(shaft.E, force))
+    if stick_slip.motor.stuck:
         flow[..., basis["speed"], :] = 0.0
+    if "load force" in basis or "load friction" in basis:
+        last, pushed = (
+            basis.last_speed(servo),
+            basis.row("load force") - stick_slip.load.side * basis.row("load friction"),
+        )
+        flow[..., last, :] += pushed / servo.guide.mass
+        if stick_slip.load.stuck:
+            flow[..., last, :] = 0.0
     # A polynomial input is a chain of integrators: every derivative drives the one before it.
     for name in basis.names:
         if name + "'" in basis:
             flow[..., basis[name], :] = basis.row(name + "'")
+    if "sensed" in basis:
+        flow[..., basis["sensed"], :] = rows_times(basis.sensed_of(servo), flow)
     return flow
 
 
@@ -272,11 +313,17 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
     names += ["noise"] if shape.noise else []
     names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
     names += ["friction feedforward"] if shape.friction_feedforward else []
-    return names + _constants(shape.bias, shape.friction)
+    return names + _constants(servo, shape.bias, shape.friction)
 
 
-def _constants(bias: bool, friction: bool) -> list[str]:
-    return (["input bias"] if bias else []) + (["friction"] if friction else [])
+def _constants(servo: PlantNumbers, bias: bool, friction: bool) -> list[str]:
+    present = {
+        "input bias": bias,
+        "friction": friction,
+        "load force": servo.guide.force != 0.0,
+        "load friction": servo.guide.friction != 0.0,
+    }
+    return [name for name, there in present.items() if there]
 
 
 class _System:
@@ -308,7 +355,7 @@ class _System:
         # Friction first: where the motor stops on a flank, the screw stays in contact.
         ends += [
             (guard, (contact.name, guard.target, zone.name))
-            for guard in stick_slip_guards(self.servo, self.basis, stick_slip)
+            for guard in self._stick_slip_guards(contact, stick_slip, zone)
         ]
         stopping = stopping_speed(self.servo, self.basis, stick_slip)
         sides = (0, contact.side) if contact.resting else ()
@@ -321,15 +368,38 @@ class _System:
             Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends
         )
 
+    def _stick_slip_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Zone) -> list[GuardRow]:
+        if stick_slip == FRICTIONLESS:
+            return []
+        force = np.zeros(len(self.basis.names))
+        if stick_slip.load.stuck:
+            sliding = replace(stick_slip, load=SMOOTH)
+            flow = mechanical_flow(self.servo, self.basis, contact, sliding, zone.voltage)
+            force = self.servo.guide.mass * flow[..., self.basis.last_speed(self.servo), :]
+        torque = self._torque(contact, zone)
+        return stick_slip_guards(self.servo, self.basis, stick_slip, torque, force)
+
+    def _torque(self, contact: ContactMode, zone: Zone) -> Array:
+        """Row of the torque that drives the motor's shaft against its friction, N m."""
+        shaft, basis = self.servo.shaft(), self.basis
+        lead = shaft.torque.shape[:-1]
+        torque = np.zeros((*lead, len(basis.names)))
+        torque[..., : shaft.torque.shape[-1]] = shaft.torque
+        if np.any(shaft.direct):
+            torque = torque + shaft.direct * (zone.voltage + basis.row("input bias"))
+        if self.servo.play is Play.FREE and contact.side:
+            torque = torque - self.servo.p * screw_force(self.servo, basis, screw_rate(self.servo, basis, contact))
+        return np.asarray(torque)
+
     def _acceleration(self, side: int, zone: Zone) -> Array:
         """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
-        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), StickSlipMode(""), zone.voltage)
+        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), FRICTIONLESS, zone.voltage)
         return np.asarray(flow[..., self.basis["speed"], :])
 
     def _outputs(self) -> dict[str, Array]:
         positions = self.basis.positions(self.servo)
         rows = {f"q{i + 1}": positions[..., i, :] for i in range(self.servo.n)}
-        rows |= {"position": rows[f"q{self.servo.n}"]}
+        rows |= {"position": rows[f"q{self.servo.n}"], "sensed": self.basis.sensed(self.servo)}
         rows |= {name: self.basis.row(name) for name in ("theta_m", "theta_d", "reference", "gap", "tolerance")}
         full = {name: self._everywhere(row) for name, row in rows.items()}
         full["voltage"] = np.stack(np.broadcast_arrays(*(zone.voltage for _, _, zone in self.combinations)), axis=-2)

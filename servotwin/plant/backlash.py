@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled
-from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, outer, scaled
+from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Play, outer, rows_times, scaled
 from servotwin.plant.signals import Array
 
 
@@ -88,25 +88,54 @@ class ContactMode:
     resting: bool = False
 
 
-_RIGID = (ContactMode("-", -1), ContactMode("open", 0), ContactMode("+", 1))
+_PLAIN = (ContactMode("-", -1), ContactMode("open", 0), ContactMode("+", 1))
 # A load that acts back would push a slow motor off its flank, and nothing would keep it off: between the two it rests
 # there under part of the load (the sliding mode of this automaton).
-_ELASTIC = (*_RIGID, ContactMode("held -", -1, resting=True), ContactMode("held +", 1, resting=True))
+_ELASTIC = (*_PLAIN, ContactMode("held -", -1, resting=True), ContactMode("held +", 1, resting=True))
 OPEN = 1
 """Index of the open mode."""
 
 
 def contact_modes(servo: PlantNumbers) -> tuple[ContactMode, ...]:
     """All modes of the backlash."""
-    return _RIGID if servo.rigid else _ELASTIC
+    return _ELASTIC if servo.play is Play.HELD else _PLAIN
 
 
-def screw_rate(basis: Basis, contact: ContactMode) -> Array:
+def screw_rate(servo: PlantNumbers, basis: Basis, contact: ContactMode) -> Array:
     """theta_d' of the play operator: in contact with the motor, less the half gap's own rate; zero in the gap and at
-    rest on a flank (errata E3, E4)."""
+    rest on a flank (errata E3, E4). A free shaft relaxes in the gap: there its spring and damper balance."""
+    if contact.side == 0 and servo.play is Play.FREE:
+        return _relaxing(servo, basis)
     if contact.side == 0 or contact.resting:
         return np.zeros(len(basis.names))
     return basis.row("speed") - 0.5 * contact.side * basis.row("gap'")
+
+
+def _relaxing(servo: PlantNumbers, basis: Basis) -> Array:
+    """Rate of a free shaft's load-side end in the gap: k_d (d - q_1) + c_d (d' - v_1) = 0; without a damper it is at
+    q_1."""
+    chain = servo.chain()
+    states, half = basis.chain_states(chain), chain.A.shape[-1] // 2
+    rate = np.zeros((*np.shape(servo.p)[:-1], len(basis.names)))
+    rate[..., states.start + half] = np.squeeze(1.0 / np.asarray(servo.p), -1) if np.ndim(servo.p) else 1.0 / servo.p
+    if not np.any(chain.reaction_velocity):
+        return rate
+    twist = scaled_row(servo.p, basis.row("theta_d"))
+    twist[..., states.start] -= 1.0
+    return np.asarray(rate - chain.reaction_position / chain.reaction_velocity / servo.p * twist)
+
+
+def scaled_row(factor: float | Array, row: Array) -> Array:
+    """A row times a number, or (P, 1) numbers."""
+    return np.array(factor * row, dtype=float)
+
+
+def screw_force(servo: PlantNumbers, basis: Basis, rate: Array) -> Array:
+    """Row of the force of an elastic screw on its load, N, where its load-side end moves at a rate (row)."""
+    chain = servo.chain()
+    force = np.array(chain.reaction_position * servo.p * basis.row("theta_d"))
+    force[..., basis.chain_states(chain)] += chain.reaction
+    return force + chain.reaction_velocity * servo.p * rate if np.any(chain.reaction_velocity) else force
 
 
 def contact_guards(
@@ -140,8 +169,12 @@ def contact_guards(
         # Relative to the flank, which accelerates with the half gap.
         free, pressed = (side * row - 0.5 * basis.row("gap''") for row in accelerations)
         return [GuardRow(pressed, flank, None, "contact", side), GuardRow(-free, "open", None, "release", side)]
-    release = -side * screw_rate(basis, contact) - stopping
-    if servo.rigid:
+    rate = screw_rate(servo, basis, contact)
+    if servo.play is Play.FREE:
+        # A flank pushes and never pulls.
+        return [GuardRow(-side * screw_force(servo, basis, rate), "open", None, "release", side)]
+    release = -side * rate - stopping
+    if servo.play is Play.RIGID:
         return [GuardRow(release, "open", resets[side], "release", side)]
     reset = resets[side].copy()
     # The motor stands on the flank and moves with it, at the rate of the half gap.
@@ -152,9 +185,15 @@ def contact_guards(
 def contact_reset(servo: PlantNumbers, basis: Basis, side: int) -> Array:
     """Put the screw on its flank; the chain's damper turns a jump of the screw into one of velocity (Eq 10)."""
     chain = servo.chain()
-    size, lead, first = len(basis.names), chain.B_velocity.shape[:-1], basis["chain0"]
+    size, lead = len(basis.names), chain.B_velocity.shape[:-1]
     reset = np.broadcast_to(np.eye(size), (*lead, size, size)).copy()
     moved = basis.row("theta_m") - 0.5 * side * basis.row("gap") - basis.row("theta_d")
     reset[..., basis["theta_d"], :] += moved
-    reset[..., first : first + chain.A.shape[-1], :] += scaled(servo.p, outer(chain.B_velocity, moved))
+    reset[..., basis.chain_states(chain), :] += scaled(servo.p, outer(chain.B_velocity, moved))
+    if np.any(chain.reaction_velocity):
+        # The same impulse acts back on the motor.
+        impulse = scaled_row(chain.reaction_velocity * np.square(servo.p), moved)
+        reset[..., : basis["theta_d"], :] -= outer(servo.shaft().E, impulse)
+    if "sensed" in basis:
+        reset[..., basis["sensed"], :] = rows_times(basis.sensed_of(servo), reset)
     return reset

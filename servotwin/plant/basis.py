@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+from enum import Enum
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from servotwin.plant.actuator import ShaftMatrices
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain
+
+
+class Play(Enum):
+    """Kinds of backlash: what the driven side does inside the gap, and whether the load acts back on the motor."""
+
+    RIGID = "rigid"
+    """A rigid screw, held in the gap, whose load does not act back (the paper's)."""
+    HELD = "held"
+    """An elastic screw, held in the gap; in contact the load acts back."""
+    FREE = "free"
+    """An elastic shaft without mass or friction: inside the gap no force passes (the two-mass system with a dead zone
+    of Nordin and Gutman)."""
+
+
+class Guide(NamedTuple):
+    """Forces on the last mass beside those of its neighbours: of a linear load N, of a rotary one N m.
+
+    Attributes
+    ----------
+    friction : float
+        Coulomb friction.
+    force : float
+        Constant, gravity for one; positive pushes forwards.
+    mass : float
+        The last mass, kg or kg m^2.
+    yielding : float
+        m/s (rad/s) that a force of one N (N m) takes off the last mass's speed in its own time.
+    """
+
+    friction: float = 0.0
+    force: float = 0.0
+    mass: float = 1.0
+    yielding: float = 1.0
 
 
 class PlantNumbers(Protocol):
@@ -19,13 +54,8 @@ class PlantNumbers(Protocol):
         ...
 
     @property
-    def rigid(self) -> bool:
-        """True when the first mass follows the screw."""
-        ...
-
-    @property
-    def k_d(self) -> float | Array:
-        """N/m, stiffness of the screw."""
+    def play(self) -> Play:
+        """Kind of the backlash."""
         ...
 
     @property
@@ -34,26 +64,21 @@ class PlantNumbers(Protocol):
         ...
 
     @property
-    def R(self) -> float | Array:
-        """Resistance of the winding, ohm."""
+    def guide(self) -> Guide:
+        """Forces on the last mass."""
         ...
 
     @property
-    def k_T(self) -> float | Array:
-        """Torque per current, N m/A."""
-        ...
-
-    @property
-    def k_B(self) -> float | Array:
-        """Back-EMF per angular velocity, V s/rad."""
+    def at_motor(self) -> bool:
+        """True where the controller acts on the motor's encoder instead of the load's."""
         ...
 
     def chain(self) -> Chain:
         """Matrices of the structure."""
         ...
 
-    def motor(self) -> tuple[Array, Array, Array]:
-        """Matrices of the motor."""
+    def shaft(self) -> ShaftMatrices:
+        """Matrices of the actuator."""
         ...
 
 
@@ -181,19 +206,42 @@ class Basis:
         """The row that picks a state, not to be written to; zero when there is no such state."""
         return np.asarray(self._rows[self._index.get(name, -1)])
 
+    def chain_states(self, chain: Chain) -> slice:
+        """Places of the structure's states, which follow the screw's."""
+        first = self["theta_d"] + 1
+        return slice(first, first + chain.A.shape[-1])
+
+    def last_speed(self, servo: PlantNumbers) -> int:
+        """Place of the last mass's speed, which must be a state."""
+        return self.chain_states(servo.chain()).stop - 1
+
     def positions(self, servo: PlantNumbers) -> Array:
         """(..., n, states) rows of the masses' positions."""
         chain = servo.chain()
-        first = self["chain0"]
         rows = np.zeros((*np.shape(servo.p)[:-1], servo.n, len(self.names)))
-        rows[..., first : first + chain.A.shape[-1]] = chain.C
+        rows[..., self.chain_states(chain)] = chain.C
         rows[..., self["theta_d"]] += chain.D * servo.p
         return rows
+
+    def sensed(self, servo: PlantNumbers) -> Array:
+        """(..., states) row of the position that the controller's sensor sees."""
+        return self.row("sensed") if "sensed" in self else self.sensed_of(servo)
+
+    def sensed_of(self, servo: PlantNumbers) -> Array:
+        """The same by the states of motor and load."""
+        if servo.at_motor:
+            return np.asarray(servo.p * self.row("theta_m"))
+        return np.asarray(self.positions(servo)[..., -1, :])
+
+
+def rows_times(row: Array, matrices: Array) -> Array:
+    """(..., n) products of rows (..., m) and matrices (..., m, n)."""
+    return np.asarray((row[..., None, :] @ matrices)[..., 0, :])
 
 
 def plant_names(servo: PlantNumbers) -> list[str]:
     """States of motor, screw and structure."""
-    return ["current", "speed", "theta_m", "theta_d", *(f"chain{i}" for i in range(servo.chain().A.shape[-1]))]
+    return [*servo.shaft().names, "theta_d", *(f"chain{i}" for i in range(servo.chain().A.shape[-1]))]
 
 
 def input_names(key: str, order: int) -> list[str]:

@@ -14,6 +14,7 @@ import numpy as np
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawState, tick
 from servotwin.errors import InvalidInput
+from servotwin.plant.actuator import ShaftMatrices, ShaftPolynomials
 from servotwin.plant.linear import (
     Complex,
     LinearSystem,
@@ -48,7 +49,7 @@ def structure_system(structure: Structure, pitch: float) -> LinearSystem:
     links = chain(structure.m, structure.k, structure.c, structure.k_d)
     B = pitch * (links.B_position + links.A @ links.B_velocity)
     numerator, denominator, _ = transfer(structure.m, structure.k, structure.c, structure.k_d)
-    return LinearSystem(links.A, B, links.C_last, 0.0, pitch * numerator, denominator)
+    return LinearSystem(links.A, B, links.C_last, pitch * float(links.D[-1]), pitch * numerator, denominator)
 
 
 @np.errstate(over="ignore", invalid="ignore")
@@ -78,6 +79,66 @@ def plant_system(motor: Motor, structure: Structure, pitch: float) -> LinearSyst
     back_emf = times(np.array([0.0, motor.k_T * motor.k_B]), whole)
     denominator = plus(times(electric, mechanical), back_emf)
     return LinearSystem(A, B, C, 0.0, motor.k_T * pitch * numerator, denominator)
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def axis_system(
+    shaft: ShaftMatrices, polynomials: ShaftPolynomials, structure: Structure, pitch: float, at_motor: bool
+) -> LinearSystem:
+    """Command of an actuator to the position of the last mass without a gap, or to that of the motor times the pitch.
+
+    With a rigid transmission the load does not act back. With an elastic one its force F = (c_d s + k_d) (d - q_1)
+    turns the motor back with the torque pitch F.
+    """
+    d = len(shaft.names)
+    motor = LinearSystem(shaft.A, shaft.B, np.eye(d)[-1], 0.0, polynomials.command, polynomials.shaft)
+    if math.isinf(structure.k_d):
+        return series(motor, gain(pitch) if at_motor else structure_system(structure, pitch))
+    links = chain(*structure)
+    size = links.B_position.size
+    force = np.concatenate([np.zeros(d), links.reaction])
+    force[d - 2 : d] += pitch * np.array([structure.c_d, structure.k_d])
+    A = np.zeros((d + size, d + size))
+    A[:d, :d], A[d:, d:] = shaft.A, links.A
+    A[d:, d - 1], A[d:, d - 2] = pitch * links.B_position, pitch * links.B_velocity
+    A[:d] -= pitch * np.outer(shaft.E, force)
+    above, whole, inner = transfer(*structure)
+    screw = np.array([structure.k_d, structure.c_d]) if structure.c_d else np.array([structure.k_d])
+    reaction = pitch**2 * times(screw, minus(whole, times(screw, inner)))
+    denominator = plus(times(polynomials.shaft, whole), times(polynomials.torque, reaction))
+    C = np.concatenate([np.zeros(d), links.C_last])
+    if at_motor:
+        C, above = pitch * np.eye(d + size)[d - 1], whole
+    numerator = pitch * times(polynomials.command, above)
+    return LinearSystem(A, np.concatenate([shaft.B, np.zeros(size)]), C, 0.0, numerator, denominator)
+
+
+def check_stable(plant: LinearSystem, law: Controller, described: str, command: str = "V", position: str = "m") -> None:
+    """Refuse a controller that does not stabilise a plant, at its sample rate if it has one.
+
+    Parameters
+    ----------
+    described : str
+        The plant in words.
+    command, position : str
+        Units of the gains.
+
+    Raises
+    ------
+    InvalidInput
+        With the fastest growing pole.
+    """
+    worst = slowest_pole(plant, law)
+    if not worst.real < 0.0:
+        rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
+        units = f"{command}/{position}", f"{command}/({position} s)", f"{command} s/{position}", "s"
+        names = ("Kp", "Ki", "Kd", "Tf")
+        gains = ", ".join(f"{name} = {getattr(law, name):g} {unit}" for name, unit in zip(names, units, strict=True))
+        raise InvalidInput(
+            f"the controller with {gains}{rate} is unstable on this {described} even without a gap: "
+            f"its closed loop has a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, "
+            "and every pole must have a negative real part"
+        )
 
 
 def pidf(controller: Controller) -> LinearSystem:

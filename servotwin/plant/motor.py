@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from servotwin.plant.actuator import ShaftMatrices
 from servotwin.plant.signals import Array
 
 CURRENT, SPEED, ANGLE = 0, 1, 2
@@ -37,6 +38,15 @@ class Motor(NamedTuple):
         A[..., 2, 1] = 1.0
         B[..., 0], E[..., 1] = 1.0 / self.L, 1.0 / self.J
         return A, B, E
+
+    def shaft(self) -> ShaftMatrices:
+        """The same by name, with the row of the torque."""
+        A, B, E = self.matrices()
+        torque = np.zeros_like(B)
+        torque[..., CURRENT] = self.k_T
+        yielding = self.R / (self.k_T * self.k_B)
+        column = yielding if np.ndim(yielding) == 0 else np.asarray(yielding)[:, None]
+        return ShaftMatrices(("current", "speed", "theta_m"), A, B, E, torque, 0.0, column)
 
     def transfer(self) -> tuple[Array, Array]:
         """G1 = theta_m / u (Eq 8) as (numerator, denominator), ascending powers of s."""

@@ -7,11 +7,14 @@ thereby the same verdicts.
 
 from __future__ import annotations
 
+import math
 from functools import cache, lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
+from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.margins import gain_crossovers
 from servotwin.plant.servo import Servo
 
 # Of the loop's own time: the paper's structure is slower than that, with the gains of every preset; a stiff one is not.
@@ -37,7 +40,7 @@ class Scales(NamedTuple):
 
 
 @lru_cache(maxsize=64)
-def scales(servo: Servo) -> Scales:
+def scales(servo: Plant) -> Scales:
     """Units of a servo with its own controller; (1, 1, 1) for the preset `paper`."""
     own, paper = _units(servo), _paper()
     return Scales(own.time / paper.time, own.length / paper.length, own.voltage / paper.voltage)
@@ -48,12 +51,27 @@ def _paper() -> Scales:
     return _units(Servo.preset("paper"))
 
 
-def _units(servo: Servo) -> Scales:
+def _units(servo: Plant) -> Scales:
     """The same in s, m/rad and V/rad.
 
-    A motion needs sqrt(m / k) to pass from one mass to the next, and a stiff machine's loop k_B / (Kp p) to follow.
+    A motion needs sqrt(m / k) to pass from one mass to the next, and a stiff machine's loop k_B / (Kp p) to follow: of
+    an axis one over its first gain crossover, and its unit of the command is that of one radian in this time.
     """
+    if isinstance(servo, Axis):
+        return _units_of_axis(servo)
     time = float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:])))
     if servo.controller.Kp != 0.0:
         time = max(time, _LOOP * servo.k_B / (abs(servo.controller.Kp) * servo.p))
     return Scales(time, servo.p, servo.k_B / time)
+
+
+def _units_of_axis(axis: Axis) -> Scales:
+    time = float(np.sum(np.sqrt(axis.load.masses[1:] / axis.load.stiffnesses[1:])))
+    if not axis.rigid:
+        time += math.sqrt(axis.load.m[0] / axis.transmission.k_d)
+    crossovers = gain_crossovers(axis.loop())
+    if crossovers:
+        time = max(time, _LOOP / crossovers[0].omega)
+    shaft = axis.actuator.polynomials()
+    turned = complex(np.polyval(shaft.command[::-1], 1j / time) / np.polyval(shaft.shaft[::-1], 1j / time))
+    return Scales(time, axis.p, 1.0 / abs(turned))

@@ -21,6 +21,8 @@ from servotwin.config.toml import dumps, read, values_of
 from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
+from servotwin.plant.actuator import ShaftMatrices
+from servotwin.plant.basis import Guide, Play
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
@@ -285,6 +287,13 @@ class Servo:
         """True when the first mass follows the screw (k_d infinite)."""
         return math.isinf(self.k_d)
 
+    at_motor, guide, motor_friction = False, Guide(), 0.0
+
+    @property
+    def play(self) -> Play:
+        """Kind of the backlash: the screw is held in the gap."""
+        return Play.RIGID if self.rigid else Play.HELD
+
     @cached_property
     def version(self) -> str:
         """Twelve hexadecimal digits that name this plant's numbers (the controller's do not count)."""
@@ -298,6 +307,14 @@ class Servo:
         """Matrices A (3, 3), B (3,) of the voltage, E (3,) of a torque, for (current, speed, angle) (Eqs 1-8)."""
         return self._matrices[1]
 
+    def at_rest(self, screw: float) -> tuple[float, Array]:
+        """Angle of the screw (rad) and state of the structure at rest, for a start of the screw at an angle."""
+        return screw, self.chain().equilibrium(self.p * screw)
+
+    def shaft(self) -> ShaftMatrices:
+        """Matrices of the motor by name of its states."""
+        return self._matrices[2]
+
     @property
     def _motor(self) -> Motor:
         return Motor(self.J, self.L, self.R, self.k_T, self.k_B)
@@ -307,9 +324,10 @@ class Servo:
         return Structure(self.masses, self.stiffnesses, self.dampings, self.k_d)
 
     @cached_property
-    def _matrices(self) -> tuple[Chain, tuple[Array, Array, Array]]:
+    def _matrices(self) -> tuple[Chain, tuple[Array, Array, Array], ShaftMatrices]:
         """Structure and motor, computed once: an automaton asks for them dozens of times."""
-        return chain(self.masses, self.stiffnesses, self.dampings, self.k_d), self._motor.matrices()
+        links = chain(self.masses, self.stiffnesses, self.dampings, self.k_d)
+        return links, self._motor.matrices(), self._motor.shaft()
 
     def G1(self) -> LinearSystem:
         """Voltage to the unloaded motor's angle (Eq 8)."""
@@ -343,15 +361,7 @@ class Servo:
         InvalidInput
             With the fastest growing pole.
         """
-        law = controller or self.controller
-        worst = loop.slowest_pole(self.plant(), law)
-        if not worst.real < 0.0:
-            rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
-            gains = f"Kp = {law.Kp:g} V/m, Ki = {law.Ki:g} V/(m s), Kd = {law.Kd:g} V s/m, Tf = {law.Tf:g} s{rate}"
-            raise InvalidInput(
-                f"the controller with {gains} is unstable on this servo even without a gap: its closed loop has a pole "
-                f"at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
-            )
+        loop.check_stable(self.plant(), controller or self.controller, "servo")
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""

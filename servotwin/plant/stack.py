@@ -14,7 +14,9 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import AutomatonStack
+from servotwin.plant.actuator import ShaftMatrices
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
+from servotwin.plant.basis import Play
 from servotwin.plant.motor import Motor
 from servotwin.plant.servo import PerMass, Servo
 from servotwin.plant.signals import Array
@@ -44,24 +46,24 @@ class PlantStack:
     """Numbers of servos that have one structure: the number of masses, and a rigid or an elastic screw."""
 
     def __init__(self, servos: Sequence[Servo]) -> None:
-        self.count, self.n, self.rigid = len(servos), servos[0].n, servos[0].rigid
-        self.p, self.R, self.k_T, self.k_B = (_column(servos, name) for name in ("p", "R", "k_T", "k_B"))
+        self.count, self.n, self.play = len(servos), servos[0].n, servos[0].play
+        self.at_motor, self.guide = servos[0].at_motor, servos[0].guide
+        self.p = _column(servos, "p")
         m, k, c = (
             np.array([_spread(getattr(servo, name), self.n) for servo in servos], dtype=float)
             for name in ("m", "k", "c")
         )
-        self.k_d: float | Array = math.inf if self.rigid else np.array([servo.k_d for servo in servos])
-        self._chain = chain(m, k, c, self.k_d)
-        motors = Motor(*(np.array([getattr(servo, name) for servo in servos]) for name in Motor._fields))
-        self._motor = motors.matrices()
+        rigid = self.play is Play.RIGID
+        self._chain = chain(m, k, c, math.inf if rigid else np.array([servo.k_d for servo in servos]))
+        self._shaft = Motor(*(np.array([getattr(servo, name) for servo in servos]) for name in Motor._fields)).shaft()
 
     def chain(self) -> Chain:
         """Matrices of the structures."""
         return self._chain
 
-    def motor(self) -> tuple[Array, Array, Array]:
+    def shaft(self) -> ShaftMatrices:
         """Matrices of the motors."""
-        return self._motor
+        return self._shaft
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,8 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ON_GRID, Jump, Trajectory
 from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_loop, degree
+from servotwin.plant.axis import Plant
 from servotwin.plant.noise import NoiseSource
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.turns import direction_after, turns_of
 from servotwin.simulation.inputs import RunInputs, about, quantised
@@ -27,7 +27,7 @@ _NOISE_BLOCK = 4096
 class ContinuousEngine:
     """Engine of a `Simulation` whose controller has no sample rate; noise is constant between samples."""
 
-    servo: Servo
+    servo: Plant
     controller: Controller
     inputs: RunInputs
     theta_d0: float = 0.0
@@ -43,7 +43,7 @@ class ContinuousEngine:
         for name, pieces in signals.items():
             for index, value in self.loop.input_values(name, at_zero(pieces)).items():
                 state[index] = value
-        constants = {"input bias": self.inputs.input_bias, "friction": self.inputs.friction}
+        constants = self.inputs.constants(self.servo)
         set_states(self.loop, state, constants | controller_constants(self.controller))
         if self.noise is not None:
             set_states(self.loop, state, {"noise": self.noise.block(1)[0]})
@@ -66,7 +66,7 @@ class ContinuousEngine:
             dead_zone=self.inputs.tolerance is not None,
             noise=self.noise is not None,
             bias=self.inputs.input_bias != 0.0,
-            friction=self.inputs.friction != 0.0,
+            friction=self.inputs.friction + self.servo.motor_friction != 0.0,
             feedforward=controller.feedforward != 0.0,
             offset=offset,
             friction_feedforward=controller.friction_feedforward != 0.0,
@@ -208,16 +208,17 @@ def set_states(loop: ServoAutomaton, state: Array, values: Mapping[str, float]) 
             state[loop.automaton.index(name)] = value
 
 
-def plant_start(servo: Servo, loop: ServoAutomaton, gap: float, theta_d0: float) -> Array:
+def plant_start(servo: Plant, loop: ServoAutomaton, gap: float, theta_d0: float) -> Array:
     """State at rest: motor at 0, screw at `theta_d0` clamped into the gap, structure in equilibrium."""
     if not np.isfinite(theta_d0):
         raise InvalidInput(f"theta_d0 = {theta_d0} rad: must be finite")
     state = np.zeros(len(loop.automaton.names))
     screw = float(np.clip(theta_d0, -0.5 * gap, 0.5 * gap))
     if screw:
-        rest = servo.chain().equilibrium(servo.p * screw)
-        first = loop.automaton.index("chain0")
-        state[loop.automaton.index("theta_d")], state[first : first + rest.size] = screw, rest
+        angle = loop.automaton.index("theta_d")
+        screw, rest = servo.at_rest(screw)
+        state[angle], state[angle + 1 : angle + 1 + rest.size] = screw, rest
+        set_states(loop, state, {"sensed": 0.0 if servo.at_motor else servo.p * screw})
     return state
 
 

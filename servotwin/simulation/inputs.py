@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import PiecewiseCubic
 
 
@@ -21,6 +22,11 @@ class RunInputs:
     sample_rate: float
     input_bias: float = 0.0
     friction: float = 0.0
+
+    def constants(self, servo: Plant) -> dict[str, float]:
+        """States of a plant's automaton that are constants, by name: disturbances and the plant's own forces."""
+        forces = plant_forces(servo)
+        return {**forces, "input bias": self.input_bias, "friction": self.friction + forces["friction"]}
 
     def times(self, first: int, last: int) -> Array:
         """Times of samples first .. last - 1, s."""
@@ -39,6 +45,15 @@ class RunInputs:
         jumps += [(float(t), "parameter") for t in self.gap.jumps]
         jumps += [(float(t), "parameter") for t in self.tolerance.jumps] if self.tolerance is not None else []
         return sorted((time, kind) for time, kind in jumps if 0.0 < time <= until)
+
+
+def plant_forces(servo: Plant) -> dict[str, float]:
+    """States of a plant's automaton that are constant forces of the plant, by name."""
+    return {
+        "friction": servo.motor_friction,
+        "load force": servo.guide.force,
+        "load friction": servo.guide.friction,
+    }
 
 
 def quantised(values: Array, resolution: float) -> Array:

@@ -22,7 +22,7 @@ from servotwin.hybrid.lifted import BLOCK, COARSE, new_lifted, new_lifted_worksp
 from servotwin.hybrid.tables import search_step
 from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs
@@ -44,7 +44,7 @@ _ROOM = 4096
 _TICKS_PER_RUN, _TICKS_PER_PIECE = 20_000, 64
 
 
-def advances_in_blocks(servo: Servo, controller: Controller, inputs: RunInputs, samples: int) -> bool:
+def advances_in_blocks(servo: Plant, controller: Controller, inputs: RunInputs, samples: int) -> bool:
     """True for a noise-free run that `LiftedEngine` can do: a sampled law, an ideal sensor, ticks at every sample, and
     many ticks, inputs of few pieces with a tolerance that is constant in each; a friction feedforward needs such a
     reference."""
@@ -93,7 +93,7 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         len(names),
         states + (-states % 4),
         names.index("voltage"),
-        int(np.argmax(plant.rows["position"][0])),
+        int(np.argmax(plant.rows["sensed"][0])),
         **places,
         waiting=waiting,
         delay=delay,
@@ -134,7 +134,7 @@ def new_memory(places: Places, modes: int, watches: int) -> LiftedMemory:
 class LiftedEngine:
     """A sampled run from rest to its end, for which `advances_in_blocks` holds."""
 
-    servo: Servo
+    servo: Plant
     controller: Controller
     inputs: RunInputs
     theta_d0: float
@@ -146,15 +146,16 @@ class LiftedEngine:
         rate = self.controller.sample_rate
         assert rate is not None
         self.rate, self.every = rate, round(rate / self.inputs.sample_rate)
-        bias, friction = self.inputs.input_bias, self.inputs.friction
-        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias != 0.0, friction != 0.0)
+        constants = self.inputs.constants(self.servo)
+        bias, friction = constants["input bias"] != 0.0, constants["friction"] != 0.0
+        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias, friction)
         self.step, searches = search_step(self.plant.automaton, 1.0 / rate)
         self.tables = tables_for(self.plant.automaton, self.step)
         self.places = places_of(self.plant, self.controller, self.delay, degree(self.inputs.reference))
         start = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             start[index] = value
-        set_states(self.plant, start, {"input bias": bias, "friction": friction})
+        set_states(self.plant, start, constants)
         self.state = np.zeros(self.places.states)
         self.state[: self.places.plant] = start
         for follower in (self.places.filtered, self.places.past):

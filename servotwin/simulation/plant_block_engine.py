@@ -66,7 +66,7 @@ class PlantBlockEngine(SampledEngine):
         self.blocks = new_blocks(n, _ROOM)
 
     def _recorded(self) -> list[int]:
-        return [self.plant.automaton.names.index("voltage"), int(np.argmax(self.plant.rows["position"][0]))]
+        return [self.plant.automaton.names.index("voltage"), int(np.argmax(self.plant.rows["sensed"][0]))]
 
     def _inputs_until(self, base: int, end: int) -> TickInputs:
         # The system provides the memory of what is recorded here, beside the run, not where the run waits for it.

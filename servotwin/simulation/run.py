@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.runtime.notebook import html_table
 from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.views import Panel, arrow_table, pandas_table, stacked_figure
@@ -27,7 +27,7 @@ class Run:
     Channels are evaluated at first access and cached.
     """
 
-    servo: Servo
+    servo: Plant
     inputs: RunInputs
     samples: int
     channel: Callable[[str, int, int], Array] = field(repr=False)

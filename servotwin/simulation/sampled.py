@@ -27,8 +27,8 @@ from servotwin.hybrid.kernel import (
 from servotwin.hybrid.tables import search_step
 from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import degree, sampled_plant
+from servotwin.plant.axis import Plant
 from servotwin.plant.noise import Noise, NoiseSource
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs, quantised
@@ -43,7 +43,7 @@ class SampledEngine:
     """Engine of a `Simulation` whose controller has a sample rate; with `keep` it stores at least that many samples,
     and no events. A voltage is applied `delay` ticks after its measurement; zero until then."""
 
-    servo: Servo
+    servo: Plant
     controller: Controller
     inputs: RunInputs
     theta_d0: float
@@ -57,18 +57,19 @@ class SampledEngine:
         assert self.controller.sample_rate is not None
         self.tick_every, self.record_every = _divide(self.controller.sample_rate, self.inputs.sample_rate)
         self.rate = self.inputs.sample_rate * self.record_every
-        bias, friction = self.inputs.input_bias, self.inputs.friction
-        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias != 0.0, friction != 0.0)
+        constants = self.inputs.constants(self.servo)
+        bias, friction = constants["input bias"] != 0.0, constants["friction"] != 0.0
+        self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias, friction)
         step, searches = search_step(self.plant.automaton, 1.0 / self.rate)
         self.step, self.tables = step, tables_for(self.plant.automaton, step)
         self.state = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             self.state[index] = value
-        set_states(self.plant, self.state, {"input bias": bias, "friction": friction})
+        set_states(self.plant, self.state, constants)
         self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
-        self.law_state = law.start(float(self.plant.rows["position"][0] @ self.state))
+        self.law_state = law.start(float(self.plant.rows["sensed"][0] @ self.state))
         self.parameters = self.controller.law(None)
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
@@ -80,7 +81,7 @@ class SampledEngine:
         names = self.plant.automaton.names
         return Port(
             names.index("voltage"),
-            int(np.argmax(self.plant.rows["position"][0])),
+            int(np.argmax(self.plant.rows["sensed"][0])),
             self.servo.position_resolution,
             1 if self.servo.position_resolution > 0.0 else 0,
             np.array(self._recorded()),
@@ -260,7 +261,7 @@ class SampledEngine:
         # The transfer needs the measurement of the tick that is due; that tick then takes the same noise again.
         noise = self.draws.take(1)
         self.draws.put_back(noise)
-        measured = float(self.plant.rows["position"][0] @ self.state + noise[0])
+        measured = float(self.plant.rows["sensed"][0] @ self.state + noise[0])
         self.law_state = law.transfer(
             self.controller.law(planned),
             controller.law(planned if tolerance is None else tolerance),
@@ -288,7 +289,7 @@ class SampledEngine:
         ticks = np.arange(first, last) * self.record_every // self.tick_every
         out = self.output.measured[ticks - self.output.first_tick]
         if last > self.index and not self.finished:
-            present = self.channel("position", self.index, self.index + 1)
+            present = self.channel("sensed", self.index, self.index + 1)
             out[-1] = quantised(present, self.servo.position_resolution)[0]
         return out
 

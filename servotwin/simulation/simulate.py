@@ -10,8 +10,8 @@ import numpy as np
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.axis import Plant
 from servotwin.plant.noise import Noise
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced
@@ -41,7 +41,7 @@ class Simulation:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     duration : float
         s; the horizon up to which inputs are laid out.
     controller : Controller, optional
@@ -77,7 +77,7 @@ class Simulation:
 
     def __init__(
         self,
-        servo: Servo,
+        servo: Plant,
         duration: float,
         controller: Controller | None = None,
         reference: SignalLike = 0.0,
@@ -240,7 +240,7 @@ class Simulation:
 
 
 def simulate(
-    servo: Servo,
+    servo: Plant,
     duration: float,
     *,
     controller: Controller | None = None,
@@ -258,7 +258,7 @@ def simulate(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     duration : float
         s.
     controller : Controller, optional

@@ -24,7 +24,7 @@ import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import METHODS
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.lookup_file import flattened
+from servotwin.redesign.certified.fallback import flattened
 from servotwin.twin.settings import TwinSettings
 
 SOURCES = ("control", "estimation", "hybrid", "messages", "plant", "redesign", "simulation", "twin")

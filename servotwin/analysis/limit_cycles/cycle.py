@@ -22,7 +22,7 @@ from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loo
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 
 # The first part of the run is 32 characteristic times of the loop long, each of the others twice as long as the one
 # before: with little integral action a cycle is that slow.
@@ -66,7 +66,7 @@ class CycleResult:
 
 
 def limit_cycle(
-    servo: Servo,
+    servo: Plant,
     gap: float,
     tolerance: float | None = None,
     controller: Controller | None = None,
@@ -76,7 +76,7 @@ def limit_cycle(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     gap : float
         rad, total gap, constant.
     tolerance : float, optional
@@ -108,7 +108,7 @@ def limit_cycle(
         return CycleResult(CycleStatus.CHATTERS, None, str(error))
 
 
-def _linear(servo: Servo, controller: Controller) -> CycleResult:
+def _linear(servo: Plant, controller: Controller) -> CycleResult:
     """Result without gap, dead zone and limit: the poles decide, nothing is simulated."""
     if servo.closed_loop(controller).is_stable():
         return CycleResult(CycleStatus.SETTLES, None, "without gap, dead zone and limit the loop is linear and stable")

@@ -18,9 +18,9 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
+from servotwin.plant.axis import Plant
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
-from servotwin.plant.servo import Servo
 
 # Grid intervals within each band of frequencies in which a prediction is possible.
 _GRID = 500
@@ -65,7 +65,7 @@ def play_function(amplitude: float, gap: float) -> complex:
     return _play(math.acos(1.0 - gap / amplitude))
 
 
-def predictions(servo: Servo, gap: float, controller: Controller | None = None) -> tuple[Prediction, ...]:
+def predictions(servo: Plant, gap: float, controller: Controller | None = None) -> tuple[Prediction, ...]:
     """All limit cycles that the describing function predicts for a constant gap, by frequency.
 
     Solutions lie where abs(L) >= 1 and the phase of L is between -180 and -90 deg, since N shrinks and lags by up to
@@ -98,12 +98,18 @@ def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
     return [float(brentq(lambda w: _mismatch(loop, w), grid[i], grid[i + 1], xtol=1e-14 * grid[i])) for i in places]
 
 
-def _check(servo: Servo, law: Controller, gap: float) -> None:
+def _check(servo: Plant, law: Controller, gap: float) -> None:
     if not servo.rigid:
         raise InvalidInput(
-            f"servo k_d = {servo.k_d:g} N/m: the describing function needs a rigid screw (k_d = inf), "
+            "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), "
             "since a load that acts back on the motor only in contact is no function of the screw's angle"
         )
+    if servo.at_motor:
+        raise InvalidInput(
+            'sensors feedback = "motor": the gap is outside of a loop on the motor\'s encoder, behind a rigid screw'
+        )
+    if servo.motor_friction or servo.guide.friction:
+        raise InvalidInput("the describing function is that of the gap alone; the axis has Coulomb friction too")
     if law.voltage_limit is not None:
         raise InvalidInput(
             f"controller voltage_limit = {law.voltage_limit:g} V: the describing function knows no limit"
@@ -154,7 +160,7 @@ def _bands(loop: LinearSystem) -> list[tuple[float, float]]:
     return [(float(a), float(b)) for a, b, good in zip(bounds[:-1], bounds[1:], inside, strict=True) if good]
 
 
-def _prediction(servo: Servo, loop: LinearSystem, gap: float, omega: float) -> Prediction:
+def _prediction(servo: Plant, loop: LinearSystem, gap: float, omega: float) -> Prediction:
     value = complex(loop.response(omega))
     angle = _angle(cmath.phase(-1.0 / value))
     # 1 - cos(angle), without cancellation.
@@ -182,13 +188,13 @@ _CREST = ("+/on", "release", 1)
 
 
 def limit_cycle_near(
-    servo: Servo, gap: float, prediction: Prediction, controller: Controller | None = None
+    servo: Plant, gap: float, prediction: Prediction, controller: Controller | None = None
 ) -> CycleResult:
     """Find the symmetric orbit to which Newton's method converges from a prediction; the loop has no dead zone.
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     gap : float
         rad, total gap.
     prediction : Prediction
@@ -215,7 +221,7 @@ def limit_cycle_near(
     return CycleResult(CycleStatus.CYCLE, closed.orbit, "")
 
 
-def crest(servo: Servo, loop: ScaledLoop, prediction: Prediction, law: Controller) -> Array:
+def crest(servo: Plant, loop: ScaledLoop, prediction: Prediction, law: Controller) -> Array:
     """(n,) predicted state, SI units and zero reference, when the motor's angle is largest."""
     state = phasors(servo, loop, prediction, law).real
     at = loop.loop.automaton.index
@@ -226,7 +232,14 @@ def crest(servo: Servo, loop: ScaledLoop, prediction: Prediction, law: Controlle
     return np.asarray(state)
 
 
-def phasors(servo: Servo, loop: ScaledLoop, prediction: Prediction, law: Controller) -> Complex:
+def driven_states(servo: Plant, s: complex) -> Complex:
+    """(d,) first harmonics of the states of actuator and motor per that of the motor's angle, without a load."""
+    shaft = servo.shaft()
+    states = np.linalg.solve(s * np.eye(len(shaft.names)) - shaft.A, shaft.B)
+    return np.asarray(states / states[-1])
+
+
+def phasors(servo: Plant, loop: ScaledLoop, prediction: Prediction, law: Controller) -> Complex:
     """(n,) first harmonics of all states, that of the motor's angle real."""
     at, result = loop.loop.automaton.index, np.zeros(len(loop.state), dtype=complex)
     s = 2j * math.pi * prediction.frequency
@@ -236,11 +249,10 @@ def phasors(servo: Servo, loop: ScaledLoop, prediction: Prediction, law: Control
     chain = servo.chain()
     drive = servo.p * (chain.B_position + s * chain.B_velocity)
     masses = np.linalg.solve(s * np.eye(chain.A.shape[0]) - chain.A, drive) * screw
-    first = at("chain0")
+    first = at("theta_d") + 1
     result[first : first + masses.size] = masses
-    position = chain.C_last @ masses
-    result[at("theta_m")], result[at("speed")], result[at("theta_d")] = motor, s * motor, screw
-    result[at("current")] = servo.J * s * s * motor / servo.k_T
+    position = chain.C_last @ masses + servo.p * float(chain.D[-1]) * screw
+    result[: at("theta_d")], result[at("theta_d")] = driven_states(servo, s) * motor, screw
     measured = position
     if law.loop_filter_hz is not None:
         measured = result[at("filtered")] = position / (1.0 + s / (2.0 * math.pi * law.loop_filter_hz))

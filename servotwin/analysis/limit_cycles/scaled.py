@@ -16,8 +16,8 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.automaton import ServoAutomaton
+from servotwin.plant.axis import Plant
 from servotwin.plant.margins import gain_crossovers
-from servotwin.plant.servo import Servo
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.simulate import Simulation
 
@@ -33,20 +33,19 @@ def moving(loop: ServoAutomaton) -> Flags:
     return np.asarray(np.any(loop.automaton.flows != 0.0, axis=(0, 2)))
 
 
-def shift(servo: Servo, loop: ServoAutomaton) -> Array | None:
+def shift(servo: Plant, loop: ServoAutomaton) -> Array | None:
     """(n,) displacement of a motion per metre of reference, or None where a shifted motion is no motion.
 
     Motor, screw and masses are moved alike. Where every flow and every guard ignores that, orbits for any reference are
     one orbit; where the load holds the motor, they are not.
     """
-    automaton, rest = loop.automaton, servo.chain().equilibrium(1.0)
+    automaton = loop.automaton
+    screw, rest = servo.at_rest(1.0 / servo.p)
     result = np.zeros(len(automaton.names))
-    for name in automaton.names:
-        if name in ("theta_m", "theta_d"):
-            result[automaton.index(name)] = 1.0 / servo.p
-        elif name in ("reference", "filtered"):
-            result[automaton.index(name)] = 1.0
-    first = automaton.index("chain0")
+    for name, moved in {"theta_m": 1.0 / servo.p, "theta_d": screw, "reference": 1.0, "filtered": 1.0}.items():
+        if name in automaton.names:
+            result[automaton.index(name)] = moved
+    first = automaton.index("theta_d") + 1
     result[first : first + rest.size] = rest
     rows = [np.asarray(guard.row, dtype=float) for mode in automaton.modes for guard in mode.guards]
     everything = np.vstack([automaton.flows.reshape(-1, len(automaton.names)), *rows])
@@ -153,7 +152,7 @@ class ScaledLoop:
 
 
 def scaled_loop(
-    servo: Servo, gap: float, tolerance: float | None, controller: Controller | None, step: float
+    servo: Plant, gap: float, tolerance: float | None, controller: Controller | None, step: float
 ) -> ScaledLoop:
     """The loop at rest just after a reference step (m); see `limit_cycle`.
 
@@ -184,7 +183,7 @@ def scaled_loop(
     return ScaledLoop(loop, scaled, mode, unit, displacement, servo.p, time, free, reflection)
 
 
-def characteristic_time(servo: Servo, controller: Controller) -> float:
+def characteristic_time(servo: Plant, controller: Controller) -> float:
     """s: one turn at the first gain crossover without a gap, or, where there is none, of the slowest lasting motion."""
     crossovers = gain_crossovers(servo.loop(controller))
     if crossovers:

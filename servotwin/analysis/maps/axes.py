@@ -10,7 +10,7 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import check_gap
 
 Values: TypeAlias = tuple[float, ...]
@@ -62,7 +62,7 @@ class RatioAxes:
         """Cells along each axis."""
         return len(self.tolerance), len(self.amplitude)
 
-    def cells(self, servo: Servo) -> Cells:
+    def cells(self, servo: Plant) -> Cells:
         """Every cell in SI units."""
         unit = 0.5 * servo.p * self.gap
         tolerance, amplitude = _grid(self.tolerance, self.amplitude)
@@ -110,7 +110,7 @@ class PhysicalAxes:
         """Cells along each axis: gap, estimate, k_dz, amplitude."""
         return len(self.gap), max(1, len(self.estimate)), len(self.k_dz), len(self.amplitude)
 
-    def cells(self, servo: Servo) -> Cells:
+    def cells(self, servo: Plant) -> Cells:
         """Every cell in SI units."""
         gap, estimate, k_dz, amplitude = _grid(self.gap, self.estimate or (math.nan,), self.k_dz, self.amplitude)
         estimate = estimate if self.estimate else gap

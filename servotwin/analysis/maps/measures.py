@@ -21,6 +21,7 @@ from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
 from servotwin.simulation.continuous import controller_constants
 from servotwin.simulation.ensemble import start_modes
+from servotwin.simulation.inputs import plant_forces
 
 # Half-width about the final position, per reference step: the usual five per cent.
 SETTLING_BAND = 0.05
@@ -96,7 +97,8 @@ def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Arr
 def automaton(settings: MapSettings) -> ServoAutomaton:
     """Plant and law together, with a dead zone."""
     law = settings.law
-    return continuous_loop(settings.servo, law, Shape(feedforward=law.feedforward != 0.0))
+    friction = settings.servo.motor_friction != 0.0
+    return continuous_loop(settings.servo, law, Shape(feedforward=law.feedforward != 0.0, friction=friction))
 
 
 def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: range) -> Array:
@@ -106,9 +108,9 @@ def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: ran
     step, omega = cells.amplitude[:, None], 2.0 * math.pi / characteristic_time(servo, settings.law)
     states = np.zeros((*draws.shape[:2], len(loop.automaton.names)))
     screw = 0.5 * cells.gap[:, None] * draws[:, :, 0]
-    states[:, :, index("theta_d")] = screw
-    rest = servo.chain().equilibrium(servo.p)
-    states[:, :, index("chain0") : index("chain0") + rest.size] = screw[:, :, None] * rest
+    angle, rest = servo.at_rest(1.0)
+    states[:, :, index("theta_d")] = angle * screw
+    states[:, :, index("theta_d") + 1 : index("theta_d") + 1 + rest.size] = screw[:, :, None] * rest
     states[:, :, index("speed")] = settings.motion * draws[:, :, 1] * step * omega / servo.p
     states[:, :, index("integral")] = settings.motion * draws[:, :, 2] * step * settings.law.Ki / omega
     for name, value in zip(("gap", "tolerance", "reference"), cells, strict=True):
@@ -116,8 +118,11 @@ def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: ran
     for name, constant in controller_constants(settings.law).items():
         if name in loop.automaton.names:
             states[:, :, index(name)] = constant
+    for name, force in plant_forces(servo).items():
+        if name in loop.automaton.names:
+            states[:, :, index(name)] = force
     if settings.law.loop_filter_hz is not None:
-        states[:, :, index("filtered")] = states @ loop.rows["position"][0]
+        states[:, :, index("filtered")] = states @ loop.rows["sensed"][0]
     return states
 
 

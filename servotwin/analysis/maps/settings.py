@@ -12,8 +12,8 @@ from servotwin.analysis.limit_cycles.scaled import characteristic_time
 from servotwin.analysis.maps.axes import Axes, RatioAxes, as_lists, axis_names
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Plant
 from servotwin.plant.scales import scales
-from servotwin.plant.servo import Servo
 
 # Raise it whenever the same settings would give other numbers: stored pieces then no longer match.
 FORMAT = 1
@@ -34,7 +34,7 @@ class MapSettings:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     axes : RatioAxes or PhysicalAxes
     controller : Controller, optional
         Continuous; the servo's own by default.
@@ -61,7 +61,7 @@ class MapSettings:
         A value is outside its range, the controller is sampled or does not stabilise the servo even without a gap.
     """
 
-    servo: Servo
+    servo: Plant
     axes: Axes
     controller: Controller | None = None
     members: int = 16

@@ -17,8 +17,8 @@ from numpy.polynomial import polynomial as poly
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Plant
 from servotwin.plant.linear import LinearSystem, realised, series
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples
 
 
@@ -64,7 +64,7 @@ def shaped(controller: Controller, b: float, c: float, size: float, duration: fl
     return Samples(times.tolist(), (size * prefilter(controller, b, c).step(times)).tolist())
 
 
-def overshoot(servo: Servo, controller: Controller, b: float = 1.0, c: float = 1.0) -> float:
+def overshoot(servo: Plant, controller: Controller, b: float = 1.0, c: float = 1.0) -> float:
     """Overshoot of the linear loop's step response (no gap) as a part of the step, in ten turns of the slowest pole."""
     closed = servo.closed_loop(controller)
     system = closed if b == c == 1.0 else series(prefilter(controller, b, c), closed)

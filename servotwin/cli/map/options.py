@@ -11,7 +11,7 @@ import numpy as np
 from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.errors import InvalidInput
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import resolve_plant
 
 _MAX_VALUES = 4096
 _MAX_PANELS = 36
@@ -46,7 +46,7 @@ class MapOptions:
         InvalidInput
             An option is outside its range, or the two kinds of axes are mixed.
         """
-        servo = Servo.resolve(self.servo)
+        servo = resolve_plant(self.servo)
         own = servo.controller
         enter = own.enter if self.enter is None else self.enter
         leave = own.leave if self.leave is None else self.leave

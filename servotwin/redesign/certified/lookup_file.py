@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Generator
 from pathlib import Path
 from time import perf_counter
 
@@ -13,6 +12,7 @@ from msgspec import Struct
 import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.fallback import flattened
 from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, cells_of, certify_cell, table_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.runtime import files
@@ -135,15 +135,6 @@ def _check_owner(path: Path, file: TableFile, policy: CertifiedPolicy) -> None:
             f"{path}: was verified for {key} = {there}, and this is {here}{more}: certify a table of its own with"
             " `servotwin certify`"
         )
-
-
-def flattened(name: str, value: object) -> Iterator[tuple[str, str]]:
-    """(dotted name, value in full) of everything in nested dataclasses."""
-    if is_dataclass(value) and not isinstance(value, type):
-        for field in fields(value):
-            yield from flattened(f"{name}.{field.name}", getattr(value, field.name))
-    else:
-        yield name, repr(value)
 
 
 def _write(path: Path, table: TableFile) -> None:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 from time import perf_counter
 from typing import ClassVar, Protocol
 
 from servotwin.control.gains import with_gains
-from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
@@ -20,6 +18,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
+from servotwin.redesign.certified.fallback import fallback_certificate
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
@@ -191,7 +190,7 @@ class CertifiedPolicy:
         InvalidInput
             No setting is verified for the whole range: state a narrower one, or lower the demands.
         """
-        return _fallback(self.servo, self.uncertainty, self._limited_demands, self.simulations)
+        return fallback_certificate(self.servo, self.uncertainty, self._limited_demands, self.simulations)
 
     @property
     def _limited_demands(self) -> Demands:
@@ -373,14 +372,6 @@ def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
     error = max(certificate.within, certificate.tail) + noise
     effort = certificate.effort + abs(certificate.setting.controller.Kp) * (NEAR * certificate.step[1] + noise)
     return Band(error, error, effort, math.ceil(1.5 * certificate.settling_worst))
-
-
-@lru_cache(maxsize=16)
-def _fallback(servo: Servo, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> Certificate:
-    result = certify(servo, uncertainty, demands, trial)
-    if isinstance(result, NotVerified):
-        raise InvalidInput(f"no fallback set for the servo's stated range: {result.reason}")
-    return result
 
 
 def _fallback_redesign(certificate: Certificate, region: Region, reason: str) -> Redesign:

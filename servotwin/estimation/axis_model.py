@@ -1,0 +1,66 @@
+"""The servo that has an axis's way from the motor's angle to the load: what the paper's estimators need of an axis."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.actuator import DcMotor
+from servotwin.plant.axis import Axis
+from servotwin.plant.basis import Play
+from servotwin.plant.servo import Servo
+
+_LEAST_MASSES = 2
+
+
+def has_servo(axis: Axis) -> bool:
+    """True where a `Servo` can stand for the axis: its driven end is held in the gap and drives two masses or more."""
+    return axis.play is not Play.FREE and axis.n >= _LEAST_MASSES
+
+
+@lru_cache(maxsize=32)
+def servo_of(axis: Axis) -> Servo:
+    """The servo with the axis's transmission, load, encoders and controller.
+
+    The estimators read the angle. Of the motor they use the loop's own time alone, through its back EMF: that of
+    another actuator than a DC motor stands for the crossover of the loop.
+
+    Raises
+    ------
+    InvalidInput
+        No servo stands for the axis.
+    """
+    if not has_servo(axis):
+        what = "a shaft that is free in the gap" if axis.play is Play.FREE else "one mass"
+        raise InvalidInput(
+            f'axis with {what}: methods "whitened" and "paper" need a transmission that is held in the gap and at '
+            'least 2 masses; leave the method out, or give method = "output_error"'
+        )
+    load, motor = axis.load, axis.actuator
+    # With a rigid transmission the first spring is inert: a free load may have any.
+    springs = (load.k[0] or load.k[1], *load.k[1:]) if axis.rigid else _grounded(load.k)
+    J, R, k_T, k_B, L = 1.0, 1.0, 1.0, _loop_gain(axis), 1.0
+    if isinstance(motor, DcMotor):
+        J, R, k_T, k_B, L = motor.J, motor.R, motor.k_T, motor.k_B, motor.L or 1.0
+    return Servo(
+        m=load.m, k=springs, c=load.c, J=J, p=axis.p, L=L, R=R, k_T=k_T, k_B=k_B, controller=axis.controller, n=load.n,
+        k_d=axis.transmission.k_d, encoder_resolution=axis.encoder_resolution,
+        position_resolution=axis.sensors.position_resolution,
+    )  # fmt: skip
+
+
+def _grounded(springs: tuple[float, ...]) -> tuple[float, ...]:
+    """The springs, refused where no ground holds the load behind an elastic screw."""
+    if springs[0] == 0.0:
+        raise InvalidInput(
+            'load k[0] = 0.0: methods "whitened" and "paper" need a load on the ground behind an elastic transmission '
+            "that is held in the gap"
+        )
+    return springs
+
+
+def _loop_gain(axis: Axis) -> float:
+    """Back EMF (V s/rad) with which a servo's loop is as fast as the axis's: Kp p over the crossover."""
+    crossovers = axis.margins().gain_crossovers
+    crossover = crossovers[0].omega if crossovers else 1.0
+    return abs(axis.controller.Kp) * axis.p / crossover or 1.0

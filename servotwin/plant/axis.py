@@ -1,0 +1,329 @@
+"""A servo axis made of parts: actuator, transmission, load, sensors and the controller that runs by default."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import math
+import os
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import TypeAlias, Unpack
+
+import numpy as np
+
+from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
+from servotwin.config.toml import dumps
+from servotwin.control.controller import Controller, ControllerChanges
+from servotwin.errors import InvalidInput
+from servotwin.plant import loop
+from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
+from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
+from servotwin.plant.basis import Guide, Play
+from servotwin.plant.linear import LinearSystem
+from servotwin.plant.load import LINEAR, Load
+from servotwin.plant.margins import Margins, margins
+from servotwin.plant.sensors import MOTOR, Sensors
+from servotwin.plant.servo import PRESETS, Servo
+from servotwin.plant.signals import Array, check_gap
+from servotwin.plant.structure import Chain, Structure, chain
+from servotwin.plant.transmission import Transmission
+
+AXES = (
+    "two-mass-drive",
+    "ball-screw",
+    "robot-joint",
+    "telescope",
+    "stepper-stage",
+    "micro-positioner",
+    "gantry",
+)
+"""Names of the presets of axes."""
+
+
+class AxisChanges(ControllerChanges, total=False):
+    """The keywords of `Axis.replace`: its parts and the fields of its controller, each of them optional."""
+
+    actuator: Actuator
+    transmission: Transmission
+    load: Load
+    controller: Controller
+    sensors: Sensors
+
+
+_PARTS: dict[str, tuple[type, ...]] = {
+    "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
+    "transmission": (Transmission,),
+    "load": (Load,),
+    "controller": (Controller,),
+    "sensors": (Sensors,),
+}
+
+
+@dataclass(frozen=True, repr=False)
+class Axis:
+    """One axis. The paper's servo is the combination of a DC motor, a rigid screw and a load on the ground.
+
+    Parameters
+    ----------
+    actuator : DcMotor, TorqueDrive, VelocityDrive or Stepper
+    transmission : Transmission
+    load : Load
+    controller : Controller
+        Runs when none is given. Its gains give the actuator's command (V, N m, rad/s or rad) per m, or per rad of a
+        rotary load.
+    sensors : Sensors, optional
+        Ideal by default.
+
+    Raises
+    ------
+    InvalidInput
+        A part of another type.
+    """
+
+    actuator: Actuator
+    transmission: Transmission
+    load: Load
+    controller: Controller
+    sensors: Sensors = field(default_factory=Sensors)
+
+    def __post_init__(self) -> None:
+        for each in dataclasses.fields(self):
+            part, kinds = getattr(self, each.name), _PARTS[each.name]
+            if not isinstance(part, kinds):
+                names = " or ".join(kind.__name__ for kind in kinds)
+                raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
+        if self.n == 1 and self.rigid and (self.load.friction or self.load.force):
+            raise InvalidInput(
+                "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
+                "nothing; give a finite stiffness, or the friction at the motor"
+            )
+
+    @classmethod
+    def preset(cls, name: str) -> Axis:
+        """An axis of the shelf; each file names the source of every number.
+
+        Raises
+        ------
+        InvalidInput
+            There is none of that name.
+        """
+        if name not in AXES:
+            hint = did_you_mean(name, AXES)
+            raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(AXES)}")
+        text = resources.files("servotwin.plant").joinpath("shelf", f"{name}.toml").read_text(encoding="utf-8")
+        return cls.loads(text, f"{name}.toml")
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Axis:
+        """An axis from a TOML file, as `dumps` writes it.
+
+        Raises
+        ------
+        InvalidInput
+            The file cannot be read, a key is missing or unknown, a value is out of its range, parts do not fit, or the
+            loop is unstable.
+        """
+        return cls._from_table(read_toml(path))
+
+    @classmethod
+    def loads(cls, text: str, source: str) -> Axis:
+        """An axis from TOML text; `source` is its name in messages."""
+        return cls._from_table(parse_toml(text, source))
+
+    @classmethod
+    def _from_table(cls, table: Table) -> Axis:
+        with named(table):
+            axis = cls(**read_parts(table)._asdict())
+            axis.check_loop()
+            return axis
+
+    def dumps(self) -> str:
+        """The axis as TOML that `from_file` reads back to an equal axis."""
+        parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
+        return dumps(values_of_parts(parts))
+
+    @property
+    def n(self) -> int:
+        """Number of masses."""
+        return self.load.n
+
+    @property
+    def p(self) -> float:
+        """Travel of the load per angle of the motor, m/rad (rotary: rad/rad)."""
+        return self.transmission.p
+
+    @property
+    def play(self) -> Play:
+        """Kind of the backlash."""
+        return self.transmission.play
+
+    @property
+    def rigid(self) -> bool:
+        """True where the first mass follows the transmission."""
+        return self.transmission.rigid
+
+    @property
+    def motor_friction(self) -> float:
+        """Coulomb friction of the motor's shaft, N m."""
+        return self.actuator.coulomb
+
+    @cached_property
+    def guide(self) -> Guide:
+        """Forces on the last mass."""
+        load = self.load
+        behind = load.k[-1] if self.n > 1 else self.transmission.k_d
+        mass = load.m[-1]
+        resisting = load.c[-1] + math.sqrt(mass * behind) if math.isfinite(behind) else 1.0
+        return Guide(load.friction, load.force, mass, 1.0 / resisting)
+
+    @property
+    def at_motor(self) -> bool:
+        """True where the controller acts on the motor's encoder instead of the load's."""
+        return self.sensors.feedback == MOTOR
+
+    @property
+    def position_resolution(self) -> float:
+        """One count of the sensor that the controller reads, m (rotary: rad)."""
+        if self.at_motor:
+            return self.p * self.sensors.encoder_resolution
+        return self.sensors.position_resolution
+
+    @property
+    def encoder_resolution(self) -> float:
+        """One count of the motor's encoder, rad."""
+        return self.sensors.encoder_resolution
+
+    @cached_property
+    def version(self) -> str:
+        """Twelve hexadecimal digits that name the plant's numbers (the controller's do not count)."""
+        parts = (self.actuator, self.transmission, self.load, self.sensors)
+        return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+    def __repr__(self) -> str:
+        """Parts in one line."""
+        kind = type(self.actuator).__name__
+        masses = f"{self.n} mass{'es' if self.n > 1 else ''}"
+        return f"<Axis, model {self.version}: {kind}, {self.play.value} screw, {masses}, {self.controller!r}>"
+
+    def chain(self) -> Chain:
+        """Matrices of the load."""
+        return self._matrices[0]
+
+    def at_rest(self, screw: float) -> tuple[float, Array]:
+        """Angle of the driven end (rad) and state of the load at rest, for a start of the driven end at an angle.
+
+        What is free in the gap rests where no force acts: a load on the ground at zero, a free one anywhere.
+        """
+        if self.play is not Play.FREE:
+            return screw, self.chain().equilibrium(self.p * screw)
+        screw = screw if self.load.free else 0.0
+        return screw, np.concatenate([np.full(self.n, self.p * screw), np.zeros(self.n)])
+
+    def shaft(self) -> ShaftMatrices:
+        """Matrices of the actuator."""
+        return self._matrices[1]
+
+    @cached_property
+    def _matrices(self) -> tuple[Chain, ShaftMatrices]:
+        return chain(*self._structure), self.actuator.matrices()
+
+    @property
+    def _structure(self) -> Structure:
+        load, screw = self.load, self.transmission
+        return Structure(load.masses, load.stiffnesses, load.dampings, screw.k_d, screw.c_d)
+
+    def replace(self, **changes: Unpack[AxisChanges]) -> Axis:
+        """A copy with some of its parts changed, or some values of its controller.
+
+        Parameters
+        ----------
+        **changes
+            Parts of the axis, and fields of its controller, by name: ``axis.replace(load=load, Kp=500.0)``.
+
+        Raises
+        ------
+        InvalidInput
+            A name is unknown, or a value is out of its range.
+        """
+        parts = {name: value for name, value in changes.items() if name in _PARTS}
+        law = {name: value for name, value in changes.items() if name not in _PARTS}
+        known = [each.name for each in dataclasses.fields(parts.get("controller", self.controller))]  # type: ignore[arg-type]
+        for name in law:
+            if name not in known:
+                every = [*_PARTS, *known]
+                hint = did_you_mean(name, every)
+                raise InvalidInput(f"axis has no part or gain named {name!r}{hint}; allowed are {', '.join(every)}")
+        changed = dataclasses.replace(self, **parts)  # type: ignore[arg-type]
+        if not law:
+            return changed
+        return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **law))  # type: ignore[arg-type]
+
+    def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
+        """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21)."""
+        check_gap(gap)
+        return k_dz * self.p * gap
+
+    def G2(self) -> LinearSystem:
+        """Angle of the driven end to the position of the last mass."""
+        return loop.structure_system(self._structure, self.p)
+
+    def plant(self) -> LinearSystem:
+        """Command to the measured position, without a gap."""
+        shaft = self.actuator.polynomials()
+        return loop.axis_system(self.shaft(), shaft, self._structure, self.p, self.at_motor)
+
+    def loop(self, controller: Controller | None = None) -> LinearSystem:
+        """Open loop of controller and plant in continuous time, without a gap."""
+        return loop.open_loop(self.plant(), controller or self.controller)
+
+    def closed_loop(self, controller: Controller | None = None) -> LinearSystem:
+        """Reference to the measured position in continuous time, without a gap."""
+        return loop.closed_loop(self.plant(), controller or self.controller)
+
+    def margins(self, controller: Controller | None = None) -> Margins:
+        """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
+        return margins(self.loop(controller), self.closed_loop(controller))
+
+    def check_loop(self, controller: Controller | None = None) -> None:
+        """Refuse a controller that does not stabilise the axis even without a gap, at its sample rate if it has one.
+
+        Raises
+        ------
+        InvalidInput
+            With the fastest growing pole.
+        """
+        position = "m" if self.load.motion == LINEAR else "rad"
+        loop.check_stable(self.plant(), controller or self.controller, "axis", self.actuator.unit, position)
+
+
+Plant: TypeAlias = Servo | Axis
+"""A machine that can be simulated: the paper's servo, or an axis made of parts."""
+
+
+def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
+    """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
+
+    Raises
+    ------
+    InvalidInput
+        There is no such preset or file, or the file is not valid.
+    """
+    if name_or_path in PRESETS:
+        return Servo.preset(name_or_path)
+    path = Path(folder) / name_or_path
+    if name_or_path in AXES:
+        return Axis.preset(name_or_path)
+    # A bare word that is no file is a misspelt preset.
+    if not (path.suffix or path.exists()):
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(name_or_path, every)
+        raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
+    return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)
+
+
+def plant_of(text: str, source: str) -> Plant:
+    """A servo or an axis from the text of its file; `source` is its name in messages."""
+    return Axis.loads(text, source) if "actuator" in parse_toml(text, source).values else Servo.loads(text, source)

@@ -1,0 +1,199 @@
+"""File of an axis: TOML with the unit in every key."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+from servotwin.config.keys import items_of, key, unit_of
+from servotwin.config.table import Table
+from servotwin.config.toml import Values, part, read, read_kind, values_of
+from servotwin.control.controller import Controller
+from servotwin.plant.actuator import ACTUATORS, Actuator
+from servotwin.plant.load import LINEAR, ROTARY, Load
+from servotwin.plant.sensors import Sensors
+from servotwin.plant.transmission import FREE, HELD, Transmission
+
+# Commands by their unit: the end of a key, and the word for its limit.
+_COMMANDS = {"V": ("v", "voltage"), "N m": ("n_m", "torque"), "rad/s": ("rad_per_s", "speed"), "rad": ("rad", "angle")}
+_IN_GAP = key(
+    choices=(HELD, FREE),
+    help="The driven end inside the gap: held where it is by its own friction, or free to follow the load.",
+)
+
+
+def screw(
+    p: Annotated[float, key("pitch_m_per_rad", "lead_mm_per_rev", above=0.0, help="Travel per angle of the motor.")],
+    k_d: Annotated[
+        float, key("stiffness_n_per_m", above=0.0, infinite=True, help="Stiffness between the gap and the first mass.")
+    ] = math.inf,
+    c_d: Annotated[float, key("damping_n_s_per_m", minimum=0.0, help="Damping beside it.")] = 0.0,
+    in_gap: Annotated[str, _IN_GAP] = HELD,
+) -> Transmission:
+    """Screw, rack or belt."""
+    return Transmission(p, k_d, c_d, in_gap)
+
+
+def gear(
+    ratio: Annotated[
+        float, key(above=0.0, unit="turns of the motor per turn of the load", help="Gear ratio; 1: direct drive.")
+    ],
+    k_d: Annotated[
+        float,
+        key("stiffness_n_m_per_rad", above=0.0, infinite=True, help="Stiffness between gap and load, at the load."),
+    ] = math.inf,
+    c_d: Annotated[float, key("damping_n_m_s_per_rad", minimum=0.0, help="Damping beside it.")] = 0.0,
+    in_gap: Annotated[str, _IN_GAP] = HELD,
+) -> Transmission:
+    """Gear or direct drive."""
+    return Transmission(1.0 / ratio, k_d, c_d, in_gap)
+
+
+def linear_load(
+    m: Annotated[tuple[float, ...], key("mass_kg", above=0.0, help="Masses, from the transmission outwards.")],
+    k: Annotated[
+        tuple[float, ...],
+        key(
+            "stiffness_n_per_m", minimum=0.0, help="Of each to the one before; the first to the ground, 0: a free load."
+        ),
+    ] = (0.0,),
+    c: Annotated[
+        tuple[float, ...],
+        key("damping_n_s_per_m", minimum=0.0, help="As the stiffness; the first is viscous friction of a free load."),
+    ] = (0.0,),
+    friction: Annotated[float, key("friction_n", minimum=0.0, help="Coulomb friction on the last mass.")] = 0.0,
+    force: Annotated[float, key("force_n", help="Constant force on the last mass, gravity for one.")] = 0.0,
+) -> Load:
+    """Masses on a line."""
+    return Load(m, k, c, LINEAR, friction, force)
+
+
+def rotary_load(
+    m: Annotated[tuple[float, ...], key("inertia_kg_m2", above=0.0, help="Inertias, from the transmission outwards.")],
+    k: Annotated[
+        tuple[float, ...],
+        key(
+            "stiffness_n_m_per_rad",
+            minimum=0.0,
+            help="Of each to the one before; the first to the ground, 0: a free load.",
+        ),
+    ] = (0.0,),
+    c: Annotated[
+        tuple[float, ...],
+        key(
+            "damping_n_m_s_per_rad",
+            minimum=0.0,
+            help="As the stiffness; the first is viscous friction of a free load.",
+        ),
+    ] = (0.0,),
+    friction: Annotated[float, key("friction_n_m", minimum=0.0, help="Coulomb friction on the last inertia.")] = 0.0,
+    force: Annotated[float, key("torque_n_m", help="Constant torque on the last inertia, gravity for one.")] = 0.0,
+) -> Load:
+    """Inertias on a shaft."""
+    return Load(m, k, c, ROTARY, friction, force)
+
+
+TRANSMISSIONS = {"screw": screw, "gear": gear}
+LOADS = {"linear": linear_load, "rotary": rotary_load}
+_MOTIONS = {"screw": LINEAR, "gear": ROTARY}
+
+
+class Parts(NamedTuple):
+    """Parts of an axis, as its file describes them."""
+
+    actuator: Actuator
+    transmission: Transmission
+    load: Load
+    controller: Controller
+    sensors: Sensors
+
+
+def read_parts(table: Table) -> Parts:
+    """Read the parts of an axis from its file's table, to the last key.
+
+    Raises
+    ------
+    InvalidInput
+        A key is missing or unknown, a value is out of its range, the load is not of the transmission's kind.
+    """
+    tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
+    actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
+    kind = tables["transmission"].text("kind", choices=tuple(TRANSMISSIONS))
+    transmission: Transmission = read_kind(tables["transmission"], TRANSMISSIONS, Path())
+    motion = tables["load"].text("kind", choices=tuple(LOADS))
+    if motion != _MOTIONS[kind]:
+        raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
+    load: Load = read_kind(tables["load"], LOADS, Path())
+    controller = tables["controller"].renamed(controller_keys(actuator.unit, motion))
+    law: Controller = read(controller, Controller)
+    controller.done()
+    sensors: Sensors = part(table, "sensors", Sensors)
+    table.done()
+    return Parts(actuator, transmission, load, law, sensors)
+
+
+def controller_keys(unit: str, motion: str) -> Mapping[str, str]:
+    """Keys of the controller's table in the units of an axis, and those of a voltage and a position in metres.
+
+    Parameters
+    ----------
+    unit : str
+        Unit of the actuator's command.
+    motion : str
+        Of the load.
+    """
+    command, word = _COMMANDS[unit]
+    position = "m" if motion == LINEAR else "rad"
+    names = {}
+    for name in _keys_with_units():
+        suffix = _suffix(name)
+        renamed = {"v": command, "m": position}
+        units = "_".join(renamed.get(each, each) for each in suffix.split("_"))
+        names[name.removesuffix(suffix).replace("voltage", word) + units] = name
+    return names
+
+
+def _keys_with_units() -> list[str]:
+    """Keys of a controller whose units contain volts or metres."""
+    names = [item.exact_name for item in items_of(Controller)]
+    return [name for name in names if {"v", "m"} & set(_suffix(name).split("_"))]
+
+
+def _suffix(name: str) -> str:
+    """The end of a key that is its unit, empty for none."""
+    unit = unit_of(name)
+    words = name.split("_")
+    ends = ("_".join(words[i:]) for i in range(1, len(words)))
+    return next((end for end in ends if unit_of(f"x_{end}") == unit and unit.name), "")
+
+
+def values_of_parts(axis: Parts) -> Values:
+    """The tables of an axis's file, which `read_parts` reads back to equal parts."""
+    motion = axis.load.motion
+    kind = next(kind for kind, moves in _MOTIONS.items() if moves == motion)
+    actuator = next(name for name, maker in ACTUATORS.items() if isinstance(axis.actuator, maker))
+    keys = {name: shown for shown, name in controller_keys(axis.actuator.unit, motion).items()}
+    controller = {keys.get(name, name): value for name, value in values_of(axis.controller).items()}
+    return {
+        "actuator": {"kind": actuator, **values_of(axis.actuator)},
+        "transmission": {"kind": kind, **_transmission_values(axis.transmission, kind)},
+        "load": {"kind": motion, **values_of(axis.load, LOADS[motion])},
+        "sensors": {_sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
+        "controller": controller,
+    }
+
+
+def _sensor_key(name: str, motion: str) -> str:
+    return "position_resolution_rad" if motion == ROTARY and name == "position_resolution_m" else name
+
+
+def _transmission_values(transmission: Transmission, kind: str) -> Values:
+    if kind == "screw":
+        return values_of(transmission, screw)
+    near = 1.0 / transmission.p
+    close = (near, math.nextafter(near, math.inf), math.nextafter(near, 0.0))
+    ratio = next((each for each in close if 1.0 / each == transmission.p), near)
+    names = ("k_d", "c_d", "in_gap")
+    return {"ratio": ratio, **values_of(transmission, gear, only=names)}

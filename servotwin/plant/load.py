@@ -1,0 +1,94 @@
+"""Load of an axis: a chain of masses or inertias, on the ground or free."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.signals import Array
+
+LINEAR, ROTARY = "linear", "rotary"
+_UNITS = {LINEAR: ("kg", "N/m", "N s/m", "N"), ROTARY: ("kg m^2", "N m/rad", "N m s/rad", "N m")}
+
+
+@dataclass(frozen=True)
+class Load:
+    """Masses on springs and dampers, from the transmission outwards; the last one's position is controlled.
+
+    Parameters
+    ----------
+    m : tuple of float
+        n masses, kg; of a rotary load inertias, kg m^2.
+    k, c : tuple of float
+        n stiffnesses and dampings, N/m and N s/m (rotary: N m/rad and N m s/rad). The first of each is between the
+        first mass and the ground (0: a free load, and one without viscous friction), the others between a mass and the
+        one before it.
+    motion : {"linear", "rotary"}
+    friction : float
+        Coulomb friction on the last mass, N (rotary: N m).
+    force : float
+        Constant force on the last mass, gravity for one, N (rotary: N m); positive pushes forwards.
+
+    Raises
+    ------
+    InvalidInput
+        A value out of its range, or numbers of values that differ.
+    """
+
+    m: tuple[float, ...]
+    k: tuple[float, ...] = (0.0,)
+    c: tuple[float, ...] = (0.0,)
+    motion: str = LINEAR
+    friction: float = 0.0
+    force: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.motion not in _UNITS:
+            raise InvalidInput(f'load motion = {self.motion!r}: must be "linear" or "rotary"')
+        for name, unit in zip(("m", "k", "c"), _UNITS[self.motion], strict=False):
+            values = tuple(float(value) for value in getattr(self, name))
+            object.__setattr__(self, name, values)
+            if len(values) != len(self.m) or not values:
+                raise InvalidInput(f"load {name} = {values}: must have one value for each of the {len(self.m)} masses")
+            for i, value in enumerate(values):
+                least = "positive" if self._positive(name, i) else "0 or more"
+                if not (math.isfinite(value) and (value > 0.0 if least == "positive" else value >= 0.0)):
+                    raise InvalidInput(f"load {name}[{i}] = {value!r} {unit}: must be finite and {least}")
+
+        unit = _UNITS[self.motion][3]
+        if not (math.isfinite(self.friction) and self.friction >= 0.0):
+            raise InvalidInput(f"load friction = {self.friction!r} {unit}: must be finite and 0 or more")
+        if not math.isfinite(self.force):
+            raise InvalidInput(f"load force = {self.force!r} {unit}: must be finite")
+
+    @staticmethod
+    def _positive(name: str, place: int) -> bool:
+        return name == "m" or (name == "k" and place > 0)
+
+    @property
+    def n(self) -> int:
+        """Number of masses."""
+        return len(self.m)
+
+    @property
+    def free(self) -> bool:
+        """True where no spring holds the load to the ground."""
+        return self.k[0] == 0.0
+
+    @property
+    def masses(self) -> Array:
+        """(n,) kg or kg m^2."""
+        return np.array(self.m)
+
+    @property
+    def stiffnesses(self) -> Array:
+        """(n,) N/m or N m/rad."""
+        return np.array(self.k)
+
+    @property
+    def dampings(self) -> Array:
+        """(n,) N s/m or N m s/rad."""
+        return np.array(self.c)

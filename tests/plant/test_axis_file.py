@@ -1,0 +1,69 @@
+"""Files and presets of axes."""
+
+from pathlib import Path
+
+import pytest
+
+import servotwin as st
+from servotwin.errors import InvalidInput
+from servotwin.plant.axis import AXES, Axis, resolve_plant
+
+BALL_SCREW = Axis.preset("ball-screw")
+TEXT = BALL_SCREW.dumps()
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_a_preset_is_stable_and_reads_back_as_it_was_written(name: str) -> None:
+    axis = Axis.preset(name)
+    again = Axis.loads(axis.dumps(), "again.toml")
+    assert again == axis
+    assert again.version == axis.version
+    margins = axis.margins()
+    assert margins.stable
+    assert margins.Ms < 2.0
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_every_number_of_a_preset_has_a_source_or_is_called_assumed(name: str) -> None:
+    """The head of the file says where its numbers are from."""
+    folder = Path(st.__path__[0]) / "plant" / "shelf"
+    head = (folder / f"{name}.toml").read_text(encoding="utf-8").split("[actuator]")[0]
+    assert head.startswith(f"# {name}: ")
+    assert "assumed" in head
+
+
+def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
+    (tmp_path / "axis.toml").write_text(TEXT, encoding="utf-8")
+    (tmp_path / "servo.toml").write_text(st.Servo.preset("table1").dumps(), encoding="utf-8")
+    assert resolve_plant("axis.toml", tmp_path) == BALL_SCREW
+    assert resolve_plant("servo.toml", tmp_path) == st.Servo.preset("table1")
+    assert resolve_plant("gantry") == Axis.preset("gantry")
+    assert resolve_plant("paper") == st.Servo.preset("paper")
+    with pytest.raises(InvalidInput, match=r"preset 'gantri' does not exist \(did you mean 'gantry'\?\)"):
+        resolve_plant("gantri", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('kind = "torque"', 'kind = "torqe"', r"axis.toml: actuator.kind = 'torqe' .*did you mean 'torque'"),
+        ("inertia_kg_m2 = 0.00012", "inertia_kg_m2 = -1.0", "inertia_kg_m2 = -1.0 is not allowed; give a positive"),
+        ("pitch_m_per_rad", "pitch_mm_per_rad", "transmission.pitch_m_per_rad' is missing"),
+        ("mass_kg = [20.0]", "mass_kg = [20.0, 0.0]", r"load.mass_kg\[1\] = 0.0 is not allowed"),
+        ("mass_kg = [20.0]", "mass_kg = [20.0, 3.0]", r"load k = \(0.0,\): must have one value for each"),
+        ('kind = "linear"', 'kind = "rotary"', 'rotary\' is not allowed; give "linear", for the transmission'),
+        ("kp_n_m_per_m", "kp_v_per_m", r"controller.kp_v_per_m'; here its name is 'controller.kp_n_m_per_m'"),
+        ("kp_n_m_per_m = 1500.0", "kp_n_m_per_m = nan", "controller.kp_n_m_per_m = nan is not allowed"),
+        ("kp_n_m_per_m = 1500.0", "kp_n_m_per_m = -1500.0", r"Kp = -1500 N m/m, .* unstable on this axis"),
+        ("torque_limit_n_m", "torque_limt_n_m", "controller.torque_limt_n_m.*did you mean 'torque_limit_n_m'"),
+        ('feedback = "load"', 'feedback = "screw"', "feedback = 'screw' is not allowed; give one of load, motor"),
+        ("[load]", "[lod]", r"table \[load\] is missing"),
+        ("stiffness_n_per_m = 50000000.0", "stiffness_n_per_m = inf", "needs a finite stiffness k_d"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_is_refused_in_a_sentence(old: str, new: str, words: str) -> None:
+    assert old in TEXT
+    with pytest.raises(InvalidInput, match=words) as error:
+        Axis.loads(TEXT.replace(old, new, 1), "axis.toml")
+    assert str(error.value).startswith("axis.toml")
+    assert "\n" not in str(error.value)

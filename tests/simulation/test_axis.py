@@ -1,0 +1,180 @@
+"""Axes of every actuator and transmission against scipy's integrator, written anew from the equations."""
+
+import math
+
+import numpy as np
+import pytest
+from axis_oracle import positions
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.plant.actuator import DcMotor, Stepper, TorqueDrive, VelocityDrive
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
+from servotwin.plant.sensors import Sensors
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.plant.transmission import Transmission
+from servotwin.simulation import simulate
+
+SCREW = Transmission(1e-3 / math.pi)
+TWO_MASS = Axis(
+    TorqueDrive(J=0.4, lag=1e-3, friction=0.05),
+    Transmission(p=1.0, k_d=3300.0, c_d=2.0, in_gap="free"),
+    Load((5.6,), (0.0,), (0.3,), "rotary"),
+    Controller(Kp=60.0, Ki=20.0, Kd=40.0, Tf=0.01),
+)
+UNDAMPED = Transmission(p=0.5, k_d=330.0, in_gap="free")
+SOFT = Controller(Kp=4.0, Ki=0.2, Kd=3.0, Tf=0.05)
+PAPER = Servo.preset("paper")
+ON_SCREW = Load((5.2,) * 3, (1e4,) * 3, (36.9,) * 3)
+ELASTIC = Transmission(1e-3 / math.pi, 1e5, 150.0, "free")
+
+
+def undamped(stiffness: float) -> Axis:
+    """Two masses on a shaft without damping, the second free or on the ground."""
+    load, sensors = Load((5.6,), (stiffness,), (9.0,), "rotary"), Sensors(feedback="motor")
+    return TWO_MASS.replace(transmission=UNDAMPED, controller=SOFT, load=load, sensors=sensors)
+
+
+# Axis, amplitude (m or rad) and gap (rad).
+AXES = {
+    "two masses": (TWO_MASS, 0.2, 0.03),
+    "two masses, motor's encoder": (TWO_MASS.replace(sensors=Sensors(feedback="motor")), 0.2, 0.03),
+    "undamped shaft": (undamped(0.0), 0.2, 0.1),
+    "undamped shaft, load on the ground": (undamped(2.0), 0.2, 0.1),
+    "free in the gap, two masses of load": (
+        TWO_MASS.replace(load=Load((3.0, 2.6), (0.0, 9e4), (0.3, 90.0), "rotary"), controller=SOFT),
+        0.2,
+        0.03,
+    ),
+    "friction of motor and load, gravity": (
+        TWO_MASS.replace(
+            actuator=TorqueDrive(J=0.4, lag=1e-3, friction=0.05, coulomb=0.2),
+            load=Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.8, force=-0.3),
+            controller=SOFT,
+        ),
+        0.2,
+        0.03,
+    ),
+    "friction of the second mass": (
+        Axis(
+            DcMotor(5e-6, 12.0, 0.8, 0.1, 1e-3, coulomb=0.01),
+            SCREW,
+            Load((5.2,) * 2, (1e4,) * 2, (36.9,) * 2, friction=3.0, force=1.0),
+            Controller(300.0, 900.0, 0.0, 0.1),
+        ),
+        1e-3,
+        0.3,
+    ),
+    "DC motor without inductance": (
+        Axis(DcMotor(5e-6, 12.0, 0.8, 0.1), SCREW, ON_SCREW, PAPER.controller),
+        1e-3,
+        0.3,
+    ),
+    "DC motor, elastic shaft": (
+        Axis(
+            DcMotor(5e-6, 12.0, 0.8, 0.1, 1e-3, 1e-4),
+            ELASTIC,
+            Load((5.2,) * 2, (0.0, 1e4), (9.0, 36.9)),
+            Controller(300.0, 900.0, 0.0, 0.1),
+        ),
+        1e-3,
+        0.3,
+    ),
+    "velocity drive, one mass": (
+        Axis(VelocityDrive(5e-3), SCREW, Load((20.0,)), Controller(3e4, 1e4, 0.0, 0.1)),
+        1e-3,
+        0.3,
+    ),
+    "stepper": (
+        Axis(Stepper(2e-2), SCREW, Load((5.2, 5.2), (0.0, 1e4), (0.0, 36.9)), Controller(200.0, 1e4, 0.0, 0.1)),
+        1e-3,
+        0.3,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_an_axis_agrees_with_an_independent_integrator(name: str) -> None:
+    axis, amplitude, gap = AXES[name]
+    axis.check_loop()
+    run = simulate(axis, 8.0, reference=SquareWave(amplitude, 8.0), gap=gap, sample_rate=100.0)
+    expected, changes = positions(axis, gap, amplitude, 4.0, run.time[:-1])
+    assert np.abs(run.position[:-1] - expected).max() < 1e-8 * amplitude
+    events = run.events[np.isin(run.events.kind, ("contact", "release"))].time
+    assert len(changes) >= 3
+    assert events == pytest.approx(changes, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_a_sampled_law_tends_to_the_continuous_one(name: str) -> None:
+    axis, amplitude, gap = AXES[name]
+
+    def position(law: Controller) -> np.ndarray:
+        run = simulate(axis, 2.0, controller=law, reference=SquareWave(amplitude, 8.0), gap=gap, sample_rate=100.0)
+        return run.position
+
+    exact = position(axis.controller)
+    errors = [np.abs(position(axis.controller.replace(sample_rate=rate)) - exact).max() for rate in (2e4, 1e5)]
+    assert errors[1] < 0.3 * errors[0] < 0.02 * amplitude
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_polynomials_and_states_are_one_system(name: str) -> None:
+    plant, omega = AXES[name][0].plant(), np.geomspace(0.1, 300.0, 40)
+    by_states = plant._response_of_states(1j * omega)
+    assert plant.response(omega) == pytest.approx(by_states, rel=1e-7)
+
+
+def test_the_paper_s_servo_is_one_combination() -> None:
+    """Bit for bit: its automaton has the same numbers."""
+    parts = Axis(
+        DcMotor(PAPER.J, PAPER.R, PAPER.k_T, PAPER.k_B, PAPER.L),
+        Transmission(PAPER.p),
+        Load(tuple(PAPER.masses), tuple(PAPER.stiffnesses), tuple(PAPER.dampings)),
+        PAPER.controller,
+    )
+    runs = [simulate(each, 20.0, reference=1e-3, gap=0.2, tolerance=1e-5) for each in (PAPER, parts)]
+    assert np.array_equal(runs[0].position, runs[1].position)
+    assert np.array_equal(runs[0].events, runs[1].events)
+    assert parts.margins() == PAPER.margins()
+
+
+def test_integral_action_swings_in_the_gap_and_rests_without() -> None:
+    """The limit cycle of two inertias, which a driven end that is held in the gap hides."""
+    axis = TWO_MASS.replace(
+        actuator=TorqueDrive(0.4, 1e-3, 2.0),
+        transmission=Transmission(1.0, 3300.0, in_gap="free"),
+        load=Load((5.6,), (0.0,), (6.0,), "rotary"),
+        controller=Controller(20.0, 10.0, 20.0, 0.02),
+    )
+    swings = [
+        np.ptp(simulate(axis, 60.0, reference=0.1, gap=gap, sample_rate=200.0).position[-4000:])
+        for gap in (0.0, math.radians(0.1), math.radians(0.2))
+    ]
+    assert swings[0] < 1e-6
+    assert swings[2] > 1e-4
+    # A limit cycle is as large as the gap.
+    assert swings[2] == pytest.approx(2.0 * swings[1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Transmission(0.0), "transmission p = 0.0: must be positive and finite"),
+        (lambda: Transmission(1.0, in_gap="free"), "needs a finite stiffness"),
+        (lambda: Transmission(1.0, 1e3, 1.0), 'only a transmission that is "free"'),
+        (lambda: Load((-1.0,)), r"load m\[0\] = -1.0 kg: must be finite and positive"),
+        (lambda: Load((1.0, 2.0), (0.0, 0.0), (0.0, 0.0)), r"load k\[1\] = 0.0 N/m: must be finite and positive"),
+        (lambda: Load((1.0, 2.0)), "must have one value for each of the 2 masses"),
+        (lambda: TorqueDrive(J=0.0), "actuator J = 0.0 kg m\\^2"),
+        (lambda: Sensors(feedback="screw"), "sensors feedback = 'screw': must be one of load, motor"),
+        (lambda: TWO_MASS.replace(gearbox=1), "axis has no part named 'gearbox'"),
+        (lambda: TWO_MASS.replace(load=None), "axis load = None: must be a Load"),
+        (lambda: TWO_MASS.check_loop(Controller(-60.0, 0.0, 0.0, 0.1)), "unstable on this axis"),
+    ],
+)
+def test_refusals_are_one_sentence(make: object, words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        make()  # type: ignore[operator]
