@@ -20,7 +20,7 @@ from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 
@@ -103,7 +103,7 @@ def gap_maker(table: Table) -> Maker:
     return constant_gap if "total_deg" in table.values or not table.values else growing_gap
 
 
-def read_parts(table: Table, folder: Path, servo: Servo) -> dict[str, Any]:
+def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     """Read the values of a `Scenario` that depend on its servo or on one another.
 
     Raises

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from servotwin.control.controller import Controller
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,
@@ -63,7 +63,7 @@ class Trial:
         return self.duration / _LENGTH if self.period is None else self.period
 
 
-def trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Trial:
+def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
     """Trial that a servo needs: long enough for its slowest mode, sampled fast enough for its fastest motion.
 
     Raises
@@ -75,7 +75,7 @@ def trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Trial
 
 
 @lru_cache(maxsize=16)
-def _trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Trial:
+def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
     laws = laws_within(servo, uncertainty, demands, (0.0,))
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
