@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks.contest import Contestant
 from benchmarks.workloads import NoisyWorkload, SweepWorkload, WearWorkload
+from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.continuous import ContinuousEngine
@@ -142,6 +143,7 @@ def comparable(workload: SweepWorkload) -> NDArray[np.bool_]:
 
 
 def _refined(simulation: Simulation) -> Array:
+    assert isinstance(simulation.controller, Controller)
     engine = ContinuousEngine(simulation.servo, simulation.controller, simulation.inputs, refine=REFINED)
     engine.advance(simulation.samples - 1)
     return engine.channel("position", 0, simulation.samples)

@@ -12,6 +12,7 @@ from servotwin.analysis.maps.settings import MapSettings
 from servotwin.analysis.tuning.tune import Specification, Tuning
 from servotwin.analysis.tuning.tune import tune as tune_system
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Plant
 from servotwin.plant.linear import LinearSystem, series
@@ -63,13 +64,14 @@ def tune(
             f" math.radians({phase_margin:g})?"
         )
     specification = Specification(crossover, phase_margin, kind, Ms_max, prefer)
-    law = servo.controller.replace(sample_rate=None)
+    law = filtered_pid(servo.controller).replace(sample_rate=None)
     return tune_system(tuned_system(servo), specification, delay, law)
 
 
 def tuned_system(servo: Plant) -> LinearSystem:
     """System that `tune` closes the loop around: the plant with the controller's loop filter and notch in series."""
-    return series(series(servo.plant(), loop_filter(servo.controller)), notch(servo.controller))
+    law = filtered_pid(servo.controller)
+    return series(series(servo.plant(), loop_filter(law)), notch(law))
 
 
 def stability_map(

@@ -13,6 +13,7 @@ from rich.table import Table
 from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import resolve_plant
@@ -62,8 +63,9 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
         print(json.dumps(as_dict(tuning, overshoots), indent=2))
         return
     console = Console()
-    present = evaluate(tuned_system(servo), servo.controller, delay)
-    _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (servo.controller, present)})
+    own = filtered_pid(servo.controller)
+    present = evaluate(tuned_system(servo), own, delay)
+    _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (own, present)})
     angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))
     console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)

@@ -167,7 +167,7 @@ def start_of(fallback: FallbackSet) -> Parameters:
 
 def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
-    own, demands = policy.servo.controller, policy.demands_within_band()
+    own, demands = policy.servo.pidf, policy.demands_within_band()
     laws = _candidates(policy, demands)
     ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
     middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
@@ -206,7 +206,7 @@ def _range(values: list[float]) -> tuple[float, float]:
 
 def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
-    own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
+    own = policy.servo.pidf.replace(enter=policy.enter, leave=policy.leave)
     patience = PATIENCE * scales(policy.servo).time
     limits = Limits(
         gain_factor=_ROUNDING,
@@ -260,7 +260,7 @@ class Commissioning:
     @property
     def start(self) -> Parameters:
         """Parameters before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
-        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
+        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.pidf)
         if self.twin.policy == "certified":
             fallback = guarded.supervision.fallback if guarded is not None and own else None
             return Parameters() if fallback is None else start_of(fallback)
@@ -335,7 +335,7 @@ class Commissioning:
             No fallback set is verified for the whole stated range.
         """
         agent = dataclasses.replace(self.recorder_settings(servo, boot), parameters=self.start)
-        own, guarded = gains_of(self.servo.controller), self.guarding
+        own, guarded = gains_of(self.servo.pidf), self.guarding
         if guarded is not None:
             open_limits = self.recording.limits == Limits()
             return dataclasses.replace(

@@ -167,14 +167,14 @@ class Scenario:
         """Copy with another servo and its controller, changed as this scenario changes its servo's controller."""
         if self.controller is None:
             return self.replace(servo=servo)
-        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.controller)
+        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.pidf)
         changes = {name: value for name, value in own.items() if value != default[name]}
-        return self.replace(servo=servo, controller=servo.controller.replace(**changes))
+        return self.replace(servo=servo, controller=servo.pidf.replace(**changes))
 
     @property
     def law(self) -> Controller:
         """The controller that runs."""
-        return self.servo.controller if self.controller is None else self.controller
+        return self.servo.pidf if self.controller is None else self.controller
 
     @property
     def model(self) -> Plant:

@@ -111,11 +111,11 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    controller = read_inner(table, CONTROLLER, lambda inner: _changed(inner, servo.controller))
+    controller = read_inner(table, CONTROLLER, lambda inner: _changed(inner, servo.pidf))
     edge = table.table(EDGE)
     edge.known(PROBE)
     probe = part(edge, PROBE, ProbeLimits) if PROBE in edge.values else None
-    supervision = _supervision(edge, controller or servo.controller)
+    supervision = _supervision(edge, controller or servo.pidf)
     edge.done()
     novelty = part(table, NOVELTY, NoveltyRules) if NOVELTY in table.values else None
     link = table.table(LINK)

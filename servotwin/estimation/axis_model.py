@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import lru_cache
 
+from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis, Plant
@@ -50,7 +51,8 @@ def servo_of(axis: Axis) -> Servo:
     if isinstance(motor, DcMotor):
         J, R, k_T, k_B, L = motor.J, motor.R, motor.k_T, motor.k_B, motor.L or 1.0
     return Servo(
-        m=load.m, k=springs, c=load.c, J=J, p=axis.p, L=L, R=R, k_T=k_T, k_B=k_B, controller=axis.controller, n=load.n,
+        m=load.m, k=springs, c=load.c, J=J, p=axis.p, L=L, R=R, k_T=k_T, k_B=k_B, n=load.n,
+        controller=_filtered_pid(axis),
         k_d=axis.transmission.k_d, encoder_resolution=axis.encoder_resolution,
         position_resolution=axis.sensors.position_resolution,
     )  # fmt: skip
@@ -70,4 +72,10 @@ def _loop_gain(axis: Axis) -> float:
     """Back EMF (V s/rad) with which a servo's loop is as fast as the axis's: Kp p over the crossover."""
     crossovers = axis.margins().gain_crossovers
     crossover = crossovers[0].omega if crossovers else 1.0
-    return abs(axis.controller.Kp) * axis.p / crossover or 1.0
+    return abs(_filtered_pid(axis).Kp) * axis.p / crossover or 1.0
+
+
+def _filtered_pid(axis: Axis) -> Controller:
+    """The axis's controller; for a linear law a proportional one, whose gain the loop gain makes as fast."""
+    law = axis.controller
+    return law if isinstance(law, Controller) else Controller(1.0 / axis.p, 0.0, 0.0, 1.0)

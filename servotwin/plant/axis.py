@@ -7,7 +7,7 @@ import hashlib
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
@@ -18,11 +18,14 @@ import numpy as np
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
 from servotwin.control.controller import Controller, ControllerChanges
+from servotwin.control.laws import Law, filtered_pid
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
 from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
-from servotwin.plant.basis import Guide, Play
+from servotwin.plant.basis import Guide, PlantNumbers, Play
+from servotwin.plant.law_loop import LawLoop
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
@@ -50,7 +53,7 @@ class AxisChanges(ControllerChanges, total=False):
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Controller
+    controller: Law
     sensors: Sensors
 
 
@@ -58,7 +61,7 @@ _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
     "load": (Load,),
-    "controller": (Controller,),
+    "controller": (Controller, LinearLaw),
     "sensors": (Sensors,),
 }
 
@@ -72,9 +75,9 @@ class Axis:
     actuator : DcMotor, TorqueDrive, VelocityDrive or Stepper
     transmission : Transmission
     load : Load
-    controller : Controller
-        Runs when none is given. Its gains give the actuator's command (V, N m, rad/s or rad) per m, or per rad of a
-        rotary load.
+    controller : Controller or LinearLaw
+        Runs when none is given. The gains of a Controller give the actuator's command (V, N m, rad/s or rad) per
+        m, or per rad of a rotary load.
     sensors : Sensors, optional
         Ideal by default.
 
@@ -87,7 +90,7 @@ class Axis:
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Controller
+    controller: Law
     sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
@@ -142,7 +145,15 @@ class Axis:
             return axis
 
     def dumps(self) -> str:
-        """The axis as TOML that `from_file` reads back to an equal axis."""
+        """The axis as TOML that `from_file` reads back to an equal axis.
+
+        Raises
+        ------
+        InvalidInput
+            Its controller is a linear law.
+        """
+        if not isinstance(self.controller, Controller):
+            raise InvalidInput(f"axis controller = {self.controller!r}: a file of an axis holds a Controller only")
         parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
         return dumps(values_of_parts(parts))
 
@@ -293,6 +304,17 @@ class Axis:
         return dataclasses.replace(self, actuator=actuator, load=scaled_load, transmission=scaled_screw)
 
     @property
+    def pidf(self) -> Controller:
+        """The controller, where it is a filtered PID.
+
+        Raises
+        ------
+        InvalidInput
+            It is a linear law.
+        """
+        return filtered_pid(self.controller)
+
+    @property
     def command_per_speed(self) -> float:
         """Command of a constant speed of the motor, per rad/s."""
         shaft = self.actuator.polynomials()
@@ -335,19 +357,31 @@ class Axis:
         shaft = self.actuator.polynomials()
         return loop.axis_system(self.shaft(), shaft, self._structure, self.p, self.at_motor)
 
-    def loop(self, controller: Controller | None = None) -> LinearSystem:
-        """Open loop of controller and plant in continuous time, without a gap."""
-        return loop.open_loop(self.plant(), controller or self.controller)
+    def _law_loop(self, law: LinearLaw) -> LawLoop:
+        check_encoders(self, law)
+        shaft, polynomials = self.shaft(), self.actuator.polynomials()
+        load = loop.axis_system(shaft, polynomials, self._structure, self.p, at_motor=False)
+        motor = replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1])
+        return LawLoop(motor, load, law)
 
-    def closed_loop(self, controller: Controller | None = None) -> LinearSystem:
+    def loop(self, controller: Law | None = None) -> LinearSystem:
+        """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""
+        law = controller or self.controller
+        return self._law_loop(law).open() if isinstance(law, LinearLaw) else loop.open_loop(self.plant(), law)
+
+    def closed_loop(self, controller: Law | None = None) -> LinearSystem:
         """Reference to the measured position in continuous time, without a gap."""
-        return loop.closed_loop(self.plant(), controller or self.controller)
+        law = controller or self.controller
+        return self._law_loop(law).closed() if isinstance(law, LinearLaw) else loop.closed_loop(self.plant(), law)
 
-    def margins(self, controller: Controller | None = None) -> Margins:
+    def margins(self, controller: Law | None = None) -> Margins:
         """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
+        law = controller or self.controller
+        if isinstance(law, LinearLaw):
+            return self._law_loop(law).margins()
         return margins(self.loop(controller), self.closed_loop(controller))
 
-    def check_loop(self, controller: Controller | None = None) -> None:
+    def check_loop(self, controller: Law | None = None) -> None:
         """Refuse a controller that does not stabilise the axis even without a gap, at its sample rate if it has one.
 
         Raises
@@ -355,12 +389,30 @@ class Axis:
         InvalidInput
             With the fastest growing pole.
         """
-        position = "m" if self.load.motion == LINEAR else "rad"
-        loop.check_stable(self.plant(), controller or self.controller, "axis", self.actuator.unit, position)
+        law = controller or self.controller
+        if isinstance(law, LinearLaw):
+            self._law_loop(law).check("axis")
+        else:
+            position = "m" if self.load.motion == LINEAR else "rad"
+            loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)
 
 
 Plant: TypeAlias = Servo | Axis
 """A machine that can be simulated: the paper's servo, or an axis made of parts."""
+
+
+def check_encoders(plant: PlantNumbers, law: Law) -> None:
+    """Refuse a linear law that reads an encoder which the plant's controller does not have.
+
+    Raises
+    ------
+    InvalidInput
+        The law reads the load, and the controller acts on the motor's encoder.
+    """
+    if isinstance(law, LinearLaw) and plant.at_motor and law.reads("y_load"):
+        raise InvalidInput(
+            'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be "load"'
+        )
 
 
 def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:

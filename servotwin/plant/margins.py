@@ -147,9 +147,12 @@ def peak(system: LinearSystem) -> tuple[float, float]:
     return max(largest, (math.inf, abs(system.D)), key=lambda p: p[1])
 
 
-def search_frequencies(*systems: LinearSystem) -> Array:
-    """(N,) rad/s, ascending: frequencies that resolve every pole and zero and reach beyond the outermost crossings."""
+def search_frequencies(*systems: LinearSystem, also: Complex | None = None) -> Array:
+    """(N,) rad/s, ascending: frequencies that resolve every pole and zero, of the systems and `also` given (1/s), and
+    reach beyond the outermost crossings."""
     corners = np.concatenate([np.concatenate([system.poles(), system.zeros()]) for system in systems])
+    if also is not None:
+        corners = np.concatenate([corners, also])
     corners = corners[np.isfinite(corners) & (np.abs(corners) > 0.0)]
     # A loop may cross over far beyond all its corners, where it is its asymptote.
     sizes = np.concatenate([np.abs(corners), *(system.asymptotic_crossovers() for system in systems)])

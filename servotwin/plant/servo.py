@@ -254,6 +254,11 @@ class Servo:
         return copy
 
     @property
+    def pidf(self) -> Controller:
+        """The controller."""
+        return self.controller
+
+    @property
     def command_per_speed(self) -> float:
         """Voltage of a constant speed of the motor, V s/rad: the back EMF."""
         return self.k_B

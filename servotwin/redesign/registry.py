@@ -73,7 +73,7 @@ def _certified(servo: Plant, options: PolicyOptions) -> Policy:
 
 
 def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
-    if servo.controller.voltage_limit is not None:
+    if servo.pidf.voltage_limit is not None:
         raise InvalidInput(
             "policy 'margin' reads its dead zone from a map that serves every gap, which no map does for a controller "
             "with a voltage limit, and this one has one: give another policy"

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -69,13 +70,16 @@ class SampledEngine:
         self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
-        self.law_state = law.start(float(self.plant.rows["sensed"][0] @ self.state))
-        self.parameters = self.controller.law(None)
+        self.law_state, self.parameters = self._started()
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
+
+    def _started(self) -> tuple[Any, Any]:
+        """State of the law at rest, and its parameters, of the kind that this engine's ticks take."""
+        return law.start(float(self.plant.rows["sensed"][0] @ self.state)), self.controller.law(None)
 
     def _make_port(self, searches: int) -> Port:
         names = self.plant.automaton.names
@@ -289,9 +293,13 @@ class SampledEngine:
         ticks = np.arange(first, last) * self.record_every // self.tick_every
         out = self.output.measured[ticks - self.output.first_tick]
         if last > self.index and not self.finished:
-            present = self.channel("sensed", self.index, self.index + 1)
-            out[-1] = quantised(present, self.servo.position_resolution)[0]
+            out[-1] = self._measured_now()
         return out
+
+    def _measured_now(self) -> float:
+        """Measurement of the present state, without noise."""
+        present = self.channel("sensed", self.index, self.index + 1)
+        return float(quantised(present, self.servo.position_resolution)[0])
 
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Events of the plant and of the ticks, in time order."""

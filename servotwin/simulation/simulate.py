@@ -3,14 +3,16 @@ the exact plant)."""
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from servotwin.control.controller import Controller
+from servotwin.control.laws import Law
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant
+from servotwin.plant.axis import Plant, check_encoders
 from servotwin.plant.noise import Noise
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
@@ -19,6 +21,7 @@ from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.run import Run
 from servotwin.simulation.sampled import SampledEngine
+from servotwin.simulation.sampled_law import SampledLawEngine
 
 SAMPLE_RATE = 5000.0
 
@@ -31,7 +34,7 @@ class Engine(Protocol):
     def advance(self, index: int) -> None: ...
     def set_tolerance(self, tolerance: float) -> None: ...
     def set_reference(self, reference: PiecewiseCubic) -> None: ...
-    def set_controller(self, controller: Controller, tolerance: float | None) -> None: ...
+    def set_controller(self, controller: Any, tolerance: float | None) -> None: ...
     def channel(self, name: str, first: int, last: int) -> Array: ...
     def events(self) -> list[tuple[float, str, int, bool]]: ...
 
@@ -44,7 +47,7 @@ class Simulation:
     servo : Servo or Axis
     duration : float
         s; the horizon up to which inputs are laid out.
-    controller : Controller, optional
+    controller : Controller or LinearLaw, optional
         The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
     reference : number or signal
         m.
@@ -79,7 +82,7 @@ class Simulation:
         self,
         servo: Plant,
         duration: float,
-        controller: Controller | None = None,
+        controller: Law | None = None,
         reference: SignalLike = 0.0,
         gap: SignalLike = 0.0,
         tolerance: SignalLike | None = None,
@@ -95,7 +98,8 @@ class Simulation:
         _check_times(duration, sample_rate)
         _check_disturbances(input_bias, friction)
         self.servo = servo
-        self.controller = servo.controller if controller is None else controller
+        self.controller: Law = servo.controller if controller is None else controller
+        check_encoders(servo, self.controller)
         self.samples = round(duration * sample_rate) + 1
         self.inputs = RunInputs(
             as_pieces(reference, duration),
@@ -109,16 +113,20 @@ class Simulation:
         rng = np.random.default_rng(seed)
         self.keep = keep
         self._check_keep()
-        self.engine: Engine
         if delay < 0 or (delay > 0 and self.controller.sample_rate is None):
             raise InvalidInput(f"delay = {delay!r} samples: must be 0 or more, and 0 for a continuous controller")
-        if self.controller.sample_rate is None:
-            source = None if noise is None else noise.source(sample_rate, rng)
-            self.engine = ContinuousEngine(servo, self.controller, self.inputs, theta_d0, noise=source)
-        else:
-            self.engine = SampledEngine(
-                servo, self.controller, self.inputs, theta_d0, self.samples, noise, rng, keep, delay
-            )
+        self.engine: Engine = self._made(theta_d0, noise, rng, delay)
+
+    def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
+        servo, law, inputs, samples, keep = self.servo, self.controller, self.inputs, self.samples, self.keep
+        if isinstance(law, LinearLaw) and law.sample_rate is None:
+            raise InvalidInput("law sample_rate = None: a simulation needs its rate in Hz")
+        if not isinstance(law, LinearLaw) and law.sample_rate is None:
+            source = None if noise is None else noise.source(inputs.sample_rate, rng)
+            return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)
+        if isinstance(law, LinearLaw):
+            return SampledLawEngine(servo, law, inputs, theta_d0, samples, noise, rng, keep, delay)
+        return SampledEngine(servo, law, inputs, theta_d0, samples, noise, rng, keep, delay)
 
     @property
     def index(self) -> int:
@@ -158,13 +166,13 @@ class Simulation:
         # Without an offset the reference stays as it is, bit for bit.
         self._follow(self._reference if offset == 0.0 else raised(self._reference, offset))
 
-    def set_controller(self, controller: Controller, tolerance: float | None = None) -> None:
+    def set_controller(self, controller: Law, tolerance: float | None = None) -> None:
         """Change the controller from the present sample on, without a jump of the voltage.
 
         Parameters
         ----------
-        controller : Controller
-            Continuous or sampled as the one before, at the same rate. Its difference to the voltage at this instant
+        controller : Controller or LinearLaw
+            Of the same kind as the one before, at the same rate. Its difference to the voltage at this instant
             becomes an offset that fades with its `release_time`; a voltage beyond its own limit is cut.
         tolerance : float, optional
             m, a new dead-zone half-width, which replaces the planned one; None keeps the planned one.
@@ -177,6 +185,10 @@ class Simulation:
         if controller.sample_rate != self.controller.sample_rate:
             rates = (_described(law.sample_rate) for law in (self.controller, controller))
             raise InvalidInput("controller sample_rate: a running simulation cannot go from {} to {}".format(*rates))
+        kinds = [type(law).__name__ for law in (self.controller, controller)]
+        if kinds[0] != kinds[1]:
+            raise InvalidInput("controller: a running simulation cannot go from a {} to a {}".format(*kinds))
+        check_encoders(self.servo, controller)
         if tolerance is not None:
             self._check_tolerance(tolerance)
         if controller == self.controller and tolerance is None:
@@ -243,7 +255,7 @@ def simulate(
     servo: Plant,
     duration: float,
     *,
-    controller: Controller | None = None,
+    controller: Law | None = None,
     reference: SignalLike = 0.0,
     gap: SignalLike = 0.0,
     tolerance: SignalLike | None = None,
@@ -261,7 +273,7 @@ def simulate(
     servo : Servo or Axis
     duration : float
         s.
-    controller : Controller, optional
+    controller : Controller or LinearLaw, optional
         The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
     reference : number or signal
         Reference of the position, m: a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic.
@@ -307,7 +319,9 @@ def _run_by_steps(simulation: Simulation) -> Run:
 
 def _run_plant_in_blocks(simulation: Simulation) -> Run | None:
     """The whole run with the plant in blocks and the law tick by tick; None where they do not fit or do not pay."""
-    if not (isinstance(simulation.engine, SampledEngine) and fits_plant_blocks(simulation.engine)):
+    if not isinstance(simulation.engine, SampledEngine) or isinstance(simulation.engine, SampledLawEngine):
+        return None
+    if not fits_plant_blocks(simulation.engine):
         return None
     engine = in_plant_blocks(simulation.engine)
     engine.advance(engine.samples - 1)
@@ -317,7 +331,7 @@ def _run_plant_in_blocks(simulation: Simulation) -> Run | None:
 def _run_in_blocks(simulation: Simulation, theta_d0: float) -> Run | None:
     """The whole run without noise in blocks of ticks; None where they do not fit or do not pay."""
     servo, law, inputs, samples = simulation.servo, simulation.controller, simulation.inputs, simulation.samples
-    if not advances_in_blocks(servo, law, inputs, samples):
+    if not isinstance(law, Controller) or not advances_in_blocks(servo, law, inputs, samples):
         return None
     engine = LiftedEngine(servo, law, inputs, theta_d0, samples)
     engine.advance(samples - 1)

@@ -97,7 +97,7 @@ class TwinModel:
             triage=None if settings.triage is None else Triage(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
-            controller=servo.controller,
+            controller=servo.pidf,
         )
 
     def initial_state(self, servo: str) -> TwinState:

@@ -170,10 +170,10 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is not a name of a model: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo: Plant = read(table, servo_table, folder)
-    law = read_inner(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
+    law = read_inner(table, "controller", lambda inner: servo.pidf.replace(**changes(inner, Controller)))
     settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder))
     servo.check_loop(law)
-    own = gains_of(law) == gains_of(servo.controller)
+    own = gains_of(law) == gains_of(servo.pidf)
     if checked:
         policy_of(servo.replace(controller=law), settings)
     return ServoModel(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))

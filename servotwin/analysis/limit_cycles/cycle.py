@@ -20,6 +20,7 @@ from servotwin.analysis.limit_cycles.orbit import ClosedOrbit, Orbit, closed_orb
 from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section, guard_events
 from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
 from servotwin.plant.axis import Plant
@@ -99,7 +100,7 @@ def limit_cycle(
     if not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
     loop = scaled_loop(servo, gap, tolerance, controller, step)
-    law = servo.controller if controller is None else controller
+    law = filtered_pid(servo.controller) if controller is None else controller
     if gap == 0.0 and not tolerance and law.voltage_limit is None:
         return _linear(servo, law)
     try:

@@ -15,6 +15,7 @@ from servotwin.analysis.limit_cycles.orbit import closed_orbit
 from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section
 from servotwin.analysis.limit_cycles.scaled import ScaledLoop, scaled_loop
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
@@ -78,7 +79,7 @@ def predictions(servo: Plant, gap: float, controller: Controller | None = None) 
         The screw is elastic (its load on the motor is no function of theta_d alone), the controller is sampled or
         saturates, or the gap is not a number above 0.
     """
-    law = servo.controller if controller is None else controller
+    law = filtered_pid(servo.controller) if controller is None else controller
     _check(servo, law, gap)
     loop = servo.loop(law)
     solutions = [omega for low, high in _bands(loop) for omega in _solutions(loop, low, high)]
@@ -207,7 +208,7 @@ def limit_cycle_near(
     CycleResult
         Status CYCLE or, when the prediction leads to no orbit, IRREGULAR with the reason.
     """
-    law = servo.controller if controller is None else controller
+    law = filtered_pid(servo.controller) if controller is None else controller
     # Only the scaling is used: this step is never simulated.
     loop = scaled_loop(servo, gap, None, law, step=gap * servo.p)
     start = crest(servo, loop, prediction, law) / loop.unit

@@ -13,6 +13,7 @@ import numpy as np
 
 from servotwin.analysis.limit_cycles.poincare import Flags, GuardId
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.automaton import ServoAutomaton
@@ -161,7 +162,7 @@ def scaled_loop(
     InvalidInput
         The controller is sampled or has a rate limit, or a number is outside its range.
     """
-    law = servo.controller if controller is None else controller
+    law = filtered_pid(servo.controller) if controller is None else controller
     if law.sample_rate is not None:
         rate = f"sample_rate = {law.sample_rate:g} Hz"
         raise InvalidInput(f"controller {rate}: limit cycles are those of the continuous law; give sample_rate = None")

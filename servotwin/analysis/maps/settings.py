@@ -11,6 +11,7 @@ from typing import Any
 from servotwin.analysis.limit_cycles.scaled import characteristic_time
 from servotwin.analysis.maps.axes import Axes, RatioAxes, as_lists, axis_names
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Plant
 from servotwin.plant.scales import scales
@@ -95,7 +96,7 @@ class MapSettings:
     @property
     def law(self) -> Controller:
         """The controller that runs."""
-        return self.servo.controller if self.controller is None else self.controller
+        return filtered_pid(self.servo.controller) if self.controller is None else self.controller
 
     @property
     def run_time(self) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 
 from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import resolve_plant
 
@@ -47,7 +48,7 @@ class MapOptions:
             An option is outside its range, or the two kinds of axes are mixed.
         """
         servo = resolve_plant(self.servo)
-        own = servo.controller
+        own = filtered_pid(servo.controller)
         enter = own.enter if self.enter is None else self.enter
         leave = own.leave if self.leave is None else self.leave
         law = own.replace(sample_rate=None, rate_limit=None, enter=enter, leave=leave)

@@ -89,10 +89,10 @@ class Question:
         law = setting.controller
         if not self.noise:
             return 0.0
-        begin, end = (edge / (2.0 * math.pi * self.servo.controller.Tf) for edge in _NOISE_BAND)
+        begin, end = (edge / (2.0 * math.pi * self.servo.pidf.Tf) for edge in _NOISE_BAND)
         end = end if law.sample_rate is None else 0.5 * law.sample_rate
         effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
-        authority = abs(self.servo.controller.Kp) * self.uncertainty.step[1]
+        authority = abs(self.servo.pidf.Kp) * self.uncertainty.step[1]
         return self.demands.effort_weight * self.trial.unit * effort / authority
 
 
@@ -198,7 +198,7 @@ class Attempt:
         beyond, servo, known = question.demands.beyond, question.servo, question.uncertainty
         if beyond.machines == 0:
             return None
-        force = servo.torque_of(beyond.friction * abs(servo.controller.Kp) * known.step[0])
+        force = servo.torque_of(beyond.friction * abs(servo.pidf.Kp) * known.step[0])
         force = max(known.friction[1], force) if servo.takes_friction else known.friction[1]
         wide = widened(known, question.demands)
         ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))

@@ -152,7 +152,7 @@ def _any_of(kinds: Sequence[Callable[[Design], bool]]) -> Callable[[Design], boo
 def known_bias(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> float:
     """V: an input bias up to this counts as known, since the error that it leaves is a small share of the smallest
     step."""
-    return demands.known * abs(servo.controller.Kp) * uncertainty.step[0]
+    return demands.known * abs(servo.pidf.Kp) * uncertainty.step[0]
 
 
 def is_disturbed(servo: Plant, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
@@ -208,7 +208,7 @@ def _without_zone(servo: Plant, within: tuple[Controller, ...], demands: Demands
 
 def _with_velocity(servo: Plant, law: Controller, demands: Demands) -> list[Controller]:
     """A law as it is, and with velocity feedforwards."""
-    needed, own = servo.command_per_speed / servo.p, abs(servo.controller.Kp)
+    needed, own = servo.command_per_speed / servo.p, abs(servo.pidf.Kp)
     shares = demands.velocity if demands.velocity_feedforward and own > 0.0 and needed > 0.0 else ()
     time = _VELOCITY_TIME * needed / own if shares else law.velocity_time
     return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
@@ -220,7 +220,7 @@ def _with_friction(servo: Plant, laws: list[Controller], friction: float, demand
     fed = min(float(servo.command_of(friction)), demands.friction_limit)
     if not demands.friction_feedforward or not fed:
         return []
-    fed = math.copysign(fed, servo.controller.Kp)
+    fed = math.copysign(fed, servo.pidf.Kp)
     return [law.replace(friction_feedforward=fed) for law in laws if not law.Ki]
 
 
@@ -247,7 +247,7 @@ def _ranked_in_stages(
     The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
     would otherwise take turns, whenever the evidence moves a little.
     """
-    own = _gains(question.servo.controller)
+    own = _gains(question.servo.pidf)
     plain = [setting for setting in candidates if not setting.controller.Ki]
     if plain and len(plain) < len(candidates):
         fed = _velocities(screening.ranked(plain), own)

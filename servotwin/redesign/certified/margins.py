@@ -111,9 +111,9 @@ def laws_within(
     InvalidInput
         There is none.
     """
-    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
-    delays = delays_of(servo.controller, uncertainty)
-    own = servo.controller
+    plants = plant_set(servo, uncertainty, servo.pidf.sample_rate)
+    delays = delays_of(servo.pidf, uncertainty)
+    own = servo.pidf
     notched = with_notch(servo) if demands.notch else None
     known: dict[Controller, bool] = {}
 
@@ -167,13 +167,13 @@ def with_notch(servo: Plant) -> Controller | None:
         return None
     first = complex(resonant[np.argmin(np.abs(resonant))])
     hertz, damping = abs(first) / (2.0 * math.pi), -first.real / abs(first)
-    rate = servo.controller.sample_rate
+    rate = servo.pidf.sample_rate
     if rate is not None and hertz > _RESOLVED * rate:
         return None
     # Rounded: what a window adds to a learnt resonance is not worth another notch.
     hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
     depth = min(0.9, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
-    return servo.controller.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
+    return servo.pidf.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
 def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demands: Demands) -> bool:
@@ -188,7 +188,7 @@ def _none_within(
     servo: Plant, uncertainty: Uncertainty, demands: Demands, plants: PlantSet, laws: list[Controller]
 ) -> str:
     """Reason why none of the laws is within the bounds."""
-    rate, delays = servo.controller.sample_rate, delays_of(servo.controller, uncertainty)
+    rate, delays = servo.pidf.sample_rate, delays_of(servo.pidf, uncertainty)
     at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
     stable = [law for law in laws if _stable(plants, law, delays)]
     peaks = [max(float(plants.peaks(law, delay).max()) for delay in delays) for law in stable]

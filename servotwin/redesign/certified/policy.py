@@ -104,7 +104,7 @@ class CertifiedPolicy:
     @property
     def smallest_answer(self) -> float:
         """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
-        return abs(self.servo.controller.Kp) * self.uncertainty.step[0]
+        return abs(self.servo.pidf.Kp) * self.uncertainty.step[0]
 
     @property
     def bias_floor(self) -> float:
@@ -156,7 +156,7 @@ class CertifiedPolicy:
         demands, trial = self.demands_within_band(), self.simulations
         fed, in_force = region.feedforward, None
         if running is not None and running.gains is not None:
-            in_force = Design(with_gains(servo.controller, running.gains), running.tolerance)
+            in_force = Design(with_gains(servo.pidf, running.gains), running.tolerance)
         return certify(servo, known, demands, trial, fed, region.noise, self.clock, in_force)
 
     def confirm(

@@ -1,0 +1,210 @@
+"""The loop of a linear law without a gap, cut at the command: response, poles, margins; continuous or sampled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.control.linear_law import LinearLaw
+from servotwin.control.linear_tick import LinearState, linear_tick
+from servotwin.errors import InvalidInput
+from servotwin.plant.linear import Complex, LinearSystem, zero_order_hold
+from servotwin.plant.margins import Margins, margins_of_response, search_frequencies
+from servotwin.plant.signals import Array
+
+_INPUTS = np.eye(3)
+_NO_POLYNOMIAL = np.array([math.nan])
+_ZERO_AT_INFINITY = 1e12
+
+
+class LawMatrices(NamedTuple):
+    """x' = A x + B (r, y_motor, y_load), command = C x + D (r, y_motor, y_load); of a sampled law x' is the next x."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+
+def ticked_law(law: LinearLaw) -> LawMatrices:
+    """One tick of a law as matrices, its limits and dead zone off: the edge's own tick applied to unit states.
+
+    Raises
+    ------
+    InvalidInput
+        The law is continuous.
+    """
+    parameters = law.replace(limit=None, rate_limit=None, feedforward=0.0).parameters()
+    size = len(parameters.output) // 2 - len(_INPUTS)
+    still = LinearState((0.0,) * size, 0.0, 1.0, 0.0)
+    starts = [still._replace(states=tuple(row)) for row in np.eye(size).tolist()]
+    ticks = [linear_tick(parameters, start, 0.0, 0.0, 0.0) for start in starts]
+    ticks += [linear_tick(parameters, still, *row) for row in _INPUTS.tolist()]
+    moved = np.array([after.states for after in ticks]).T[: law.n]
+    command = np.array([after.command for after in ticks])
+    return LawMatrices(moved[:, : law.n], moved[:, size:], command[: law.n], command[size:])
+
+
+def law_matrices(law: LinearLaw) -> LawMatrices:
+    """Matrices of a law as they are given, as arrays."""
+    n = law.n
+    return LawMatrices(
+        np.array(law.A).reshape(n, n), np.array(law.B).reshape(n, len(_INPUTS)), np.array(law.C), np.array(law.D)
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LawLoop:
+    """A linear law on a plant without a gap.
+
+    Attributes
+    ----------
+    motor, load : LinearSystem
+        Command to the motor's angle (rad) and to the load's position (m or rad), with the same states.
+    law : LinearLaw
+    """
+
+    motor: LinearSystem
+    load: LinearSystem
+    law: LinearLaw
+
+    @property
+    def _measured(self) -> Array:
+        """(2, N) rows of the plant's states that motor's and load's encoders read."""
+        return np.stack([self.motor.C, self.load.C])
+
+    def _controlled(self) -> Array:
+        """Row of the plant's states whose error the dead zone looks at."""
+        return np.asarray(np.array(self.law.error) @ self._measured)
+
+    def _opened(self, A: Array, B: Array, law: LawMatrices) -> LinearSystem:
+        """Command in to minus command out, for plant matrices of continuous or of sampled time."""
+        size, n = B.size, law.C.size
+        matrix = np.zeros((size + n, size + n))
+        matrix[:size, :size], matrix[size:, size:] = A, law.A
+        matrix[size:, :size] = law.B[:, 1:] @ self._measured
+        row = -np.concatenate([law.D[1:] @ self._measured, law.C])
+        return LinearSystem(matrix, np.append(B, np.zeros(n)), row, 0.0, _NO_POLYNOMIAL, _NO_POLYNOMIAL)
+
+    def _closed(self, A: Array, B: Array, law: LawMatrices) -> LinearSystem:
+        """Reference to the controlled measurement."""
+        opened = self._opened(A, B, law)
+        matrix = opened.A - np.outer(opened.B, opened.C)
+        drive = opened.B * law.D[0]
+        drive[B.size :] += law.B[:, 0]
+        row = np.append(self._controlled(), np.zeros(law.C.size))
+        return LinearSystem(matrix, drive, row, 0.0, _NO_POLYNOMIAL, _NO_POLYNOMIAL)
+
+    def open(self) -> LinearSystem:
+        """Open loop in continuous time, cut at the command.
+
+        Raises
+        ------
+        InvalidInput
+            The law has discrete matrices.
+        """
+        self._check_continuous()
+        return self._opened(self.load.A, self.load.B, law_matrices(self.law))
+
+    def closed(self) -> LinearSystem:
+        """Reference to the controlled measurement in continuous time (m or rad).
+
+        Raises
+        ------
+        InvalidInput
+            The law has discrete matrices.
+        """
+        self._check_continuous()
+        return self._closed(self.load.A, self.load.B, law_matrices(self.law))
+
+    def _check_continuous(self) -> None:
+        if self.law.discrete:
+            raise InvalidInput("law discrete = True: its loop has no continuous-time system; `margins` takes it")
+
+    def _held_plant(self) -> tuple[Array, Array]:
+        assert self.law.sample_rate is not None
+        return zero_order_hold(self.load.A, self.load.B, 1.0 / self.law.sample_rate)
+
+    def sampled_poles(self) -> Complex:
+        """Poles z of the sampled loop; stable when all abs(z) < 1."""
+        return self._closed(*self._held_plant(), ticked_law(self.law)).poles()
+
+    def slowest_pole(self) -> complex:
+        """The closed loop's pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
+        if self.law.sample_rate is None:
+            poles = self.closed().poles()
+            return complex(poles[np.argmax(poles.real)])
+        poles = self.sampled_poles()
+        return complex(np.log(poles[np.argmax(np.abs(poles))]) * self.law.sample_rate)
+
+    def margins(self) -> Margins:
+        """All crossovers and margins, cut at the command; of a law with discrete matrices up to half its rate.
+
+        The bandwidth is that of the controlled measurement.
+        """
+        if self.law.discrete:
+            return self._sampled_margins()
+        opened, closed = self.open(), self.closed()
+        return margins_of_response(
+            opened.response,
+            search_frequencies(opened, closed, also=_zeros(opened)),
+            stable=closed.is_stable(),
+            closed_loop=closed.response,
+            at_rest=float(np.abs(closed.response(0.0))),
+        )
+
+    def _sampled_margins(self) -> Margins:
+        assert self.law.sample_rate is not None
+        rate, plant, law = self.law.sample_rate, self._held_plant(), ticked_law(self.law)
+        opened, closed = self._opened(*plant, law), self._closed(*plant, law)
+        corners = np.concatenate([opened.poles(), closed.poles(), _zeros(opened)])
+        corners = np.log(corners[np.abs(corners) > 0.0]) * rate
+        omega = search_frequencies(opened, also=corners)
+        omega = np.append(omega[omega < math.pi * rate * (1.0 - 1e-9)], math.pi * rate * (1.0 - 1e-9))
+
+        def on_circle(system: LinearSystem, w: Array) -> Complex:
+            return system._response_of_states(np.exp(1j * np.asarray(w) / rate))
+
+        return margins_of_response(
+            lambda w: on_circle(opened, w),
+            omega,
+            stable=bool(np.all(np.abs(closed.poles()) < 1.0)),
+            closed_loop=lambda w: on_circle(closed, w),
+            at_rest=float(np.abs(on_circle(closed, np.zeros(1))[0])),
+        )
+
+    def check(self, described: str) -> None:
+        """Refuse a law that does not stabilise the plant, at its sample rate if it has one.
+
+        Raises
+        ------
+        InvalidInput
+            With the fastest growing pole.
+        """
+        worst = self.slowest_pole()
+        if not worst.real < 0.0:
+            raise InvalidInput(
+                f"the controller {self.law!r} is unstable on this {described} even without a gap: its closed loop has "
+                f"a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
+            )
+
+
+def _zeros(system: LinearSystem) -> Complex:
+    """Finite zeros, by the pencil of the system's matrices."""
+    from scipy.linalg import eigvals, matrix_balance
+
+    A, scaling = matrix_balance(system.A)
+    B, C = np.linalg.solve(scaling, system.B), system.C @ scaling
+    size = B.size
+    pencil = np.zeros((size + 1, size + 1))
+    pencil[:size, :size], pencil[:size, size], pencil[size, :size], pencil[size, size] = A, B, C, system.D
+    masses = np.eye(size + 1)
+    masses[size, size] = 0.0
+    with np.errstate(all="ignore"):
+        found = eigvals(pencil, masses)
+    # A zero at infinity comes out infinite or huge.
+    largest = _ZERO_AT_INFINITY * max(float(np.abs(A).max()), 1.0)
+    return np.asarray(found[np.isfinite(found) & (np.abs(found) < largest)], dtype=complex)

@@ -1,0 +1,96 @@
+"""The sampled loop of a linear law: two measurements, the edge's own tick compiled, on the exact plant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.control.linear_law import LinearLaw
+from servotwin.control.linear_tick import LinearParameters, LinearState
+from servotwin.errors import InvalidInput
+from servotwin.simulation.inputs import quantised
+from servotwin.simulation.law_ticks import TwoSensors, law_tick_and_record, run_law_ticks
+from servotwin.simulation.sampled import SampledEngine
+from servotwin.simulation.ticks import TickInputs
+
+
+@dataclass
+class SampledLawEngine(SampledEngine):
+    """Engine of a `Simulation` whose controller is a linear law with a sample rate."""
+
+    controller: LinearLaw  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        if self.noise is not None and not self.controller.reads("y_load"):
+            raise InvalidInput("noise is on the load's encoder, which the controller does not read: noise must be None")
+        super().__post_init__()
+
+    def _started(self) -> tuple[LinearState, LinearParameters]:
+        return self.controller.start(*self._present()), _with_arrays(self.controller.parameters())
+
+    @property
+    def sensors(self) -> TwoSensors:
+        """Port with the motor's encoder."""
+        angle = self.plant.automaton.names.index("theta_m")
+        counted = 1 if self.servo.encoder_resolution > 0.0 else 0
+        return TwoSensors(self.port, angle, self.servo.encoder_resolution, counted)
+
+    def _present(self, noise: float = 0.0) -> tuple[float, float]:
+        """Measurements (motor, load) of the present state."""
+        load = np.array(self.plant.rows["sensed"][0] @ self.state + noise)
+        motor = np.array(self.plant.rows["theta_m"][0] @ self.state)
+        resolutions = (self.servo.encoder_resolution, self.servo.position_resolution)
+        y_motor, y_load = (
+            float(quantised(value, each)) for value, each in zip((motor, load), resolutions, strict=True)
+        )
+        return y_motor, y_load
+
+    def flow(self, end: int, tick_inputs: TickInputs) -> None:
+        """Advance to a base step; `tick_inputs` covers the ticks on the way, while the gap's cubic stays the same."""
+        while self.base < end:
+            status, self.base, self.mode, self.law_state = run_law_ticks(
+                self.tables,
+                self.state,
+                self.base,
+                end,
+                self.mode,
+                self.parameters,
+                self.law_state,
+                self.sensors,
+                tick_inputs,
+                self.output,
+                self.record,
+                self.scratch,
+            )
+            self._check(status)
+
+    def _tick_and_record(self, base: int) -> None:
+        tick_inputs = self.tick_inputs(-(-base // self.tick_every), base // self.tick_every + 1)
+        self.law_state = law_tick_and_record(
+            base, self.state, self.parameters, self.law_state, self.sensors, tick_inputs, self.output
+        )
+
+    def set_controller(self, controller: LinearLaw, tolerance: float | None) -> None:  # type: ignore[override]
+        """Change the law from the tick that is due on, without a jump of its command; a constant tolerance unless
+        None."""
+        time = -(-self.base // self.tick_every) / self.tick_rate
+        planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
+        # The transfer needs the measurement of the tick that is due; that tick then takes the same noise again.
+        noise = self.draws.take(1)
+        self.draws.put_back(noise)
+        inputs = (float(self.inputs.reference.value(time)), *self._present(float(noise[0])))
+        tolerances = (planned, planned if tolerance is None else tolerance)
+        self.law_state = controller.transfer(self.controller, self.law_state, inputs, tolerances)
+        self.controller, self.parameters = controller, _with_arrays(controller.parameters())
+
+    def _measured_now(self) -> float:
+        motor, load = self._present()
+        by_motor, by_load = self.controller.error
+        return by_motor * motor + by_load * load
+
+
+def _with_arrays(parameters: LinearParameters) -> LinearParameters:
+    """The same numbers as arrays, for compiled code: one version of it for laws of equally many states."""
+    advance, output = (np.array(values) for values in (parameters.advance, parameters.output))
+    return parameters._replace(advance=advance, output=output)  # type: ignore[arg-type]

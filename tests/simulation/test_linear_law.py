@@ -1,0 +1,60 @@
+"""Linear laws on axes, sampled and continuous, against scipy's integrator and a law in numpy."""
+
+import numpy as np
+import pytest
+from law_oracle import numpy_law, sampled_positions
+from test_axis import TWO_MASS
+
+from servotwin.control.linear_law import LinearLaw
+from servotwin.plant.signals import PiecewiseCubic
+from servotwin.simulation import simulate
+
+RATE = 200.0
+
+
+def position_and_speed(integral: float) -> LinearLaw:
+    """Two measurements: the load's position, and the motor's speed as the difference of two ticks."""
+    gain, damping = 60.0, 40.0
+    return LinearLaw(
+        A=[[1.0, 0.0], [0.0, 0.0]],
+        B=[[integral / RATE, 0.0, -integral / RATE], [0.0, 1.0, 0.0]],
+        C=[1.0, damping * RATE],
+        D=[gain, -damping * RATE, -gain],
+        sample_rate=RATE,
+        discrete=True,
+        names=("integral", "before"),
+        holds=("integral",),
+        windup=(0.05, 0.0),
+    )
+
+
+def pieces(law: LinearLaw) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Matrices outside, and inside with the integral stopped."""
+    A, B, C, D, windup = (np.array(each) for each in (law.A, law.B, law.C, law.D, law.windup))
+    B_inside, windup_inside = B.copy(), windup.copy()
+    B_inside[0], windup_inside[0] = 0.0, 0.0
+    return (A, B, C, D, windup), (A, B_inside, C, D, windup_inside)
+
+
+LAWS = {
+    "plain": (position_and_speed(20.0), None),
+    "dead zone": (position_and_speed(20.0).replace(enter=0.6, leave=1.4), 0.2),
+    "limits": (position_and_speed(20.0).replace(limit=8.0, rate_limit=300.0), None),
+    "all": (position_and_speed(20.0).replace(limit=8.0, rate_limit=300.0, enter=0.6, leave=1.4), 0.2),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_sampled_law_agrees_with_an_independent_loop(name: str) -> None:
+    law, tolerance = LAWS[name]
+    axis, gap, count = TWO_MASS.replace(controller=law), 0.03, 300
+    axis.check_loop()
+    times = np.arange(count) / RATE
+    references = np.where(times < 0.75, 0.2, -0.3)
+    expected, commands = sampled_positions(axis, numpy_law(law, tolerance, pieces(law)), gap, references, RATE)
+    steps = PiecewiseCubic.zero_order_hold([0.0, 0.75], [0.2, -0.3])
+    run = simulate(axis, count / RATE, reference=steps, gap=gap, tolerance=tolerance, sample_rate=RATE)
+    assert np.abs(run.position[:-1] - expected).max() < 1e-8 * np.ptp(expected)
+    assert np.abs(run.voltage[:-1] - commands).max() < 1e-8 * np.ptp(commands)
+    if tolerance is not None:
+        assert {"enter", "leave"} <= set(run.events.kind)
