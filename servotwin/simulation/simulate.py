@@ -119,9 +119,7 @@ class Simulation:
 
     def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
         servo, law, inputs, samples, keep = self.servo, self.controller, self.inputs, self.samples, self.keep
-        if isinstance(law, LinearLaw) and law.sample_rate is None:
-            raise InvalidInput("law sample_rate = None: a simulation needs its rate in Hz")
-        if not isinstance(law, LinearLaw) and law.sample_rate is None:
+        if law.sample_rate is None:
             source = None if noise is None else noise.source(inputs.sample_rate, rng)
             return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)
         if isinstance(law, LinearLaw):
