@@ -44,6 +44,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_a_sampled_law_agrees_with_an_independent_loop(name: str) -> None:
     law, tolerance = LAWS[name]
@@ -79,6 +80,7 @@ ZONED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ZONED)
 def test_a_continuous_law_agrees_with_an_independent_integrator(name: str) -> None:
     law, tolerance = ZONED[name]
