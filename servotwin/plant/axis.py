@@ -6,11 +6,12 @@ import dataclasses
 import hashlib
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import TypeAlias, Unpack
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_
 from servotwin.config.toml import dumps
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller, ControllerChanges
-from servotwin.control.laws import AnyController, Law, law_of
+from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
@@ -273,6 +274,76 @@ class Axis:
             return changed
         return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **law))  # type: ignore[arg-type]
 
+    def scaled(self, factors: Mapping[str, float]) -> Axis:
+        """A copy with some of the plant's numbers multiplied.
+
+        Parameters
+        ----------
+        factors : mapping of str to float
+            Positive, by the names of a servo: k (stiffnesses of load and transmission), c (dampings of both), m
+            (masses), p (ratio), k_T (torque per command), k_B (back EMF, or viscous friction of a torque drive). A
+            drive that follows its command has neither of the last two.
+
+        Raises
+        ------
+        InvalidInput
+            A factor is not positive and finite.
+        """
+        for name, factor in factors.items():
+            if not 0.0 < factor < math.inf:
+                raise InvalidInput(f"axis {name}: factor {factor!r} must be positive and finite")
+        k, c, m, p = (factors.get(name, 1.0) for name in ("k", "c", "m", "p"))
+        load, screw = self.load, self.transmission
+        scaled_load = dataclasses.replace(
+            load,
+            m=tuple(m * each for each in load.m),
+            k=tuple(k * each for each in load.k),
+            c=tuple(c * each for each in load.c),
+        )
+        scaled_screw = dataclasses.replace(screw, p=p * screw.p, k_d=k * screw.k_d, c_d=c * screw.c_d)
+        actuator = self.actuator.scaled(factors.get("k_T", 1.0), factors.get("k_B", 1.0))
+        return dataclasses.replace(self, actuator=actuator, load=scaled_load, transmission=scaled_screw)
+
+    @property
+    def pidf(self) -> Controller:
+        """The controller, where it is a filtered PID.
+
+        Raises
+        ------
+        InvalidInput
+            It is a linear law.
+        """
+        return filtered_pid(self.controller)
+
+    @property
+    def command_per_speed(self) -> float:
+        """Command of a constant speed of the motor, per rad/s."""
+        shaft = self.actuator.polynomials()
+        return float(shaft.shaft[1] / shaft.command[0]) if shaft.shaft[0] == 0.0 else 0.0
+
+    def command_of(self, torque: float | Array) -> Any:
+        """Command of a constant torque (N m); 0 for a drive that follows its command whatever the load."""
+        shaft = self.actuator.polynomials()
+        return torque * float(shaft.torque[0]) / float(shaft.command[0])
+
+    def torque_of(self, command: float) -> float:
+        """Torque at rest under a command, N m; 0 for a drive that follows its command whatever the load."""
+        shaft = self.actuator.polynomials()
+        return command * float(shaft.command[0]) / float(shaft.torque[0]) if shaft.torque[0] else 0.0
+
+    @property
+    def takes_friction(self) -> bool:
+        """True where Coulomb friction on the motor can be simulated."""
+        return self.play is not Play.HELD and bool(np.any(self.shaft().E))
+
+    def with_position_resolution(self, resolution: float) -> Axis:
+        """A copy whose measured position has another resolution, m (rotary: rad)."""
+        if self.at_motor:
+            sensors = dataclasses.replace(self.sensors, encoder_resolution=resolution / self.p)
+        else:
+            sensors = dataclasses.replace(self.sensors, position_resolution=resolution)
+        return dataclasses.replace(self, sensors=sensors)
+
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21)."""
         check_gap(gap)
@@ -369,3 +440,10 @@ def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Pl
 def plant_of(text: str, source: str) -> Plant:
     """A servo or an axis from the text of its file; `source` is its name in messages."""
     return Axis.loads(text, source) if "actuator" in parse_toml(text, source).values else Servo.loads(text, source)
+
+
+def structure_of(plant: Plant) -> tuple[object, ...]:
+    """What plants must share for their automata to have the same states and modes."""
+    guide = plant.guide
+    forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
+    return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces

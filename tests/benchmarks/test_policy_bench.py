@@ -88,10 +88,14 @@ def test_no_constant_is_dropped_for_its_name() -> None:
 
 
 @pytest.mark.slow
-def test_the_table_and_its_document() -> None:
+def test_the_table_and_its_document(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The best of every tenth constant: how many are tried does not matter here."""
+    few = dict(list(constants(MODEL, KNOWN).items())[::10])
+    monkeypatch.setattr("benchmarks.policies.table.constants", lambda *_: few)
     rows = list(compare(MODEL, KNOWN, 2, seed=3, blocks=("clean",)))
     assert [row.name for row in rows[:5]] == ["no dead zone", "paper", "margin", "hysteresis", "certified"]
-    assert rows[-1].name.startswith("constant: ")
+    assert len(few) > 15
+    assert rows[-1].name in {f"constant: {name}" for name in few}
     certified = rows[4]
     assert certified.settled == 1.0
     assert certified.at("tail", 95.0) < 5e-6

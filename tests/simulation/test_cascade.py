@@ -34,7 +34,7 @@ AXES = {
     ),
     "ball screw": (
         Axis(
-            TorqueDrive(2e-5, 1e-3, 2e-5),
+            TorqueDrive(J=2e-5, lag=1e-3, friction=2e-5),
             ELASTIC,
             Load((20.0,), (0.0,), (60.0,)),
             Cascade(8.0, P, velocity_gain=2e-3, integral_time=0.1, speed_filter=1e-3, on="motor", low_pass_hz=400.0),
