@@ -153,8 +153,10 @@ class Axis:
         InvalidInput
             Its controller is a linear law.
         """
-        if not isinstance(self.controller, Controller):
-            raise InvalidInput(f"axis controller = {self.controller!r}: a file of an axis holds a Controller only")
+        if isinstance(self.controller, LinearLaw):
+            raise InvalidInput(
+                f"axis controller = {self.controller!r}: a file of an axis holds a Controller or a Cascade"
+            )
         parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
         return dumps(values_of_parts(parts))
 

@@ -174,6 +174,23 @@ def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -
     assert abs(voltage[300] - voltage[299]) < 2.0 * abs(voltage[299] - voltage[298]) + 1e-9
 
 
+@pytest.mark.parametrize("name", AXES)
+def test_a_file_of_an_axis_holds_its_cascade(name: str) -> None:
+    axis = AXES[name][0]
+    text = axis.dumps()
+    assert 'kind = "cascade"' in text
+    again = Axis.loads(text, "axis.toml")
+    assert again.controller == axis.controller
+    assert (again.transmission, again.load, again.actuator) == (axis.transmission, axis.load, axis.actuator)
+    if name == "two masses":
+        short = "\n".join(line for line in text.splitlines() if not line.startswith("travel"))
+        assert Axis.loads(short, "axis.toml").controller == axis.controller
+        with pytest.raises(InvalidInput, match="velocity_gain_n_m_s_per_rad"):
+            Axis.loads(
+                text.replace("velocity_gain_n_m_s_per_rad = 30.0", "velocity_gain_n_m_s_per_rad = -3.0"), "a.toml"
+            )
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -189,9 +206,26 @@ def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -
             ),
             "noise is on the load's encoder, which the controller does not read",
         ),
-        (lambda: AXES["two masses"][0].dumps(), "a file of an axis holds a Controller only"),
+        (
+            lambda: AXES["two masses"][0].replace(controller=AXES["two masses"][0].controller.linear()).dumps(),
+            "a file of an axis holds a Controller or a Cascade",
+        ),
     ],
 )  # fmt: skip
 def test_refusals_are_one_sentence(make: object, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
         make()  # type: ignore[operator]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("in_gap", ["free", "held"])
+def test_friction_and_gravity_act_under_a_cascade_too(in_gap: str) -> None:
+    axis, amplitude, gap = AXES["two masses"]
+    elastic = Transmission(1.0, 3300.0, 2.0, "free") if in_gap == "free" else Transmission(1.0, 3300.0)
+    load = Load((5.6,), (0.0,), (0.3,), "rotary", friction=1.5, force=0.5)
+    axis = axis.replace(transmission=elastic, load=load)
+    run = simulate(axis, 2.0, reference=SquareWave(amplitude, 4.0), gap=gap, sample_rate=100.0)
+    law = axis.controller.replace(sample_rate=1e5)
+    sampled = simulate(axis, 2.0, controller=law, reference=SquareWave(amplitude, 4.0), gap=gap, sample_rate=100.0)
+    assert {"stick", "slip"} <= set(run.events.kind)
+    assert np.abs(sampled.position - run.position).max() < 2e-4 * amplitude
