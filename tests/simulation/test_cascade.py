@@ -8,6 +8,7 @@ import pytest
 from law_oracle import IDLE, ContinuousOracle, HeldOracle, continuous_positions
 from test_axis import ELASTIC, TWO_MASS
 
+from servotwin.analysis.limit_cycles.cycle import limit_cycle
 from servotwin.control.cascade import Cascade
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
@@ -18,6 +19,7 @@ from servotwin.plant.sensors import Sensors
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Simulation, simulate
+from servotwin.simulation.ensemble import simulate_ensemble
 
 P = 1e-3 / math.pi
 # Axis with its cascade, amplitude (m or rad) and gap (rad).
@@ -229,3 +231,18 @@ def test_friction_and_gravity_act_under_a_cascade_too(in_gap: str) -> None:
     sampled = simulate(axis, 2.0, controller=law, reference=SquareWave(amplitude, 4.0), gap=gap, sample_rate=100.0)
     assert {"stick", "slip"} <= set(run.events.kind)
     assert np.abs(sampled.position - run.position).max() < 2e-4 * amplitude
+
+
+def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
+    """Position on the load around a velocity loop with integral action: the gap swings."""
+    axis, _, gap = AXES["two masses"]
+    law = axis.controller.replace(limit=None, position_gain=4.0, velocity_feedforward=0.0, acceleration_feedforward=0.0)
+    result = limit_cycle(axis, gap, controller=law, step=0.1)
+    assert result.orbit is not None
+    run = simulate(axis, 120.0, controller=law, reference=0.1, gap=gap, sample_rate=200.0)
+    tail = run.position[-8000:]
+    assert 0.5 * np.ptp(tail) == pytest.approx(result.orbit.amplitude, rel=1e-3)
+    spectrum = np.abs(np.fft.rfft((tail - tail.mean()) * np.hanning(tail.size)))
+    assert np.argmax(spectrum) / 40.0 == pytest.approx(result.orbit.frequency, abs=0.03)
+    with pytest.raises(InvalidInput, match=r"controller = Cascade\(.*must be a Controller, a filtered PID"):
+        simulate_ensemble(axis, 1.0, reference=0.1, gap=gap, controller=law)
