@@ -116,13 +116,13 @@ class TorqueDrive:
     lag: Annotated[
         float, key("current_loop_time_s", minimum=0.0, help="Time constant of the current loop; 0: none.")
     ] = 0.0
-    gain: Annotated[
-        float, key("torque_per_command", above=0.0, help="Torque per commanded torque; 1: the drive is calibrated.")
-    ] = 1.0
     friction: Annotated[
         float, key("viscous_friction_n_m_s_per_rad", minimum=0.0, help="Viscous friction of the shaft.")
     ] = 0.0
     coulomb: Annotated[float, key("coulomb_friction_n_m", minimum=0.0, help="Coulomb friction of the shaft.")] = 0.0
+    gain: Annotated[
+        float, key("torque_per_command", above=0.0, help="Torque per commanded torque; 1: the drive is calibrated.")
+    ] = 1.0
 
     unit = "N m"
 
