@@ -50,7 +50,9 @@ class ShaftPolynomials(NamedTuple):
 @settings("actuator")
 @dataclass(frozen=True)
 class DcMotor:
-    """DC motor behind a voltage (Eqs 1-8): L I' + R I = u - k_B omega, J omega' = k_T I + torque.
+    """DC motor behind a voltage (Eqs 1-8).
+
+    L I' + R I = u - k_B omega, J omega' = k_T I + torque.
 
     Raises
     ------
@@ -103,8 +105,9 @@ class DcMotor:
 @settings("actuator")
 @dataclass(frozen=True)
 class TorqueDrive:
-    """Motor behind a current loop, whose command is a torque: J omega' = torque - friction omega, with a first-order
-    lag from command to torque.
+    """Motor behind a current loop, whose command is a torque.
+
+    J omega' = torque - friction omega, with a first-order lag from command to torque.
 
     Raises
     ------
