@@ -15,6 +15,7 @@ from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 
+from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
 from servotwin.control.cascade import Cascade
@@ -449,3 +450,21 @@ def structure_of(plant: Plant) -> tuple[object, ...]:
     guide = plant.guide
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
     return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces
+
+
+def _named_plant(table: Table, name: str, plant: str, folder: Path) -> Plant:
+    """Load the servo or axis that a file names."""
+    if plant not in (*PRESETS, *AXES) and not (folder / plant).is_file():
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(plant, every)
+        allowed = f"one of {', '.join(every)}, or the path of a servo's or an axis's TOML, relative to this file{hint}"
+        raise table.invalid(name, allowed)
+    return resolve_plant(plant, folder)
+
+
+PLANT_KEY = key(
+    form=Form.TEXT,
+    parse=_named_plant,
+    help="A preset, or the path of the TOML of a servo or of an axis, relative to this file.",
+)
+"""Key of a machine in the files that name one."""
