@@ -15,10 +15,12 @@ from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 
+from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller, ControllerChanges
-from servotwin.control.laws import Law, filtered_pid
+from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
@@ -53,7 +55,7 @@ class AxisChanges(ControllerChanges, total=False):
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Law
+    controller: AnyController
     sensors: Sensors
 
 
@@ -61,7 +63,7 @@ _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
     "load": (Load,),
-    "controller": (Controller, LinearLaw),
+    "controller": (Controller, Cascade, LinearLaw),
     "sensors": (Sensors,),
 }
 
@@ -75,7 +77,7 @@ class Axis:
     actuator : DcMotor, TorqueDrive, VelocityDrive or Stepper
     transmission : Transmission
     load : Load
-    controller : Controller or LinearLaw
+    controller : Controller, Cascade or LinearLaw
         Runs when none is given. The gains of a Controller give the actuator's command (V, N m, rad/s or rad) per
         m, or per rad of a rotary load.
     sensors : Sensors, optional
@@ -90,7 +92,7 @@ class Axis:
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Law
+    controller: AnyController
     sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
@@ -152,8 +154,10 @@ class Axis:
         InvalidInput
             Its controller is a linear law.
         """
-        if not isinstance(self.controller, Controller):
-            raise InvalidInput(f"axis controller = {self.controller!r}: a file of an axis holds a Controller only")
+        if isinstance(self.controller, LinearLaw):
+            raise InvalidInput(
+                f"axis controller = {self.controller!r}: a file of an axis holds a Controller or a Cascade"
+            )
         parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
         return dumps(values_of_parts(parts))
 
@@ -364,24 +368,24 @@ class Axis:
         motor = replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1])
         return LawLoop(motor, load, law)
 
-    def loop(self, controller: Law | None = None) -> LinearSystem:
+    def loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         return self._law_loop(law).open() if isinstance(law, LinearLaw) else loop.open_loop(self.plant(), law)
 
-    def closed_loop(self, controller: Law | None = None) -> LinearSystem:
+    def closed_loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Reference to the measured position in continuous time, without a gap."""
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         return self._law_loop(law).closed() if isinstance(law, LinearLaw) else loop.closed_loop(self.plant(), law)
 
-    def margins(self, controller: Law | None = None) -> Margins:
+    def margins(self, controller: AnyController | None = None) -> Margins:
         """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
             return self._law_loop(law).margins()
         return margins(self.loop(controller), self.closed_loop(controller))
 
-    def check_loop(self, controller: Law | None = None) -> None:
+    def check_loop(self, controller: AnyController | None = None) -> None:
         """Refuse a controller that does not stabilise the axis even without a gap, at its sample rate if it has one.
 
         Raises
@@ -389,7 +393,7 @@ class Axis:
         InvalidInput
             With the fastest growing pole.
         """
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
             self._law_loop(law).check("axis")
         else:
@@ -446,3 +450,21 @@ def structure_of(plant: Plant) -> tuple[object, ...]:
     guide = plant.guide
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
     return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces
+
+
+def _named_plant(table: Table, name: str, plant: str, folder: Path) -> Plant:
+    """Load the servo or axis that a file names."""
+    if plant not in (*PRESETS, *AXES) and not (folder / plant).is_file():
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(plant, every)
+        allowed = f"one of {', '.join(every)}, or the path of a servo's or an axis's TOML, relative to this file{hint}"
+        raise table.invalid(name, allowed)
+    return resolve_plant(plant, folder)
+
+
+PLANT_KEY = key(
+    form=Form.TEXT,
+    parse=_named_plant,
+    help="A preset, or the path of the TOML of a servo or of an axis, relative to this file.",
+)
+"""Key of a machine in the files that name one."""
