@@ -18,7 +18,7 @@ from servotwin.config.table import Table, did_you_mean, read_toml
 from servotwin.config.toml import attribute
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -112,7 +112,7 @@ def _jobs(file: Path, model: str | None, out: Path | None) -> list[_TableJob]:
     return [_table_job(name, servo, settings, out) for name, (servo, settings) in chosen.items()]
 
 
-def _models(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
+def _models(table: Table, file: Path) -> dict[str, tuple[Plant, TwinSettings]]:
     """Model and settings by name: of a twin's file, or of a scenario, whose table need not be there yet."""
     if "models" in table.values:
         models = models_of(table, file.parent, checked=False)
@@ -124,7 +124,7 @@ def _models(table: Table, file: Path) -> dict[str, tuple[Servo, TwinSettings]]:
     return {scenario.name: (scenario.model, scenario.twin.replace(table=path))}
 
 
-def _table_job(name: str, servo: Servo, settings: TwinSettings, out: Path | None) -> _TableJob:
+def _table_job(name: str, servo: Plant, settings: TwinSettings, out: Path | None) -> _TableJob:
     if settings.policy != "certified":
         raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
     return _TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))

@@ -111,6 +111,7 @@ def compare(published: st.Scenario, certified: st.Scenario, console: Console) ->
 
         bars = [progress_bar(name) for name in jobs]
         runs = pool.map(lambda job, bar: run_twin(job, progress=bar), jobs.values(), bars)
+        assert isinstance(published.servo, st.Servo)
         return Comparison(published.servo, *runs)
 
 

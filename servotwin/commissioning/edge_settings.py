@@ -21,12 +21,14 @@ from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
+from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.gap import shortest_window
+from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.messages import Gains, Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.axis import Plant
 from servotwin.plant.scales import scales
-from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
@@ -111,14 +113,14 @@ class Guarding(NamedTuple):
     middle: Gains
 
 
-def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
+def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
     """Derive supervision and limits for a policy that sends gains; None for one that sets the tolerance only.
 
     The edge tolerates silence of the twin for the time for which its settings are verified.
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         Servo with the controller that runs.
     settings : TwinSettings
     noise : float
@@ -142,7 +144,7 @@ def guarding(servo: Servo, settings: TwinSettings, noise: float = 0.0) -> Guardi
     )
 
 
-def supervision_of(servo: Servo, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
+def supervision_of(servo: Plant, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
     """Supervision of a servo in its own seconds and volts; errors count from a tenth of the smallest stated step on."""
     usual, period = WatchSettings(), Supervision().period_s
     second, _, volt = scales(servo)
@@ -165,7 +167,7 @@ def start_of(fallback: FallbackSet) -> Parameters:
 
 def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
-    own, demands = policy.servo.controller, policy.demands_within_band()
+    own, demands = policy.servo.pidf, policy.demands_within_band()
     laws = _candidates(policy, demands)
     ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
     middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
@@ -204,7 +206,7 @@ def _range(values: list[float]) -> tuple[float, float]:
 
 def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
-    own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
+    own = policy.servo.pidf.replace(enter=policy.enter, leave=policy.leave)
     patience = PATIENCE * scales(policy.servo).time
     limits = Limits(
         gain_factor=_ROUNDING,
@@ -223,7 +225,7 @@ class Commissioning:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         Its own controller's gains are the middle of the box for updates.
     law : Controller
         The controller that runs.
@@ -235,7 +237,7 @@ class Commissioning:
         m rms on the measured position.
     """
 
-    servo: Servo
+    servo: Plant
     law: Controller
     twin: TwinSettings
     recording: Recording = field(default_factory=Recording)
@@ -258,7 +260,7 @@ class Commissioning:
     @property
     def start(self) -> Parameters:
         """Parameters before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
-        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
+        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.pidf)
         if self.twin.policy == "certified":
             fallback = guarded.supervision.fallback if guarded is not None and own else None
             return Parameters() if fallback is None else start_of(fallback)
@@ -305,7 +307,10 @@ class Commissioning:
     @property
     def _shortest_window(self) -> tuple[float, str]:
         twin = self.twin
-        return shortest_window(twin.method, self.servo, self.recording.sample_rate, twin.estimator)
+        model = servo_for(self.servo)
+        if model is None:
+            return SHORTEST / self.recording.sample_rate, f"a window needs {SHORTEST} samples"
+        return shortest_window(twin.method, model, self.recording.sample_rate, twin.estimator)
 
     def check_window(self) -> None:
         """Refuse a window that does not fit into memory or is too short for the estimator.
@@ -330,7 +335,7 @@ class Commissioning:
             No fallback set is verified for the whole stated range.
         """
         agent = dataclasses.replace(self.recorder_settings(servo, boot), parameters=self.start)
-        own, guarded = gains_of(self.servo.controller), self.guarding
+        own, guarded = gains_of(self.servo.pidf), self.guarding
         if guarded is not None:
             open_limits = self.recording.limits == Limits()
             return dataclasses.replace(
@@ -367,7 +372,10 @@ class Commissioning:
         rules = self.recording.novelty
         if rules is None:
             return None
-        return NoveltySettings(model_of(self.servo, self.recording.sample_rate), rules, self.twin.initial_gap)
+        model = servo_for(self.servo)
+        if model is None:
+            raise InvalidInput("[novelty]: the edge's filter needs an axis that is held in the gap and has two masses")
+        return NoveltySettings(model_of(model, self.recording.sample_rate), rules, self.twin.initial_gap)
 
 
 def check_samples(name: str, seconds: float, rate: float) -> None:

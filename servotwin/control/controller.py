@@ -225,7 +225,7 @@ class Controller:
         step = 1.0 / self.sample_rate
         # expm1: with a fast tick 1 - exp(-step / Tf) would lose the digits that decide the filter's pole.
         enter, leave = self.thresholds(tolerance)
-        notch = _notch_step(2.0 * pi * self.notch_hz, self.notch_damping, step)
+        notch = notch_step(2.0 * pi * self.notch_hz, self.notch_damping, step)
         return LawParameters(
             Kp=float(self.Kp),
             integral_step=self.Ki / self.sample_rate,
@@ -251,7 +251,7 @@ class Controller:
         )
 
 
-def _notch_step(omega: float, damping: float, step: float) -> tuple[float, float, float]:
+def notch_step(omega: float, damping: float, step: float) -> tuple[float, float, float]:
     """Exact zero-order-hold step of band-pass a and low-pass b: a' = omega (v - b) - 2 damping omega a, b' = omega a.
 
     Returns 1 - F_aa, 1 - F_bb and F_ba = -F_ab of its transition matrix F.

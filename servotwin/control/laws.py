@@ -2,22 +2,30 @@
 
 from typing import TypeAlias
 
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 
 Law: TypeAlias = Controller | LinearLaw
-"""A controller that an axis can have: the filtered PID or any linear law."""
+"""A law that runs: the filtered PID, or a linear law."""
+AnyController: TypeAlias = Controller | Cascade | LinearLaw
+"""A controller that an axis can have; a cascade is a description of a linear law."""
 
 
-def filtered_pid(law: Law) -> Controller:
-    """The law itself, where a computation is made for the filtered PID only.
+def law_of(controller: AnyController) -> Law:
+    """The law that runs."""
+    return controller.linear() if isinstance(controller, Cascade) else controller
+
+
+def filtered_pid(controller: AnyController) -> Controller:
+    """The controller itself, where a computation is made for the filtered PID only.
 
     Raises
     ------
     InvalidInput
-        It is a linear law.
+        It is another one.
     """
-    if isinstance(law, Controller):
-        return law
-    raise InvalidInput(f"controller = {law!r}: must be a Controller, a filtered PID, for this computation")
+    if isinstance(controller, Controller):
+        return controller
+    raise InvalidInput(f"controller = {controller!r}: must be a Controller, a filtered PID, for this computation")

@@ -11,7 +11,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.endless import FOREVER, UnboundedSimulation, first_stretch
@@ -88,7 +88,7 @@ def put_in_force(simulation: Simulation | UnboundedSimulation, law: Controller, 
         simulation.set_controller(with_gains(law, setting.gains), setting.tolerance)
 
 
-def simulation_of(scenario: Scenario, plant: Servo | None = None, delay: int = 0) -> Simulation:
+def simulation_of(scenario: Scenario, plant: Plant | None = None, delay: int = 0) -> Simulation:
     """Make the simulation of a scenario's plant and controller.
 
     `plant` replaces the scenario's servo where the machine differs from the model of twin and edge, and `delay` is in
@@ -117,7 +117,7 @@ def compile_ahead(scenario: Scenario) -> None:
     simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)
 
 
-def _simulation(scenario: Scenario, plant: Servo, keep: int | None = None, delay: int = 0) -> Simulation:
+def _simulation(scenario: Scenario, plant: Plant, keep: int | None = None, delay: int = 0) -> Simulation:
     return Simulation(
         plant,
         scenario.duration if keep is None else FOREVER,

@@ -23,8 +23,9 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN
+from servotwin.plant.axis import Plant
 from servotwin.plant.noise import Noise
-from servotwin.plant.servo import SERVO_KEY, Servo
+from servotwin.plant.servo import SERVO_KEY
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings
@@ -39,7 +40,7 @@ class Scenario:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     controller : Controller, optional
         The servo's own by default.
     recording : Recording
@@ -65,7 +66,7 @@ class Scenario:
         A value is out of its range, the gap goes below zero, a rate does not divide, a window is too short.
     """
 
-    servo: Annotated[Servo, SERVO_KEY]
+    servo: Annotated[Plant, SERVO_KEY]
     duration: Annotated[float, key("duration_s", above=0.0, help="Simulated time, a whole number of samples.")]
     seed: Annotated[
         int,
@@ -151,7 +152,7 @@ class Scenario:
     def from_table(cls, table: Table, folder: Path) -> Scenario:
         """Read a scenario from a parsed table; a servo's path in it is relative to `folder`."""
         with named(table):
-            servo: Servo = attribute(table, cls, "servo", folder)
+            servo: Plant = attribute(table, cls, "servo", folder)
             scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))
             table.done()
             scenario.servo.check_loop(scenario.law)
@@ -162,21 +163,21 @@ class Scenario:
         """Copy with some values changed, validated again."""
         return dataclasses.replace(self, **changes)
 
-    def with_servo(self, servo: Servo) -> Scenario:
+    def with_servo(self, servo: Plant) -> Scenario:
         """Copy with another servo and its controller, changed as this scenario changes its servo's controller."""
         if self.controller is None:
             return self.replace(servo=servo)
-        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.controller)
+        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.pidf)
         changes = {name: value for name, value in own.items() if value != default[name]}
-        return self.replace(servo=servo, controller=servo.controller.replace(**changes))
+        return self.replace(servo=servo, controller=servo.pidf.replace(**changes))
 
     @property
     def law(self) -> Controller:
         """The controller that runs."""
-        return self.servo.controller if self.controller is None else self.controller
+        return self.servo.pidf if self.controller is None else self.controller
 
     @property
-    def model(self) -> Servo:
+    def model(self) -> Plant:
         """The servo with the controller that runs; the twin designs for it."""
         return self.servo.replace(controller=self.law)
 

@@ -20,7 +20,7 @@ from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 
@@ -103,7 +103,7 @@ def gap_maker(table: Table) -> Maker:
     return constant_gap if "total_deg" in table.values or not table.values else growing_gap
 
 
-def read_parts(table: Table, folder: Path, servo: Servo) -> dict[str, Any]:
+def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     """Read the values of a `Scenario` that depend on its servo or on one another.
 
     Raises
@@ -111,11 +111,11 @@ def read_parts(table: Table, folder: Path, servo: Servo) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    controller = read_inner(table, CONTROLLER, lambda inner: _changed(inner, servo.controller))
+    controller = read_inner(table, CONTROLLER, lambda inner: _changed(inner, servo.pidf))
     edge = table.table(EDGE)
     edge.known(PROBE)
     probe = part(edge, PROBE, ProbeLimits) if PROBE in edge.values else None
-    supervision = _supervision(edge, controller or servo.controller)
+    supervision = _supervision(edge, controller or servo.pidf)
     edge.done()
     novelty = part(table, NOVELTY, NoveltyRules) if NOVELTY in table.values else None
     link = table.table(LINK)

@@ -7,7 +7,7 @@ from functools import lru_cache
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import DcMotor
-from servotwin.plant.axis import Axis
+from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.basis import Play
 from servotwin.plant.servo import Servo
 
@@ -17,6 +17,13 @@ _LEAST_MASSES = 2
 def has_servo(axis: Axis) -> bool:
     """True where a `Servo` can stand for the axis: its driven end is held in the gap and drives two masses or more."""
     return axis.play is not Play.FREE and axis.n >= _LEAST_MASSES
+
+
+def servo_for(plant: Plant) -> Servo | None:
+    """The servo that stands for a plant: itself, the one of an axis, or None where there is none."""
+    if isinstance(plant, Servo):
+        return plant
+    return servo_of(plant) if has_servo(plant) else None
 
 
 @lru_cache(maxsize=32)

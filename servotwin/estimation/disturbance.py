@@ -19,8 +19,8 @@ import numpy as np
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.window import Window
+from servotwin.plant.axis import Plant
 from servotwin.plant.scales import Scales, scales
-from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 # Seconds and volts are the servo's own (`plant.scales`).
@@ -72,14 +72,14 @@ def nothing_known(effort: float, *reasons: str) -> Disturbance:
     return Disturbance(math.nan, math.inf, math.nan, 0.0, effort, reasons)
 
 
-def disturbance(window: Window, servo: Servo) -> Disturbance:
+def disturbance(window: Window, servo: Plant) -> Disturbance:
     """Estimate input bias and noise from the longest rest whose spread is close to the least.
 
     Parameters
     ----------
     window : Window
         With reference, voltage and theta_m; the voltage as the motor gets it, feedforward included, bias not.
-    servo : Servo
+    servo : Servo or Axis
         For its back EMF and pitch.
     """
     effort = math.nan if window.voltage is None else float(np.sqrt(np.mean(window.voltage**2)))
@@ -97,7 +97,7 @@ def disturbance(window: Window, servo: Servo) -> Disturbance:
     return Disturbance(bias, std, noise, (last - first) / window.sample_rate, effort)
 
 
-def quick_bias(window: Window, servo: Servo) -> tuple[float, float]:
+def quick_bias(window: Window, servo: Plant) -> tuple[float, float]:
     """Estimate input bias and spread (V) from the last `SHORTEST` s before a reference change or the window's end.
 
     The first such interval at rest counts; without one, or without the channels, the result is (NaN, inf).
@@ -133,7 +133,7 @@ def _constant(window: Window, size: int, shortest: int) -> list[tuple[int, int]]
 
 
 def _rests(
-    window: Window, servo: Servo, size: int, stretches: Sequence[tuple[int, int]]
+    window: Window, servo: Plant, size: int, stretches: Sequence[tuple[int, int]]
 ) -> Iterator[tuple[float, float, int, int]]:
     """Yield (bias, std, first, last) of the stretches in which nothing moves."""
     begins: dict[int, int] = {}
@@ -164,9 +164,9 @@ def _batches(window: Window, size: int, first: int, last: int) -> _Batches:
     return _Batches(_means(angle, size), position, voltage, ends)
 
 
-def _rest(window: Window, servo: Servo, size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
+def _rest(window: Window, servo: Plant, size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
     """(bias, std) of the last `count` batches; None where something moves in them."""
-    per_sample, creep = servo.k_B * window.sample_rate, _CREEP * scales(servo).voltage
+    per_sample, creep = servo.command_per_speed * window.sample_rate, _CREEP * scales(servo).voltage
     angle, position = batches.angle[-count:], batches.position[-count:]
     if not (_still(angle, size, per_sample / creep) and _still(position, size, per_sample / creep / servo.p)):
         return None

@@ -7,12 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from servotwin.errors import InvalidInput
-from servotwin.estimation import paper, whitened
-from servotwin.estimation.axis_model import servo_of
+from servotwin.estimation import output_error, paper, whitened
+from servotwin.estimation.axis_model import has_servo, servo_of
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.window import Window
-from servotwin.plant.axis import Plant
+from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.servo import Servo
 
 
@@ -36,14 +38,24 @@ class Method(NamedTuple):
 
 METHODS: Mapping[str, Method] = {
     module.METHOD: Method(module.estimate, settings, module.shortest_window)
-    for module, settings in ((whitened, whitened.WhitenedSettings), (paper, paper.PaperSettings))
+    for module, settings in (
+        (whitened, whitened.WhitenedSettings),
+        (paper, paper.PaperSettings),
+    )
+}
+"""The methods for a servo, those of a twin."""
+
+_SAME = 1e-9  # of the motion: rounding
+_ALL = {
+    **METHODS,
+    output_error.METHOD: Method(output_error.estimate, output_error.OutputErrorSettings, output_error.shortest_window),
 }
 
 
 def estimate_gap(
     window: Window,
     servo: Plant,
-    method: str = whitened.METHOD,
+    method: str | None = None,
     prior: float | GapEstimate | None = None,
     settings: Any = None,
 ) -> GapEstimate:
@@ -54,9 +66,10 @@ def estimate_gap(
     window : Window
     servo : Servo or Axis
         The model; its controller does not matter.
-    method : str
-        "whitened", the default (`servotwin.estimation.whitened`), or "paper", the published one
-        (`servotwin.estimation.paper`).
+    method : str, optional
+        "whitened" (`servotwin.estimation.whitened`), the default where the driven end is held in the gap;
+        "output_error" (`servotwin.estimation.output_error`), the default for a shaft that is free in the gap and for
+        one mass behind a rigid transmission; or "paper", the published one (`servotwin.estimation.paper`).
     prior : float or GapEstimate, optional
         Total gap known before, rad; an estimate that is not OK is ignored. The search starts there, among other
         places; "whitened" also returns it where the window does not show the gap.
@@ -67,13 +80,21 @@ def estimate_gap(
     ------
     InvalidInput
         An unknown method, a prior that is not a gap, settings of another method, a window that lacks a channel or
-        is too short.
+        is too short, a method that is not for this axis.
     """
+    method = default_method(servo) if method is None else method
     chosen, known = settings_of(method, settings), _usable_prior(prior)
-    if isinstance(servo, Servo):
-        return METHODS[method].estimate(window, servo, known, chosen)
-    estimate: GapEstimate = METHODS[method].estimate(window, servo_of(servo), known, chosen)
+    if isinstance(servo, Axis):
+        _check_position(window, servo)
+    if isinstance(servo, Servo) or method == output_error.METHOD:
+        return _ALL[method].estimate(window, servo, known, chosen)
+    estimate: GapEstimate = _ALL[method].estimate(window, servo_of(servo), known, chosen)
     return replace(estimate, model_version=servo.version)
+
+
+def default_method(servo: Plant) -> str:
+    """The method that estimates a servo's or an axis's gap where none is named."""
+    return whitened.METHOD if isinstance(servo, Servo) or has_servo(servo) else output_error.METHOD
 
 
 def settings_of(method: str, settings: Any = None) -> Any:
@@ -84,9 +105,9 @@ def settings_of(method: str, settings: Any = None) -> Any:
     InvalidInput
         An unknown method, settings of another method.
     """
-    if method not in METHODS:
-        raise InvalidInput(f"method {method!r} does not exist: allowed are {', '.join(METHODS)}")
-    kind = METHODS[method].settings
+    if method not in _ALL:
+        raise InvalidInput(f"method {method!r} does not exist: allowed are {', '.join(_ALL)}")
+    kind = _ALL[method].settings
     if settings is not None and not isinstance(settings, kind):
         expected = f"{kind.__module__.removeprefix('servotwin.')}.{kind.__name__}"
         raise InvalidInput(f"settings {settings!r} do not belong to method {method!r}: give {expected}")
@@ -95,7 +116,19 @@ def settings_of(method: str, settings: Any = None) -> Any:
 
 def shortest_window(method: str, servo: Servo, sample_rate: float, settings: Any = None) -> tuple[float, str]:
     """The shortest window (s) of a servo that a method accepts at a sample rate (Hz), and why, in words."""
-    return METHODS[method].shortest(settings_of(method, settings), servo, sample_rate)
+    return _ALL[method].shortest(settings_of(method, settings), servo, sample_rate)
+
+
+def _check_position(window: Window, axis: Axis) -> None:
+    """Refuse a window whose position is the motor's own."""
+    if window.theta_m is None or not axis.at_motor:
+        return
+    lead = window.position - axis.p * window.theta_m
+    if np.ptp(lead) <= axis.p * axis.encoder_resolution + _SAME * np.ptp(window.position):
+        raise InvalidInput(
+            f'{window.where}axis sensors feedback = "motor": position is the motor\'s angle times the ratio, and '
+            "the gap lies behind the motor; give the load's own position"
+        )
 
 
 def _usable_prior(prior: float | GapEstimate | None) -> float | GapEstimate | None:

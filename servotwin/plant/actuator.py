@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
@@ -88,6 +88,10 @@ class DcMotor:
         B, E, torque = np.array([[1.0 / L, 0.0, 0.0], [0.0, 1.0 / J, 0.0], [k_T, 0.0, 0.0]])
         return ShaftMatrices(("current", "speed", "theta_m"), A, B, E, torque, 0.0, yielding)
 
+    def scaled(self, torque: float, drag: float) -> DcMotor:
+        """A copy with other factors on torque gain and back EMF."""
+        return replace(self, k_T=self.k_T * torque, k_B=self.k_B * drag)
+
     def polynomials(self) -> ShaftPolynomials:
         """Voltage and torque to the angle (Eq 8)."""
         electric = np.array([self.R, self.L]) if self.L > 0.0 else np.array([self.R])
@@ -116,6 +120,9 @@ class TorqueDrive:
         float, key("viscous_friction_n_m_s_per_rad", minimum=0.0, help="Viscous friction of the shaft.")
     ] = 0.0
     coulomb: Annotated[float, key("coulomb_friction_n_m", minimum=0.0, help="Coulomb friction of the shaft.")] = 0.0
+    gain: Annotated[
+        float, key("torque_per_command", above=0.0, help="Torque per commanded torque; 1: the drive is calibrated.")
+    ] = 1.0
 
     unit = "N m"
 
@@ -130,15 +137,19 @@ class TorqueDrive:
         if self.lag == 0.0:
             A = np.array([[-drag / J, 0.0], [1.0, 0.0]])
             column = np.array([1.0 / J, 0.0])
-            return ShaftMatrices(("speed", "theta_m"), A, column, column, np.zeros(2), 1.0, yielding)
+            return ShaftMatrices(("speed", "theta_m"), A, self.gain * column, column, np.zeros(2), self.gain, yielding)
         A = np.array([[-1.0 / self.lag, 0.0, 0.0], [1.0 / J, -drag / J, 0.0], [0.0, 1.0, 0.0]])
-        B, E, torque = np.array([[1.0 / self.lag, 0.0, 0.0], [0.0, 1.0 / J, 0.0], [1.0, 0.0, 0.0]])
+        B, E, torque = np.array([[self.gain / self.lag, 0.0, 0.0], [0.0, 1.0 / J, 0.0], [1.0, 0.0, 0.0]])
         return ShaftMatrices(("torque", "speed", "theta_m"), A, B, E, torque, 0.0, yielding)
+
+    def scaled(self, torque: float, drag: float) -> TorqueDrive:
+        """A copy with other factors on the torque per command and on the viscous friction."""
+        return replace(self, friction=self.friction * drag, gain=self.gain * torque)
 
     def polynomials(self) -> ShaftPolynomials:
         """Torque command and torque to the angle."""
         lag = np.array([1.0, self.lag]) if self.lag > 0.0 else np.array([1.0])
-        return ShaftPolynomials(product([lag, np.array([0.0, self.friction, self.J])]), np.array([1.0]), lag)
+        return ShaftPolynomials(product([lag, np.array([0.0, self.friction, self.J])]), np.array([self.gain]), lag)
 
 
 @settings("actuator")
@@ -163,6 +174,10 @@ class VelocityDrive:
         """Matrices of (speed, theta_m)."""
         A, B = np.array([[-1.0 / self.lag, 0.0], [1.0, 0.0]]), np.array([1.0 / self.lag, 0.0])
         return ShaftMatrices(("speed", "theta_m"), A, B, np.zeros(2), np.zeros(2), 0.0, 0.0)
+
+    def scaled(self, torque: float, drag: float) -> VelocityDrive:  # noqa: ARG002
+        """Itself: it follows its command."""
+        return self
 
     def polynomials(self) -> ShaftPolynomials:
         """Speed command to the angle."""
@@ -195,6 +210,10 @@ class Stepper:
         rate = 1.0 / self.smoothing
         A, B = np.array([[-2.0 * rate, -rate * rate], [1.0, 0.0]]), np.array([rate * rate, 0.0])
         return ShaftMatrices(("speed", "theta_m"), A, B, np.zeros(2), np.zeros(2), 0.0, 0.0)
+
+    def scaled(self, torque: float, drag: float) -> Stepper:  # noqa: ARG002
+        """Itself: it follows its command."""
+        return self
 
     def polynomials(self) -> ShaftPolynomials:
         """Commanded angle to the angle."""

@@ -9,8 +9,10 @@ constant disturbances exist only where the `Shape` requests them.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -47,8 +49,9 @@ from servotwin.plant.friction import (
     stopping_speed,
 )
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.plant.zones import Zone, controller_zones
+from servotwin.plant.zones import LinearPiece, Zone, controller_zones
 
+Piece = TypeVar("Piece", bound=LinearPiece)
 INPUTS = ("reference", "gap", "tolerance")
 
 
@@ -214,7 +217,7 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
     sensed = basis.sensed(servo) + basis.row("noise")
     measured = sensed if controller.loop_filter_hz is None else basis.row("filtered")
     error = basis.row("reference") - measured
-    system = _System(servo, basis, controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
+    system = LoopModes(servo, basis, controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
     flows = []
     for contact, stick_slip, zone in system.combinations:
         flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
@@ -243,12 +246,12 @@ def sampled_plant(servo: Plant, gap_degree: int, bias: bool = False, friction: b
 
 def sampled_parts(servo: PlantNumbers, gap_degree: int, bias: bool, friction: bool) -> LoopParts:
     """Modes, guards and outputs of plants under a constant voltage."""
-    names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *_constants(servo, bias, friction)]
+    names = [*plant_names(servo), "voltage", *input_names("gap", gap_degree), *constants(servo, bias, friction)]
     # The tick reads one state: a measurement that none of them is becomes one.
     names += ["sensed"] if servo.at_motor or servo.chain().D[-1] else []
     basis = Basis(tuple(names))
     zero = np.zeros(len(basis.names))
-    system = _System(servo, basis, (Zone("held", basis.row("voltage"), zero, zero, zero),), friction)
+    system = LoopModes(servo, basis, (Zone("held", basis.row("voltage"), zero, zero, zero),), friction)
     return system.parts(
         [
             mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
@@ -313,10 +316,11 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
     names += ["noise"] if shape.noise else []
     names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
     names += ["friction feedforward"] if shape.friction_feedforward else []
-    return names + _constants(servo, shape.bias, shape.friction)
+    return names + constants(servo, shape.bias, shape.friction)
 
 
-def _constants(servo: PlantNumbers, bias: bool, friction: bool) -> list[str]:
+def constants(servo: PlantNumbers, bias: bool, friction: bool) -> list[str]:
+    """States of a plant that never change."""
     present = {
         "input bias": bias,
         "friction": friction,
@@ -326,10 +330,10 @@ def _constants(servo: PlantNumbers, bias: bool, friction: bool) -> list[str]:
     return [name for name, there in present.items() if there]
 
 
-class _System:
+class LoopModes(Generic[Piece]):
     """All combinations of contact mode, stick-slip mode and zone, in the order of the automaton's modes."""
 
-    def __init__(self, servo: PlantNumbers, basis: Basis, zones: tuple[Zone, ...], friction: bool) -> None:
+    def __init__(self, servo: PlantNumbers, basis: Basis, zones: Sequence[Piece], friction: bool) -> None:
         self.servo, self.basis, self.zones = servo, basis, zones
         self.contacts, self.frictions = contact_modes(servo), stick_slip_modes(servo, friction)
         self._resets = {side: contact_reset(servo, basis, side) for side in (-1, 1)}
@@ -350,7 +354,7 @@ class _System:
         """(..., M, N) rows, the same in every mode."""
         return np.repeat(row[..., None, :], len(self.combinations), axis=-2)
 
-    def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Zone) -> tuple[Guard, ...]:
+    def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Piece) -> tuple[Guard, ...]:
         ends = [(guard, (contact.name, stick_slip.name, guard.target)) for guard in zone.guards]
         # Friction first: where the motor stops on a flank, the screw stays in contact.
         ends += [
@@ -368,7 +372,7 @@ class _System:
             Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends
         )
 
-    def _stick_slip_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Zone) -> list[GuardRow]:
+    def _stick_slip_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Piece) -> list[GuardRow]:
         if stick_slip == FRICTIONLESS:
             return []
         force = np.zeros(len(self.basis.names))
@@ -379,7 +383,7 @@ class _System:
         torque = self._torque(contact, zone)
         return stick_slip_guards(self.servo, self.basis, stick_slip, torque, force)
 
-    def _torque(self, contact: ContactMode, zone: Zone) -> Array:
+    def _torque(self, contact: ContactMode, zone: Piece) -> Array:
         """Row of the torque that drives the motor's shaft against its friction, N m."""
         shaft, basis = self.servo.shaft(), self.basis
         lead = shaft.torque.shape[:-1]
@@ -391,7 +395,7 @@ class _System:
             torque = torque - self.servo.p * screw_force(self.servo, basis, screw_rate(self.servo, basis, contact))
         return np.asarray(torque)
 
-    def _acceleration(self, side: int, zone: Zone) -> Array:
+    def _acceleration(self, side: int, zone: Piece) -> Array:
         """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
         flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), FRICTIONLESS, zone.voltage)
         return np.asarray(flow[..., self.basis["speed"], :])

@@ -6,18 +6,20 @@ import dataclasses
 import hashlib
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
 from pathlib import Path
-from typing import TypeAlias, Unpack
+from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller, ControllerChanges
-from servotwin.control.laws import Law
+from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
@@ -52,7 +54,7 @@ class AxisChanges(ControllerChanges, total=False):
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Law
+    controller: AnyController
     sensors: Sensors
 
 
@@ -60,7 +62,7 @@ _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
     "load": (Load,),
-    "controller": (Controller, LinearLaw),
+    "controller": (Controller, Cascade, LinearLaw),
     "sensors": (Sensors,),
 }
 
@@ -74,7 +76,7 @@ class Axis:
     actuator : DcMotor, TorqueDrive, VelocityDrive or Stepper
     transmission : Transmission
     load : Load
-    controller : Controller or LinearLaw
+    controller : Controller, Cascade or LinearLaw
         Runs when none is given. The gains of a Controller give the actuator's command (V, N m, rad/s or rad) per
         m, or per rad of a rotary load.
     sensors : Sensors, optional
@@ -89,7 +91,7 @@ class Axis:
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Law
+    controller: AnyController
     sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
@@ -272,6 +274,76 @@ class Axis:
             return changed
         return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **law))  # type: ignore[arg-type]
 
+    def scaled(self, factors: Mapping[str, float]) -> Axis:
+        """A copy with some of the plant's numbers multiplied.
+
+        Parameters
+        ----------
+        factors : mapping of str to float
+            Positive, by the names of a servo: k (stiffnesses of load and transmission), c (dampings of both), m
+            (masses), p (ratio), k_T (torque per command), k_B (back EMF, or viscous friction of a torque drive). A
+            drive that follows its command has neither of the last two.
+
+        Raises
+        ------
+        InvalidInput
+            A factor is not positive and finite.
+        """
+        for name, factor in factors.items():
+            if not 0.0 < factor < math.inf:
+                raise InvalidInput(f"axis {name}: factor {factor!r} must be positive and finite")
+        k, c, m, p = (factors.get(name, 1.0) for name in ("k", "c", "m", "p"))
+        load, screw = self.load, self.transmission
+        scaled_load = dataclasses.replace(
+            load,
+            m=tuple(m * each for each in load.m),
+            k=tuple(k * each for each in load.k),
+            c=tuple(c * each for each in load.c),
+        )
+        scaled_screw = dataclasses.replace(screw, p=p * screw.p, k_d=k * screw.k_d, c_d=c * screw.c_d)
+        actuator = self.actuator.scaled(factors.get("k_T", 1.0), factors.get("k_B", 1.0))
+        return dataclasses.replace(self, actuator=actuator, load=scaled_load, transmission=scaled_screw)
+
+    @property
+    def pidf(self) -> Controller:
+        """The controller, where it is a filtered PID.
+
+        Raises
+        ------
+        InvalidInput
+            It is a linear law.
+        """
+        return filtered_pid(self.controller)
+
+    @property
+    def command_per_speed(self) -> float:
+        """Command of a constant speed of the motor, per rad/s."""
+        shaft = self.actuator.polynomials()
+        return float(shaft.shaft[1] / shaft.command[0]) if shaft.shaft[0] == 0.0 else 0.0
+
+    def command_of(self, torque: float | Array) -> Any:
+        """Command of a constant torque (N m); 0 for a drive that follows its command whatever the load."""
+        shaft = self.actuator.polynomials()
+        return torque * float(shaft.torque[0]) / float(shaft.command[0])
+
+    def torque_of(self, command: float) -> float:
+        """Torque at rest under a command, N m; 0 for a drive that follows its command whatever the load."""
+        shaft = self.actuator.polynomials()
+        return command * float(shaft.command[0]) / float(shaft.torque[0]) if shaft.torque[0] else 0.0
+
+    @property
+    def takes_friction(self) -> bool:
+        """True where Coulomb friction on the motor can be simulated."""
+        return self.play is not Play.HELD and bool(np.any(self.shaft().E))
+
+    def with_position_resolution(self, resolution: float) -> Axis:
+        """A copy whose measured position has another resolution, m (rotary: rad)."""
+        if self.at_motor:
+            sensors = dataclasses.replace(self.sensors, encoder_resolution=resolution / self.p)
+        else:
+            sensors = dataclasses.replace(self.sensors, position_resolution=resolution)
+        return dataclasses.replace(self, sensors=sensors)
+
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21)."""
         check_gap(gap)
@@ -293,24 +365,24 @@ class Axis:
         motor = replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1])
         return LawLoop(motor, load, law)
 
-    def loop(self, controller: Law | None = None) -> LinearSystem:
+    def loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         return self._law_loop(law).open() if isinstance(law, LinearLaw) else loop.open_loop(self.plant(), law)
 
-    def closed_loop(self, controller: Law | None = None) -> LinearSystem:
+    def closed_loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Reference to the measured position in continuous time, without a gap."""
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         return self._law_loop(law).closed() if isinstance(law, LinearLaw) else loop.closed_loop(self.plant(), law)
 
-    def margins(self, controller: Law | None = None) -> Margins:
+    def margins(self, controller: AnyController | None = None) -> Margins:
         """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
             return self._law_loop(law).margins()
         return margins(self.loop(controller), self.closed_loop(controller))
 
-    def check_loop(self, controller: Law | None = None) -> None:
+    def check_loop(self, controller: AnyController | None = None) -> None:
         """Refuse a controller that does not stabilise the axis even without a gap, at its sample rate if it has one.
 
         Raises
@@ -318,7 +390,7 @@ class Axis:
         InvalidInput
             With the fastest growing pole.
         """
-        law = controller or self.controller
+        law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
             self._law_loop(law).check("axis")
         else:
@@ -368,3 +440,10 @@ def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Pl
 def plant_of(text: str, source: str) -> Plant:
     """A servo or an axis from the text of its file; `source` is its name in messages."""
     return Axis.loads(text, source) if "actuator" in parse_toml(text, source).values else Servo.loads(text, source)
+
+
+def structure_of(plant: Plant) -> tuple[object, ...]:
+    """What plants must share for their automata to have the same states and modes."""
+    guide = plant.guide
+    forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
+    return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces

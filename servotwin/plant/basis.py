@@ -33,16 +33,16 @@ class Guide(NamedTuple):
         Coulomb friction.
     force : float
         Constant, gravity for one; positive pushes forwards.
-    mass : float
+    mass : float, or (P, 1) array
         The last mass, kg or kg m^2.
-    yielding : float
+    yielding : float, or (P, 1) array
         m/s (rad/s) that a force of one N (N m) takes off the last mass's speed in its own time.
     """
 
     friction: float = 0.0
     force: float = 0.0
-    mass: float = 1.0
-    yielding: float = 1.0
+    mass: float | Array = 1.0
+    yielding: float | Array = 1.0
 
 
 class PlantNumbers(Protocol):

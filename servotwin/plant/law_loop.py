@@ -18,6 +18,8 @@ from servotwin.plant.signals import Array
 _INPUTS = np.eye(3)
 _NO_POLYNOMIAL = np.array([math.nan])
 _ZERO_AT_INFINITY = 1e12
+# A pole this much smaller than the largest is an integrator's, as rounding splits a double one.
+_INTEGRATOR = 1e-7
 
 
 class LawMatrices(NamedTuple):
@@ -148,9 +150,10 @@ class LawLoop:
         if self.law.discrete:
             return self._sampled_margins()
         opened, closed = self.open(), self.closed()
+        corners = np.concatenate([opened.poles(), closed.poles(), _zeros(opened)])
         return margins_of_response(
             opened.response,
-            search_frequencies(opened, closed, also=_zeros(opened)),
+            _above_integrators(search_frequencies(also=corners), corners),
             stable=closed.is_stable(),
             closed_loop=closed.response,
             at_rest=float(np.abs(closed.response(0.0))),
@@ -162,7 +165,7 @@ class LawLoop:
         opened, closed = self._opened(*plant, law), self._closed(*plant, law)
         corners = np.concatenate([opened.poles(), closed.poles(), _zeros(opened)])
         corners = np.log(corners[np.abs(corners) > 0.0]) * rate
-        omega = search_frequencies(opened, also=corners)
+        omega = _above_integrators(search_frequencies(also=corners), corners)
         omega = np.append(omega[omega < math.pi * rate * (1.0 - 1e-9)], math.pi * rate * (1.0 - 1e-9))
 
         def on_circle(system: LinearSystem, w: Array) -> Complex:
@@ -190,6 +193,13 @@ class LawLoop:
                 f"the controller {self.law!r} is unstable on this {described} even without a gap: its closed loop has "
                 f"a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
             )
+
+
+def _above_integrators(omega: Array, corners: Complex) -> Array:
+    """Frequencies of a search without those that belong to poles which are zero but for rounding."""
+    sizes = np.abs(corners)
+    least = float(sizes[sizes > _INTEGRATOR * sizes.max()].min())
+    return omega[omega >= 1e-2 * least]
 
 
 def _zeros(system: LinearSystem) -> Complex:

@@ -150,9 +150,8 @@ def peak(system: LinearSystem) -> tuple[float, float]:
 def search_frequencies(*systems: LinearSystem, also: Complex | None = None) -> Array:
     """(N,) rad/s, ascending: frequencies that resolve every pole and zero, of the systems and `also` given (1/s), and
     reach beyond the outermost crossings."""
-    corners = np.concatenate([np.concatenate([system.poles(), system.zeros()]) for system in systems])
-    if also is not None:
-        corners = np.concatenate([corners, also])
+    own = [np.concatenate([system.poles(), system.zeros()]) for system in systems]
+    corners = np.concatenate(own if also is None else [*own, also])
     corners = corners[np.isfinite(corners) & (np.abs(corners) > 0.0)]
     # A loop may cross over far beyond all its corners, where it is its asymptote.
     sizes = np.concatenate([np.abs(corners), *(system.asymptotic_crossovers() for system in systems)])

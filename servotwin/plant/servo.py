@@ -253,6 +253,33 @@ class Servo:
         copy.__dict__.update(values)
         return copy
 
+    @property
+    def pidf(self) -> Controller:
+        """The controller."""
+        return self.controller
+
+    @property
+    def command_per_speed(self) -> float:
+        """Voltage of a constant speed of the motor, V s/rad: the back EMF."""
+        return self.k_B
+
+    def command_of(self, torque: float | Array) -> Any:
+        """Voltage of a constant torque, V."""
+        return torque * self.R / self.k_T
+
+    def torque_of(self, command: float) -> float:
+        """Torque at rest under a voltage, N m."""
+        return command * self.k_T / self.R
+
+    @property
+    def takes_friction(self) -> bool:
+        """True where Coulomb friction on the motor can be simulated."""
+        return self.rigid
+
+    def with_position_resolution(self, resolution: float) -> Servo:
+        """A copy whose position sensor has another resolution, m."""
+        return self.replace(position_resolution=resolution)
+
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Dead-zone half-width (m) for a total gap (rad): k_dz p gap (Eq 21).
 

@@ -14,8 +14,9 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import AutomatonStack
-from servotwin.plant.actuator import ShaftMatrices
+from servotwin.plant.actuator import ShaftMatrices, stacked
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
+from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.basis import Play
 from servotwin.plant.motor import Motor
 from servotwin.plant.servo import PerMass, Servo
@@ -45,10 +46,17 @@ class LoopStack(NamedTuple):
 class PlantStack:
     """Numbers of servos that have one structure: the number of masses, and a rigid or an elastic screw."""
 
-    def __init__(self, servos: Sequence[Servo]) -> None:
+    def __init__(self, servos: Sequence[Plant]) -> None:
         self.count, self.n, self.play = len(servos), servos[0].n, servos[0].play
         self.at_motor, self.guide = servos[0].at_motor, servos[0].guide
         self.p = _column(servos, "p")
+        self._axes = [each for each in servos if isinstance(each, Axis)]
+        if self._axes:
+            self._stack_axes(self._axes)
+        else:
+            self._stack_servos([each for each in servos if isinstance(each, Servo)])
+
+    def _stack_servos(self, servos: Sequence[Servo]) -> None:
         m, k, c = (
             np.array([_spread(getattr(servo, name), self.n) for servo in servos], dtype=float)
             for name in ("m", "k", "c")
@@ -56,6 +64,24 @@ class PlantStack:
         rigid = self.play is Play.RIGID
         self._chain = chain(m, k, c, math.inf if rigid else np.array([servo.k_d for servo in servos]))
         self._shaft = Motor(*(np.array([getattr(servo, name) for servo in servos]) for name in Motor._fields)).shaft()
+
+    def _stack_axes(self, axes: Sequence[Axis]) -> None:
+        m, k, c = (np.array([getattr(axis.load, name) for axis in axes]) for name in ("m", "k", "c"))
+        k_d, c_d = (np.array([getattr(axis.transmission, name) for axis in axes]) for name in ("k_d", "c_d"))
+        rigid = self.play is Play.RIGID
+        self._chain = chain(m, k, c, math.inf if rigid else k_d, 0.0 if rigid or not c_d.any() else c_d)
+        self._shaft = stacked([axis.shaft() for axis in axes])
+        if axes[0].guide.friction or axes[0].guide.force:
+            guides = [axis.guide for axis in axes]
+            mass, yielding = (np.array([[getattr(guide, name)] for guide in guides]) for name in ("mass", "yielding"))
+            self.guide = guides[0]._replace(mass=mass, yielding=yielding)
+
+    def at_rest(self) -> tuple[Array, Array]:
+        """(P,) angles and (P, N) states of the structures at rest, per angle of the screw's start."""
+        if self._axes:
+            every = [axis.at_rest(1.0) for axis in self._axes]
+            return np.array([angle for angle, _ in every]), np.array([state for _, state in every])
+        return np.ones(self.count), self._chain.equilibrium(self.p)
 
     def chain(self) -> Chain:
         """Matrices of the structures."""
@@ -98,7 +124,7 @@ class LawStack:
         return cls(**columns, integral_only=laws[0].integral_only)
 
 
-def continuous_loops(servos: Sequence[Servo], laws: Sequence[Controller], shape: Shape) -> LoopStack:
+def continuous_loops(servos: Sequence[Plant], laws: Sequence[Controller], shape: Shape) -> LoopStack:
     """Automata of servos, each with its continuous controller.
 
     Parameters
@@ -111,13 +137,13 @@ def continuous_loops(servos: Sequence[Servo], laws: Sequence[Controller], shape:
     return LoopStack(plants, *continuous_parts(plants, LawStack.of(laws), shape).stacked(plants.count))
 
 
-def sampled_plants(servos: Sequence[Servo], gap_degree: int, bias: bool, friction: bool) -> LoopStack:
+def sampled_plants(servos: Sequence[Plant], gap_degree: int, bias: bool, friction: bool) -> LoopStack:
     """Automata of servos of one structure under a constant voltage."""
     plants = PlantStack(servos)
     return LoopStack(plants, *sampled_parts(plants, gap_degree, bias, friction).stacked(plants.count))
 
 
-def _column(items: Sequence[Servo] | Sequence[Controller], name: str) -> Array:
+def _column(items: Sequence[Plant] | Sequence[Controller], name: str) -> Array:
     return np.array([[getattr(item, name)] for item in items], dtype=float)
 
 

@@ -3,11 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
 from servotwin.plant.basis import Basis, GuardRow, LawNumbers
 from servotwin.plant.signals import Array
+
+
+class LinearPiece(Protocol):
+    """One linear piece of any law."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def voltage(self) -> Array:
+        """Row of the command."""
+        ...
+
+    @property
+    def guards(self) -> tuple[GuardRow, ...]: ...
 
 
 @dataclass(frozen=True)

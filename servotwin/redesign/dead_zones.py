@@ -10,7 +10,7 @@ from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.messages import Setting
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.uncertainty import Range
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.redesign.settling import settling_map
@@ -32,7 +32,7 @@ class MarginPolicy:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     step : (float, float)
         m, sizes of the steps that the reference makes.
     k_noise : float
@@ -44,7 +44,7 @@ class MarginPolicy:
         A value is outside its range.
     """
 
-    servo: Servo
+    servo: Plant
     step: Range = (1e-4, 2.5e-3)
     k_noise: float = 3.0
     needs_estimate: ClassVar[bool] = True
@@ -79,12 +79,12 @@ class HysteresisPolicy:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     enter, leave : float
         Tolerances.
     """
 
-    servo: Servo
+    servo: Plant
     enter: float = 0.5
     leave: float = 1.5
     needs_estimate: ClassVar[bool] = True
@@ -94,5 +94,5 @@ class HysteresisPolicy:
         if evidence.unusable:
             return Redesign(None, math.nan, evidence.unusable)
         estimate = evidence.estimate
-        law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
+        law = self.servo.pidf.replace(enter=self.enter, leave=self.leave)
         return Redesign(Setting(self.servo.p * estimate.gap, gains_of(law)), estimate.gap, "")

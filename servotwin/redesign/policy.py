@@ -13,7 +13,7 @@ from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Gains, Setting
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.uncertainty import Region
 
@@ -121,7 +121,7 @@ class PaperPolicy:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         For its pitch.
     k_dz : float
         Tolerances per gap (the paper's is one).
@@ -135,7 +135,7 @@ class PaperPolicy:
         A value is outside its range.
     """
 
-    servo: Servo
+    servo: Plant
     k_dz: float = 1.0
     smoothing: float = 0.0
     needs_estimate: ClassVar[bool] = True

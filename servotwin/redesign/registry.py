@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
@@ -39,16 +39,16 @@ class PolicyOptions(Protocol):
 class PolicyEntry(NamedTuple):
     """A policy's maker, and the options that belong to it alone."""
 
-    make: Callable[[Servo, PolicyOptions], Policy]
+    make: Callable[[Plant, PolicyOptions], Policy]
     options: tuple[str, ...] = ()
 
 
-def policy_of(servo: Servo, options: PolicyOptions) -> Policy:
+def policy_of(servo: Plant, options: PolicyOptions) -> Policy:
     """Make the policy that the options name.
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         The model, with the controller that runs: its loop filter and limits count, and candidates scale its gains.
     options : PolicyOptions
 
@@ -60,20 +60,20 @@ def policy_of(servo: Servo, options: PolicyOptions) -> Policy:
     return POLICIES[options.policy].make(servo, options)
 
 
-def certified_policy(servo: Servo, options: PolicyOptions) -> CertifiedPolicy:
+def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
     """Make the certified policy; its largest feedforward cancels the largest stated input bias."""
     low, high = options.uncertainty.input_bias
     return CertifiedPolicy(servo, options.uncertainty, options.demands, feedforward_limit=max(abs(low), abs(high)))
 
 
-def _certified(servo: Servo, options: PolicyOptions) -> Policy:
+def _certified(servo: Plant, options: PolicyOptions) -> Policy:
     """Make the policy that verifies before every update or, with a table, looks settings up."""
     policy = certified_policy(servo, options)
     return policy if options.table is None else TablePolicy(policy, load(Path(options.table), policy))
 
 
-def _margin(servo: Servo, options: PolicyOptions) -> MarginPolicy:
-    if servo.controller.voltage_limit is not None:
+def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
+    if servo.pidf.voltage_limit is not None:
         raise InvalidInput(
             "policy 'margin' reads its dead zone from a map that serves every gap, which no map does for a controller "
             "with a voltage limit, and this one has one: give another policy"
@@ -84,11 +84,11 @@ def _margin(servo: Servo, options: PolicyOptions) -> MarginPolicy:
     return MarginPolicy(continuous, step, options.k_noise)
 
 
-def _hysteresis(servo: Servo, _options: PolicyOptions) -> HysteresisPolicy:
+def _hysteresis(servo: Plant, _options: PolicyOptions) -> HysteresisPolicy:
     return HysteresisPolicy(servo)
 
 
-def _paper(servo: Servo, options: PolicyOptions) -> PaperPolicy:
+def _paper(servo: Plant, options: PolicyOptions) -> PaperPolicy:
     return PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
 
 

@@ -17,8 +17,8 @@ from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.measures import compute_cells
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.axis import Plant
 from servotwin.plant.scales import scales
-from servotwin.plant.servo import Servo
 
 # In units of p gap, the screw's lost motion; the map's own unit p b is half of it.
 _K_DZ, _STEPS = np.arange(0.25, 3.01, 0.125), np.geomspace(0.05, 500.0, 33)
@@ -60,7 +60,7 @@ class SettlingMap:
 
 
 @lru_cache(maxsize=8)
-def settling_map(servo: Servo) -> SettlingMap:
+def settling_map(servo: Plant) -> SettlingMap:
     """The map of a servo with its own continuous controller, from rest; some seconds of simulation.
 
     Raises

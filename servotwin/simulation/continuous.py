@@ -10,11 +10,14 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.control.law import replaced
+from servotwin.control.laws import Law
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ON_GRID, Jump, Trajectory
 from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_loop, degree
 from servotwin.plant.axis import Plant
+from servotwin.plant.linear_zones import law_state, linear_loop
 from servotwin.plant.noise import NoiseSource
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.turns import direction_after, turns_of
@@ -28,7 +31,7 @@ class ContinuousEngine:
     """Engine of a `Simulation` whose controller has no sample rate; noise is constant between samples."""
 
     servo: Plant
-    controller: Controller
+    controller: Law
     inputs: RunInputs
     theta_d0: float = 0.0
     refine: int = 1
@@ -50,14 +53,17 @@ class ContinuousEngine:
         followers = ("filtered", "lagging")
         position = float(self.loop.rows["measured_position"][0] @ state)
         set_states(self.loop, state, dict.fromkeys(followers, position))
+        if isinstance(self.controller, LinearLaw):
+            resting = law_at_rest(self.controller, LoopState(self.loop, state, 0), {})
+            set_states(self.loop, state, resting)
         self.direction = direction_after(signals["reference"], 0.0, position, 0.0)
-        set_states(self.loop, state, {"friction feedforward": self.controller.friction_feedforward * self.direction})
+        set_states(self.loop, state, {"friction feedforward": friction_feedforward(self.controller) * self.direction})
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
         mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
         self.trajectory = Trajectory(self.loop.automaton, state, mode, 1.0 / self.inputs.sample_rate, self.refine)
 
-    def _automaton(self, controller: Controller, offset: bool = False) -> ServoAutomaton:
+    def _automaton(self, controller: Law, offset: bool = False) -> ServoAutomaton:
         reference, gap, tolerance = (degree(self._signal(name)) for name in INPUTS)
         shape = Shape(
             reference,
@@ -69,8 +75,10 @@ class ContinuousEngine:
             friction=self.inputs.friction + self.servo.motor_friction != 0.0,
             feedforward=controller.feedforward != 0.0,
             offset=offset,
-            friction_feedforward=controller.friction_feedforward != 0.0,
+            friction_feedforward=friction_feedforward(controller) != 0.0,
         )
+        if isinstance(controller, LinearLaw):
+            return linear_loop(self.servo, controller, shape)
         return continuous_loop(self.servo, controller, shape)
 
     def _signal(self, name: str) -> PiecewiseCubic:
@@ -105,7 +113,7 @@ class ContinuousEngine:
         for time, direction in self._turns(span):
             self.direction = direction
             knots.setdefault(time, {})[self.loop.automaton.index("friction feedforward")] = (
-                self.controller.friction_feedforward * direction
+                friction_feedforward(self.controller) * direction
             )
         if self.noise is not None:
             times = self.inputs.times(self.index + 1, index + 1).tolist()
@@ -117,7 +125,7 @@ class ContinuousEngine:
 
     def _turns(self, span: tuple[float, float]) -> list[tuple[float, float]]:
         """Times (s) within a span of samples at which the reference may change its direction, and that then."""
-        if self.controller.friction_feedforward == 0.0:
+        if friction_feedforward(self.controller) == 0.0:
             return []
         turns = turns_of(self.inputs.reference)
         times = np.array([time for time, _ in turns]) * self.inputs.sample_rate
@@ -136,17 +144,17 @@ class ContinuousEngine:
             self.set_controller(self.controller, None)
         self.direction = direction_after(reference, time, before, self.direction)
         values = self.loop.input_values("reference", now)
-        if self.controller.friction_feedforward != 0.0:
+        if friction_feedforward(self.controller) != 0.0:
             values[self.loop.automaton.index("friction feedforward")] = (
-                self.controller.friction_feedforward * self.direction
+                friction_feedforward(self.controller) * self.direction
             )
         self.trajectory.set(values)
 
-    def set_controller(self, controller: Controller, tolerance: float | None) -> None:
+    def set_controller(self, controller: Law, tolerance: float | None) -> None:
         """Change the controller from now on without a jump of the voltage; a constant tolerance unless None."""
         _refuse_rate_limit(controller)
         values = controller_constants(controller) | {
-            "friction feedforward": controller.friction_feedforward * self.direction
+            "friction feedforward": friction_feedforward(controller) * self.direction
         }
         if tolerance is not None:
             names = [name for name in self.loop.automaton.names if name.startswith("tolerance")]
@@ -183,7 +191,7 @@ class ContinuousEngine:
         ]
 
 
-def _refuse_rate_limit(controller: Controller) -> None:
+def _refuse_rate_limit(controller: Law) -> None:
     if controller.rate_limit is not None:
         raise InvalidInput("controller rate_limit needs a sampled controller: set its sample_rate")
 
@@ -195,10 +203,16 @@ def start_zone(error: float, enter: float) -> str:
     return "+" if error > 0.0 else "-"
 
 
-def controller_constants(controller: Controller) -> dict[str, float]:
+def controller_constants(controller: Law) -> dict[str, float]:
     """States of the automaton that are constants of the controller, by name."""
-    limit = {} if controller.voltage_limit is None else {"voltage limit": controller.voltage_limit}
+    most = controller.limit if isinstance(controller, LinearLaw) else controller.voltage_limit
+    limit = {} if most is None else {"voltage limit": most}
     return {"feedforward": controller.feedforward, **limit}
+
+
+def friction_feedforward(controller: Law) -> float:
+    """Command added with the sign of the reference's last change; linear laws add none."""
+    return controller.friction_feedforward if isinstance(controller, Controller) else 0.0
 
 
 def set_states(loop: ServoAutomaton, state: Array, values: Mapping[str, float]) -> None:
@@ -250,7 +264,7 @@ class LoopState:
 
 
 def change_controller(
-    now: LoopState, controller: Controller, values: Mapping[str, float], loop: Callable[[bool], ServoAutomaton]
+    now: LoopState, controller: Law, values: Mapping[str, float], loop: Callable[[bool], ServoAutomaton]
 ) -> LoopState:
     """Replace the controller in the running loop: common states go on, the voltage does not jump.
 
@@ -274,14 +288,25 @@ def change_controller(
     return _with_states(now, controller, loop(True), {**values, "offset": offset})
 
 
-def _with_states(
-    now: LoopState, controller: Controller, loop: ServoAutomaton, values: Mapping[str, float]
-) -> LoopState:
+def law_at_rest(law: LinearLaw, now: LoopState, known: dict[str, float]) -> dict[str, float]:
+    """States of a linear law in the automaton, at rest under the present measurements; some of them given."""
+    y_motor, measured = now.output("theta_m"), now.output("measured_position")
+    y_load = now.output("sensed")
+    reference = measured if not known else now.value("reference")
+    resting = law.rest((reference, y_motor, y_load), known)
+    return {law_state(name): value for name, value in zip(law.names, resting, strict=True)}
+
+
+def _with_states(now: LoopState, controller: Law, loop: ServoAutomaton, values: Mapping[str, float]) -> LoopState:
     """Carry the states over by name. Without integral action nothing would correct the integral: its part goes into the
     offset."""
     common = {name: now.value(name) for name in now.loop.automaton.names if name != "offset"}
-    common |= {"integral": 0.0} if controller.Ki == 0.0 else {}
-    if controller.integral_only:
+    if isinstance(controller, LinearLaw):
+        running = {name: common[law_state(name)] for name in controller.names if law_state(name) in common}
+        common |= law_at_rest(controller, now, running)
+    else:
+        common |= {"integral": 0.0} if controller.Ki == 0.0 else {}
+    if isinstance(controller, Controller) and controller.integral_only:
         common["integral"] -= replaced(common["integral"], controller.feedforward - common.get("feedforward", 0.0))
     # A filter that is new starts at what it filters: at zero it would show a jump of it.
     new = {"filtered": now.output("measured_position"), "lagging": now.value("reference")}
@@ -294,7 +319,7 @@ def _with_states(
     # Contact and stick-slip modes stay: both automata number them alike.
     mode = now.mode // len(now.loop.zones) * len(loop.zones) + loop.zones.index(zone)
     names = loop.automaton.names
-    if "notch low" in names and "notch low" not in common:
+    if isinstance(controller, Controller) and "notch low" in names and "notch low" not in common:
         # At rest at what it filters, which drives the band-pass.
         driven = float(loop.automaton.flows[mode][loop.automaton.index("notch band")] @ state)
         state[loop.automaton.index("notch low")] = driven / (2.0 * math.pi * controller.notch_hz)

@@ -15,10 +15,11 @@ from servotwin.hybrid.automaton import Array, AutomatonStack
 from servotwin.hybrid.ensemble import FigureOptions, Members, figures_of_family, run_family
 from servotwin.hybrid.members import Figures
 from servotwin.plant.automaton import ServoAutomaton, Shape, without_feedforward
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant, structure_of
 from servotwin.plant.signals import check_gap
 from servotwin.plant.stack import LoopStack, continuous_loops
 from servotwin.simulation.continuous import controller_constants
+from servotwin.simulation.inputs import plant_forces
 
 NOT_NEGATIVE = ("gap", "tolerance", "friction")
 
@@ -92,7 +93,7 @@ class EnsembleMembers:
     """
 
     shape: tuple[int, ...]
-    servos: list[Servo]
+    servos: list[Plant]
     controllers: list[Controller]
     constants: dict[str, Array]
 
@@ -117,7 +118,7 @@ class EnsembleMembers:
 
     def _group(self, which: NDArray[np.int64], shape: Shape, outputs: Sequence[str]) -> Group:
         servos, laws = ([values[member] for member in which] for values in (self.servos, self.controllers))
-        places: dict[tuple[Servo, Controller], int] = {}
+        places: dict[tuple[Plant, Controller], int] = {}
         pairs = [(servo, without_feedforward(law)) for servo, law in zip(servos, laws, strict=True)]
         automaton = np.array([places.setdefault(pair, len(places)) for pair in pairs])
         loops = continuous_loops([servo for servo, _ in places], [law for _, law in places], shape)
@@ -137,7 +138,7 @@ class EnsembleMembers:
 
 
 def simulate_ensemble(
-    servo: Servo,
+    servo: Plant,
     duration: float,
     reference: ArrayLike = 0.0,
     gap: ArrayLike = 0.0,
@@ -151,7 +152,7 @@ def simulate_ensemble(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     duration : float
         s.
     reference, gap, tolerance, theta_d0 : array_like
@@ -329,7 +330,18 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     for law in {id(law): law for law in every_law}.values():
         if law.sample_rate is not None or law.rate_limit is not None:
             raise InvalidInput("an ensemble needs continuous controllers: without sample_rate and rate_limit")
-    return EnsembleMembers(shape, every_servo, every_law, constants)
+    return EnsembleMembers(shape, every_servo, every_law, with_forces(constants, every_servo))
+
+
+def with_forces(constants: dict[str, Array], plants: Sequence[Plant]) -> dict[str, Array]:
+    """Constants of members, with the plants' own forces beside or among them."""
+    # Thousands of members share a few plants.
+    different = {id(plant): plant for plant in plants}.values()
+    if not any(plant.motor_friction or plant.guide.friction or plant.guide.force for plant in different):
+        return constants
+    own = {name: np.array([plant_forces(plant)[name] for plant in plants]) for name in plant_forces(plants[0])}
+    friction = constants["friction"] + own.pop("friction")
+    return {**constants, "friction": friction, **{name.replace(" ", "_"): values for name, values in own.items()}}
 
 
 def check_constants(constants: dict[str, Array]) -> None:
@@ -341,9 +353,9 @@ def check_constants(constants: dict[str, Array]) -> None:
     check_gap(float(constants["gap"].max(initial=0.0)))
 
 
-def _structure_of(servo: Servo, law: Controller) -> tuple[object, ...]:
+def _structure_of(servo: Plant, law: Controller) -> tuple[object, ...]:
     limits = law.voltage_limit is None, law.loop_filter_hz is None
-    return servo.n, servo.rigid, *limits, law.integral_only, law.velocity_feedforward == 0.0, law.notch_hz == 0.0
+    return structure_of(servo), *limits, law.integral_only, law.velocity_feedforward == 0.0, law.notch_hz == 0.0
 
 
 def _constants_of(laws: list[Controller]) -> dict[str, Array]:
@@ -361,10 +373,12 @@ def starts_of(loops: LoopStack, which: NDArray[np.int64], constants: dict[str, A
         if key in names:
             states[:, index(key)] = values
     half = 0.5 * constants["gap"]
-    screw, first = np.clip(constants["theta_d0"], -half, half), index("chain0")
-    rest = loops.plants.chain().equilibrium(loops.plants.p)[which]
-    states[:, index("theta_d")] = screw
+    screw, first = np.clip(constants["theta_d0"], -half, half), index("theta_d") + 1
+    angle, rest = (each[which] for each in loops.plants.at_rest())
+    states[:, first - 1] = angle * screw
     states[:, first : first + rest.shape[1]] = screw[:, None] * rest
+    if "sensed" in names and not loops.plants.at_motor:
+        states[:, index("sensed")] = loops.plants.p[which, 0] * states[:, first - 1]
     for follower in ("filtered", "lagging"):
         if follower in names:
             states[:, index(follower)] = np.sum(states * loops.rows["measured_position"][which, 0], axis=1)

@@ -14,7 +14,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures, figures_of
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_pieces
-from servotwin.simulation.ensemble import Cases, check_constants, samples_of
+from servotwin.simulation.ensemble import Cases, check_constants, samples_of, with_forces
 from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.sampled_groups import SampledMembers, SampledSpan, groups_of, in_blocks, run_group
@@ -186,7 +186,7 @@ def sampled_members(servos: Any, controllers: Any, cases: SampledCases) -> Sampl
     for law in {id(law): law for law in every_law}.values():
         if law.sample_rate is None:
             raise InvalidInput("a sampled ensemble needs controllers with a sample_rate")
-    return SampledMembers(shape, every_servo, every_law, constants)
+    return SampledMembers(shape, every_servo, every_law, with_forces(constants, every_servo))
 
 
 def _span(duration: float, sample_rate: float, outputs: Sequence[str], last: float, shape: SignalLike) -> SampledSpan:
@@ -216,10 +216,10 @@ def _run(members: SampledMembers, member: int, span: SampledSpan) -> Array:
         PiecewiseCubic.constant(tolerance) if tolerance > 0.0 else None,
         span.rate,
         here["input_bias"],
-        here["friction"],
+        here["friction"] - servo.motor_friction,
     )
     engine = SampledEngine(
-        servo.replace(position_resolution=here["resolution"]),
+        servo.with_position_resolution(here["resolution"]),
         members.controllers[member],
         inputs,
         here["theta_d0"],

@@ -19,7 +19,7 @@ from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
 from servotwin.hybrid.threads import on_threads
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant, structure_of
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.stack import LoopStack, sampled_plants
 from servotwin.simulation.ensemble import starts_of
@@ -43,7 +43,7 @@ class SampledMembers:
     """All members, flat; `shape` is what servos, controllers and constants broadcast to."""
 
     shape: tuple[int, ...]
-    servos: list[Servo]
+    servos: list[Plant]
     controllers: list[Controller]
     constants: dict[str, Array]
 
@@ -98,7 +98,7 @@ def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
     always = law.feedforward == 0.0 and law.friction_feedforward == 0.0
     feedforwards = always, law.velocity_feedforward == 0.0
     switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    return servo.n, servo.rigid, *limits, law.notch_hz == 0.0, *feedforwards, *switches
+    return structure_of(servo), *limits, law.notch_hz == 0.0, *feedforwards, *switches
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:
@@ -108,7 +108,7 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     servos, laws = ([values[member] for member in which] for values in (members.servos, members.controllers))
     law_places: dict[Controller, int] = {}
     law = np.array([law_places.setdefault(each, len(law_places)) for each in laws])
-    plant_places: dict[tuple[Servo, float], int] = {}
+    plant_places: dict[tuple[Plant, float], int] = {}
     plant = np.array(
         [
             plant_places.setdefault((servo, each.sample_rate or 0.0), len(plant_places))

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from servotwin.control.controller import Controller
-from servotwin.control.laws import Law
+from servotwin.control.laws import AnyController, Law, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
@@ -47,7 +47,7 @@ class Simulation:
     servo : Servo or Axis
     duration : float
         s; the horizon up to which inputs are laid out.
-    controller : Controller or LinearLaw, optional
+    controller : Controller, Cascade or LinearLaw, optional
         The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
     reference : number or signal
         m.
@@ -82,7 +82,7 @@ class Simulation:
         self,
         servo: Plant,
         duration: float,
-        controller: Law | None = None,
+        controller: AnyController | None = None,
         reference: SignalLike = 0.0,
         gap: SignalLike = 0.0,
         tolerance: SignalLike | None = None,
@@ -98,7 +98,7 @@ class Simulation:
         _check_times(duration, sample_rate)
         _check_disturbances(input_bias, friction)
         self.servo = servo
-        self.controller: Law = servo.controller if controller is None else controller
+        self.controller: Law = law_of(servo.controller if controller is None else controller)
         check_encoders(servo, self.controller)
         self.samples = round(duration * sample_rate) + 1
         self.inputs = RunInputs(
@@ -119,9 +119,7 @@ class Simulation:
 
     def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
         servo, law, inputs, samples, keep = self.servo, self.controller, self.inputs, self.samples, self.keep
-        if isinstance(law, LinearLaw) and law.sample_rate is None:
-            raise InvalidInput("law sample_rate = None: a simulation needs its rate in Hz")
-        if not isinstance(law, LinearLaw) and law.sample_rate is None:
+        if law.sample_rate is None:
             source = None if noise is None else noise.source(inputs.sample_rate, rng)
             return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)
         if isinstance(law, LinearLaw):
@@ -166,12 +164,12 @@ class Simulation:
         # Without an offset the reference stays as it is, bit for bit.
         self._follow(self._reference if offset == 0.0 else raised(self._reference, offset))
 
-    def set_controller(self, controller: Law, tolerance: float | None = None) -> None:
+    def set_controller(self, controller: AnyController, tolerance: float | None = None) -> None:
         """Change the controller from the present sample on, without a jump of the voltage.
 
         Parameters
         ----------
-        controller : Controller or LinearLaw
+        controller : Controller, Cascade or LinearLaw
             Of the same kind as the one before, at the same rate. Its difference to the voltage at this instant
             becomes an offset that fades with its `release_time`; a voltage beyond its own limit is cut.
         tolerance : float, optional
@@ -182,19 +180,20 @@ class Simulation:
         InvalidInput
             The sample rate differs, the tolerance is negative, or the simulation has no dead zone.
         """
-        if controller.sample_rate != self.controller.sample_rate:
-            rates = (_described(law.sample_rate) for law in (self.controller, controller))
+        law = law_of(controller)
+        if law.sample_rate != self.controller.sample_rate:
+            rates = (_described(each.sample_rate) for each in (self.controller, law))
             raise InvalidInput("controller sample_rate: a running simulation cannot go from {} to {}".format(*rates))
-        kinds = [type(law).__name__ for law in (self.controller, controller)]
+        kinds = [type(each).__name__ for each in (self.controller, law)]
         if kinds[0] != kinds[1]:
             raise InvalidInput("controller: a running simulation cannot go from a {} to a {}".format(*kinds))
-        check_encoders(self.servo, controller)
+        check_encoders(self.servo, law)
         if tolerance is not None:
             self._check_tolerance(tolerance)
-        if controller == self.controller and tolerance is None:
+        if law == self.controller and tolerance is None:
             return
-        self.engine.set_controller(controller, tolerance)
-        self.controller = controller
+        self.engine.set_controller(law, tolerance)
+        self.controller = law
         if tolerance is not None:
             self.inputs.retune(self.time, tolerance)
 
@@ -255,7 +254,7 @@ def simulate(
     servo: Plant,
     duration: float,
     *,
-    controller: Law | None = None,
+    controller: AnyController | None = None,
     reference: SignalLike = 0.0,
     gap: SignalLike = 0.0,
     tolerance: SignalLike | None = None,
@@ -273,7 +272,7 @@ def simulate(
     servo : Servo or Axis
     duration : float
         s.
-    controller : Controller or LinearLaw, optional
+    controller : Controller, Cascade or LinearLaw, optional
         The servo's own by default. Its ``sample_rate`` decides between the continuous and the sampled loop.
     reference : number or signal
         Reference of the position, m: a number, SCurve, Step, SquareWave, Samples or PiecewiseCubic.

@@ -23,6 +23,7 @@ import msgspec
 import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import METHODS
+from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.fallback import flattened
 from servotwin.twin.settings import TwinSettings
@@ -32,16 +33,19 @@ SOURCES = ("control", "estimation", "hybrid", "messages", "plant", "redesign", "
 LIBRARIES = ("numpy", "scipy", "numba", "llvmlite")
 _BLAS = ("OPENBLAS_NUM_THREADS", "OPENBLAS_CORETYPE", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _MODEL, _SETTINGS = "model", "settings"
+# The file of an axis, instead of the values of a servo.
+_AXIS = f"{_MODEL}.axis"
 _INFINITE = re.compile(r"\binf\b(?!')")
 
 
 @lru_cache(maxsize=256)
-def context_of(servo: Servo, settings: TwinSettings) -> tuple[str, str]:
+def context_of(servo: Plant, settings: TwinSettings) -> tuple[str, str]:
     """(digest, JSON) of the context of a model and its settings in this process.
 
     The JSON is one object of texts: the name of each part, and its value in full.
     """
-    parts = {**surroundings(), **dict(flattened(_MODEL, servo)), **dict(flattened(_SETTINGS, settings))}
+    model = {_AXIS: repr(servo.dumps())} if isinstance(servo, Axis) else dict(flattened(_MODEL, servo))
+    parts = {**surroundings(), **model, **dict(flattened(_SETTINGS, settings))}
     text = json.dumps(parts, sort_keys=True, indent=0)
     return hashlib.sha256(text.encode()).hexdigest()[:32], text
 
@@ -66,7 +70,7 @@ def differing(then: Mapping[str, str], now: Mapping[str, str]) -> tuple[str, ...
     return tuple(f"{key} {then.get(key, 'unknown')} then, {now.get(key, 'unknown')} now" for key in keys)
 
 
-def described(parts: Mapping[str, str]) -> tuple[Servo, TwinSettings]:
+def described(parts: Mapping[str, str]) -> tuple[Plant, TwinSettings]:
     """Return the model and the settings that a context's parts describe.
 
     Raises
@@ -75,7 +79,11 @@ def described(parts: Mapping[str, str]) -> tuple[Servo, TwinSettings]:
         This version cannot read them.
     """
     try:
-        servo = msgspec.convert(_nested(parts, _MODEL), Servo)
+        servo: Plant
+        if _AXIS in parts:
+            servo = Axis.loads(ast.literal_eval(parts[_AXIS]), "the context's model")
+        else:
+            servo = msgspec.convert(_nested(parts, _MODEL), Servo)
         values = {
             "learning": {"learn": False},
             **_nested(parts, _SETTINGS),

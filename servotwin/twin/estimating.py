@@ -14,6 +14,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
+from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.controller import ControllerComparison, compare_controller
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
@@ -24,6 +25,8 @@ from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
 from servotwin.messages import Setting
+from servotwin.plant.actuator import DcMotor
+from servotwin.plant.axis import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
 from servotwin.redesign.policy import NOT_OBSERVED
@@ -50,7 +53,7 @@ def stated_machine(settings: TwinSettings) -> FactorPrior:
     return nameplate(settings.learning, known.k, known.c, known.m)
 
 
-def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
+def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     """Make the estimator that `settings` name, with a servo as its model.
 
     The published estimator starts from the previous gap, as printed. The default one gets the trend's prediction, the
@@ -58,33 +61,40 @@ def estimator_of(servo: Servo, settings: TwinSettings) -> Estimator:
     """
     settings = settings.on(servo)
     options = settings_of(settings.method, settings.estimator)
-    new = stated_machine(settings) if settings.learning.learn and servo.rigid else None
+    model = servo_for(servo)
+    new = stated_machine(settings) if settings.learning.learn and model is not None and model.rigid else None
 
-    def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        if not isinstance(options, whitened.WhitenedSettings):
+    def of_model(window: Window, expected: Expectation) -> GapEstimate:
+        if model is None or not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
         growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
         if new is None or expected.machine is None:
-            return whitened.estimate_carrying(window, servo, expected.prior, growing, expected.offset, new)
-        made = whitened.estimate_carrying(window, servo, expected.prior, growing, expected.offset, expected.machine)
+            return whitened.estimate_carrying(window, model, expected.prior, growing, expected.offset, new)
+        made = whitened.estimate_carrying(window, model, expected.prior, growing, expected.offset, expected.machine)
         if made.status is not GapStatus.MODEL_MISMATCH:
             return made
         # The machine may have been exchanged: its new numbers are then worth knowing, and nothing else yet.
-        other = whitened.estimate_carrying(window, servo, None, growing, None, new)
+        other = whitened.estimate_carrying(window, model, None, growing, None, new)
         return replace(made, machine=other.machine) if other.ok else made
 
-    return estimate
+    def estimate(window: Window, expected: Expectation) -> GapEstimate:
+        return replace(of_model(window, expected), model_version=servo.version)
+
+    return of_model if model is servo else estimate
 
 
-def motor_learning_of(servo: Servo, settings: TwinSettings) -> MotorLearning | None:
-    """Make the learning of the motor's numbers; None where the settings or the servo's elastic screw rule it out."""
-    if not (settings.learning.learn and servo.rigid):
+def motor_learning_of(servo: Plant, settings: TwinSettings) -> MotorLearning | None:
+    """Make the learning of the motor's numbers; None where the settings, an elastic screw or another actuator than a DC
+    motor rule it out."""
+    model = servo_for(servo)
+    drives = isinstance(servo, Servo) or isinstance(servo.actuator, DcMotor)
+    if not settings.learning.learn or model is None or not (model.rigid and drives):
         return None
     known = settings.uncertainty
     # Half-widths within which every value is as likely.
     back_emf, lag = known.k_B / math.sqrt(3.0), known.k_T / math.sqrt(3.0)
     return MotorLearning(
-        servo, settings.learning, max(back_emf, settings.learning.motor_floor), max(lag, settings.learning.motor)
+        model, settings.learning, max(back_emf, settings.learning.motor_floor), max(lag, settings.learning.motor)
     )
 
 

@@ -12,7 +12,7 @@ from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Setting
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import policy_of
@@ -69,7 +69,7 @@ class TwinModel:
     @classmethod
     def of(
         cls,
-        servo: Servo,
+        servo: Plant,
         settings: TwinSettings,
         start: Setting | None = None,
         estimator: Estimator | None = None,
@@ -97,7 +97,7 @@ class TwinModel:
             triage=None if settings.triage is None else Triage(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
-            controller=servo.controller,
+            controller=servo.pidf,
         )
 
     def initial_state(self, servo: str) -> TwinState:

@@ -32,7 +32,8 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
-from servotwin.plant.servo import SERVO_KEY, Servo
+from servotwin.plant.axis import Plant
+from servotwin.plant.servo import SERVO_KEY
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
@@ -50,7 +51,7 @@ class ServoModel:
     Attributes
     ----------
     name : str
-    servo : Servo
+    servo : Servo or Axis
         The model, with the controller that runs.
     settings : TwinSettings
     start : Setting or None
@@ -60,7 +61,7 @@ class ServoModel:
     """
 
     name: str
-    servo: Servo
+    servo: Plant
     settings: TwinSettings
     start: Setting | None = None
 
@@ -168,22 +169,22 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     """Read one table of [models]."""
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is not a name of a model: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
-    servo: Servo = read(table, servo_table, folder)
-    law = read_inner(table, "controller", lambda inner: servo.controller.replace(**changes(inner, Controller)))
+    servo: Plant = read(table, servo_table, folder)
+    law = read_inner(table, "controller", lambda inner: servo.pidf.replace(**changes(inner, Controller)))
     settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder))
     servo.check_loop(law)
-    own = gains_of(law) == gains_of(servo.controller)
+    own = gains_of(law) == gains_of(servo.pidf)
     if checked:
         policy_of(servo.replace(controller=law), settings)
     return ServoModel(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
 
 
-def servo_table(servo: Annotated[Servo, SERVO_KEY]) -> Servo:
+def servo_table(servo: Annotated[Plant, SERVO_KEY]) -> Plant:
     """Return the servo that a model names."""
     return servo
 
 
-def _start(servo: Servo, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
+def _start(servo: Plant, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
     """Setting with which an edge begins, as in `Commissioning.start`; `own`: the gains are the servo's own."""
     if settings.policy == "certified":
         return None if own else Setting(0.0, gains_of(law))

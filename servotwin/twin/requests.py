@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
 
@@ -97,7 +97,7 @@ class Requests:
     widest: float
 
     @classmethod
-    def of(cls, servo: Servo, settings: TwinSettings) -> Requests | None:
+    def of(cls, servo: Plant, settings: TwinSettings) -> Requests | None:
         """Make the part that a twin's settings describe; None: the twin requests nothing."""
         if settings.excitation is None:
             return None

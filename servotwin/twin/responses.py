@@ -10,11 +10,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.messages import LearntResponse, WindowMessage
+from servotwin.plant.axis import Plant
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import DecodedWindow
 from servotwin.twin.settings import TwinSettings
@@ -62,9 +64,10 @@ class Responses:
     retry: float
 
     @classmethod
-    def of(cls, servo: Servo, settings: TwinSettings) -> Responses | None:
+    def of(cls, servo: Plant, settings: TwinSettings) -> Responses | None:
         """Make the part that a twin's settings describe; None: the twin learns no structure."""
-        return cls(servo, settings.retry) if settings.learning.learn and servo.rigid else None
+        model = servo_for(servo)
+        return cls(model, settings.retry) if settings.learning.learn and model is not None and model.rigid else None
 
     def after(
         self,

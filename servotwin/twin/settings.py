@@ -15,8 +15,8 @@ from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.trend_settings import TrendSettings, trend_maker, wear
+from servotwin.plant.axis import Plant
 from servotwin.plant.scales import scales
-from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
@@ -213,7 +213,7 @@ class TwinSettings:
         if getattr(settings_of(self.method, self.estimator), "combine", False):
             raise InvalidInput("twin estimator combine = True: must be False: the trend already combines the windows")
 
-    def on(self, servo: Servo) -> TwinSettings:
+    def on(self, servo: Plant) -> TwinSettings:
         """The settings with what is absent derived for a servo: a slow machine wears slowly, and needs longer windows.
 
         A trend that differs from the default one was stated, and stays.
@@ -227,7 +227,7 @@ class TwinSettings:
             triage=None if self.triage is None else self.triage.on(volt, step),
         )
 
-    def initial_tolerance(self, servo: Servo) -> float:
+    def initial_tolerance(self, servo: Plant) -> float:
         """Tolerance before the first update by Eq 21, m; 0 where no gap is assumed."""
         return servo.tolerance_for(self.initial_gap, 1.0 if self.k_dz is None else self.k_dz)
 

@@ -15,6 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate, MachineReading
 from servotwin.estimation.learning.trend import Trend
@@ -23,7 +24,7 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.quick import NO_SPREAD, MachineSpread, QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.twin.settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")
@@ -139,7 +140,7 @@ def in_vain(message: WindowMessage, state: TriageState) -> str:
 def glance(
     message: WindowMessage,
     window: Window,
-    servo: Servo,
+    servo: Plant,
     state: TriageState,
     offset: tuple[float, float] | None = None,
     settings: TriageSettings | None = None,
@@ -153,7 +154,7 @@ def glance(
         Gives boot, version and reason.
     window : Window
         The window of the message, decoded.
-    servo : Servo
+    servo : Servo or Axis
     state : TriageState
     offset : (float, float), optional
         The encoder's offset from earlier windows, mean and standard deviation, rad.
@@ -168,7 +169,10 @@ def glance(
         return _without_result("the window has no theta_m, or too few samples: what to make of it, the estimator says")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _without_result(state.doubt or "the motor's angle is constant")
-    fit = quick_fit(window, servo, state.gap, offset, machine)
+    model = servo_for(servo)
+    if model is None:
+        return _without_result("only the estimator can read this axis")
+    fit = quick_fit(window, model, state.gap, offset, machine)
     bias, bias_std = quick_bias(window, servo)
     numbers = None if machine is None else machine.reading
     result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "", numbers)
@@ -224,11 +228,11 @@ class Triage:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     settings : TriageSettings
     """
 
-    servo: Servo
+    servo: Plant
     settings: TriageSettings
 
     def glance(
@@ -279,7 +283,10 @@ class Triage:
         if rejection or window is None:
             boot, version = message.boot, message.parameter_version
             return replace(state, doubt=rejection, glances=0, vain=state.vain + 1, boot=boot, version=version)
-        fit = quick_fit(window, self.servo, estimate.gap, _offset(trend), machine)
+        model = servo_for(self.servo)
+        if model is None:
+            return state
+        fit = quick_fit(window, model, estimate.gap, _offset(trend), machine)
         bias, bias_std = quick_bias(window, self.servo)
         return TriageState(
             doubt=self._misled(fit, estimate),

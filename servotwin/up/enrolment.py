@@ -140,7 +140,7 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     """
     model = twin.fleet.model_of(request.servo)
     sampled = request.role == "control" or request.noise > 0.0
-    law = model.servo.controller.replace(sample_rate=request.sample_rate if sampled else None)
+    law = model.servo.pidf.replace(sample_rate=request.sample_rate if sampled else None)
     servo = model.servo.replace(controller=law)
     commissioning = Commissioning(servo, law, model.settings, Recording(request.sample_rate), noise=request.noise)
     commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S)

@@ -170,7 +170,7 @@ def test_integral_action_swings_in_the_gap_and_rests_without() -> None:
         (lambda: Load((1.0, 2.0)), "must have one value for each of the 2 masses"),
         (lambda: TorqueDrive(J=0.0), "actuator J = 0.0 kg m\\^2"),
         (lambda: Sensors(feedback="screw"), "sensors feedback = 'screw': must be one of load, motor"),
-        (lambda: TWO_MASS.replace(gearbox=1), "axis has no part named 'gearbox'"),
+        (lambda: TWO_MASS.replace(gearbox=1), "axis has no part or gain named 'gearbox'"),
         (lambda: TWO_MASS.replace(load=None), "axis load = None: must be a Load"),
         (lambda: TWO_MASS.check_loop(Controller(-60.0, 0.0, 0.0, 0.1)), "unstable on this axis"),
     ],

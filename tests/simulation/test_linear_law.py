@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from law_oracle import numpy_law, sampled_positions
+from law_oracle import ContinuousOracle, continuous_positions, numpy_law, sampled_positions
 from test_axis import TWO_MASS
 
 from servotwin.control.linear_law import LinearLaw
-from servotwin.plant.signals import PiecewiseCubic
+from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.simulation import simulate
 
 RATE = 200.0
@@ -44,6 +44,7 @@ LAWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LAWS)
 def test_a_sampled_law_agrees_with_an_independent_loop(name: str) -> None:
     law, tolerance = LAWS[name]
@@ -58,3 +59,49 @@ def test_a_sampled_law_agrees_with_an_independent_loop(name: str) -> None:
     assert np.abs(run.voltage[:-1] - commands).max() < 1e-8 * np.ptp(commands)
     if tolerance is not None:
         assert {"enter", "leave"} <= set(run.events.kind)
+
+
+# Load's position with an integral, and the motor's speed behind a low-pass of 5 ms; the position error's is the other.
+CONTINUOUS = LinearLaw(
+    A=[[0.0, 0.0], [0.0, -200.0]],
+    B=[[20.0, 0.0, -20.0], [0.0, 200.0, 0.0]],
+    C=[1.0, 40.0 * 200.0],
+    D=[60.0, -40.0 * 200.0, -60.0],
+    names=("integral", "slow angle"),
+    holds=("integral",),
+    windup=(2.0, 0.0),
+)
+ZONED = {
+    "plain": (CONTINUOUS, None),
+    "dead zone": (CONTINUOUS.replace(enter=0.6, leave=1.4), 0.02),
+    "dead zone that opens the loop, on the motor": (CONTINUOUS.replace(on="motor", opens=True), 0.05),
+    "limit": (CONTINUOUS.replace(limit=8.0), None),
+    "both": (CONTINUOUS.replace(limit=8.0, enter=0.6, leave=1.4), 0.02),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ZONED)
+def test_a_continuous_law_agrees_with_an_independent_integrator(name: str) -> None:
+    law, tolerance = ZONED[name]
+    axis, gap = TWO_MASS.replace(controller=law), 0.03
+    axis.check_loop()
+    run = simulate(axis, 6.0, reference=SquareWave(0.2, 6.0), gap=gap, tolerance=tolerance, sample_rate=100.0)
+    oracle = ContinuousOracle(axis, gap, law=law, tolerance=tolerance)
+    expected = continuous_positions(oracle, 0.2, 3.0, run.time[:-1])
+    assert np.abs(run.position[:-1] - expected).max() < 1e-8 * np.ptp(expected)
+    assert oracle.seen >= {"contact"} | ({"zone"} if tolerance else set()) | ({"limit"} if law.limit else set())
+
+
+@pytest.mark.parametrize("name", ZONED)
+def test_a_sampled_tick_tends_to_the_continuous_law(name: str) -> None:
+    law, tolerance = ZONED[name]
+
+    def position(each: LinearLaw) -> np.ndarray:
+        return simulate(
+            TWO_MASS, 1.0, controller=each, reference=0.2, gap=0.03, tolerance=tolerance, sample_rate=100.0
+        ).position
+
+    exact = position(law)
+    errors = [np.abs(position(law.replace(sample_rate=rate)) - exact).max() for rate in (2e4, 1e5)]
+    assert errors[1] < 0.3 * errors[0] < 0.002

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from axis_oracle import Array, AxisOracle
@@ -77,3 +77,125 @@ def sampled_positions(axis: Axis, law: NumpyLaw, gap: float, references: Array, 
         x, _ = oracle.run(x, k / rate, (k + 1) / rate, np.zeros(0))
     positions, commands = np.array(found).T
     return positions, commands
+
+
+@dataclass
+class ContinuousOracle(AxisOracle):
+    """An axis with a continuous linear law, whose states stand behind the axis's own; scipy finds its zones too."""
+
+    law: LinearLaw | None = None
+    tolerance: float | None = None
+    active: bool = True
+    limited: int = 0
+    seen: set[str] = field(default_factory=set)
+
+    def start(self) -> Array:
+        assert self.law is not None
+        return np.zeros(6 + 2 * self.axis.n + self.law.n)
+
+    def split(self, x: Array) -> tuple[Array, Array, Array]:
+        """States of the axis, of the law, and (reference, y_motor, y_load)."""
+        assert self.law is not None
+        n = self.axis.n
+        own, states = x[: 6 + 2 * n], x[6 + 2 * n :]
+        load = self.axis.p * own[3] if self.axis.rigid and n == 1 else own[3 + n]
+        return own, states, np.array([self.reference, own[2], load])
+
+    def wanted(self, x: Array) -> float:
+        """Command before the limit."""
+        assert self.law is not None
+        _, states, y = self.split(x)
+        if self.law.opens and not self.active:
+            return 0.0
+        return float(np.dot(self.law.C, states) + np.dot(self.law.D, y))
+
+    def error(self, x: Array) -> float:
+        """Error that the dead zone looks at."""
+        assert self.law is not None
+        _, _, y = self.split(x)
+        return float(y[0] - (self.law.ratio * y[1] if self.law.on == "motor" else y[2]))
+
+    def command(self, x: Array) -> tuple[float, float]:
+        assert self.law is not None
+        return (self.limited * self.law.limit if self.limited and self.law.limit else self.wanted(x)), 0.0
+
+    def rates(self, t: float, x: Array) -> Array:
+        assert self.law is not None
+        _, states, y = self.split(x)
+        n = self.law.n
+        A, B = np.array(self.law.A).reshape(n, n), np.array(self.law.B).reshape(n, 3)
+        driven = A @ states + (0.0 if self.law.opens and not self.active else B @ y)
+        driven = driven + np.array(self.law.windup) * (self.command(x)[0] - self.wanted(x))
+        if not self.active:
+            driven[[name in self.law.holds for name in self.law.names]] = 0.0
+        return np.concatenate([self._axis_rates(t, x), driven])
+
+    def _axis_rates(self, t: float, x: Array) -> Array:
+        own, u = x[: 6 + 2 * self.axis.n], self.command(x)[0]
+        axis = self.axis.replace(controller=IDLE)
+        held = HeldOracle(axis, self.gap, side=self.side, sliding=self.sliding, held=u)
+        return held.rates(t, own)
+
+    def events(self) -> list[object]:
+        """Ends of the contact mode, of the dead zone and of the limit."""
+        assert self.law is not None
+        law, found = self.law, super().events()
+
+        def zone(_t: float, x: Array) -> float:
+            assert self.tolerance is not None
+            if self.active:
+                return abs(self.error(x)) - law.enter * self.tolerance
+            return law.leave * self.tolerance - abs(self.error(x))
+
+        def limit(_t: float, x: Array) -> float:
+            assert law.limit is not None
+            return self.limited * self.wanted(x) - law.limit if self.limited else law.limit - abs(self.wanted(x))
+
+        wanted = ([zone] if self.tolerance is not None else []) + ([limit] if law.limit is not None else [])
+        for each in wanted:
+            each.terminal, each.direction = True, -1.0  # type: ignore[attr-defined]
+        self.kinds = [*(["contact"] * len(found)), *(each.__name__ for each in wanted)]
+        return [*found, *wanted]
+
+    def settle(self, x: Array) -> None:
+        """Zones that fit the state, where the reference has jumped."""
+        assert self.law is not None
+        if self.tolerance is not None:
+            bound = self.law.enter if self.active else self.law.leave
+            self.active = abs(self.error(x)) > bound * self.tolerance
+        self.limit_again(x)
+
+    def limit_again(self, x: Array) -> None:
+        """Saturation that fits the state."""
+        assert self.law is not None
+        if self.law.limit is not None:
+            wanted = self.wanted(x)
+            self.limited = int(np.sign(wanted)) if abs(wanted) > self.law.limit else 0
+
+    def run(self, x: Array, begin: float, end: float, times: Array) -> tuple[Array, Array]:
+        self.settle(x)
+        return super().run(x, begin, end, times)
+
+    def changed(self, x: Array, now: float, which: int) -> Array:
+        kind = self.kinds[which]
+        self.seen.add(kind)
+        if kind == "contact":
+            return super().changed(x, now, which)
+        if kind == "zone":
+            self.active = not self.active
+        limited = self.limited
+        self.limit_again(x)
+        if kind == "limit" and self.limited == limited:  # at the limit to rounding
+            self.limited = 0 if limited else int(np.sign(self.wanted(x)))
+        return x
+
+
+def continuous_positions(oracle: ContinuousOracle, amplitude: float, half_period: float, times: Array) -> Array:
+    """(N,) position of the load under a square wave that begins with +amplitude."""
+    x, begin, sign, found = oracle.start(), 0.0, 1.0, []
+    while begin < times[-1]:
+        oracle.reference = sign * amplitude
+        x, states = oracle.run(x, begin, begin + half_period, times)
+        found.append(states)
+        begin, sign = begin + half_period, -sign
+    return np.array([oracle.split(state)[2][2] for state in np.concatenate(found)])

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines
@@ -201,12 +201,12 @@ def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -
     return arrival_error(setting, model, members.input_bias, members.friction, step)
 
 
-def arrival_error(setting: Design, model: Servo, input_bias: Array, friction: Array, step: Array | float) -> Array:
+def arrival_error(setting: Design, model: Plant, input_bias: Array, friction: Array, step: Array | float) -> Array:
     """`nearness` for input biases (V) and frictions (N m)."""
     law = setting.controller
     # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the
     # motor against what it answers to the error; what is fed forward for it pushes to one side.
-    held = friction * model.R / model.k_T + abs(law.friction_feedforward)
+    held = model.command_of(friction) + abs(law.friction_feedforward)
     steady = (np.abs(input_bias + law.feedforward) + held) / abs(law.Kp)
     return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from servotwin.control.controller import Controller
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
 from servotwin.redesign.certified.bounds import share_at_least
@@ -42,7 +42,7 @@ _LOTS = (12, 36, 75)
 class Question:
     """Conditions of a verification: the model and its uncertainty, demands, simulations, noise (m rms)."""
 
-    servo: Servo
+    servo: Plant
     uncertainty: Uncertainty
     demands: Demands
     trial: Trial
@@ -89,10 +89,10 @@ class Question:
         law = setting.controller
         if not self.noise:
             return 0.0
-        begin, end = (edge / (2.0 * math.pi * self.servo.controller.Tf) for edge in _NOISE_BAND)
+        begin, end = (edge / (2.0 * math.pi * self.servo.pidf.Tf) for edge in _NOISE_BAND)
         end = end if law.sample_rate is None else 0.5 * law.sample_rate
         effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
-        authority = abs(self.servo.controller.Kp) * self.uncertainty.step[1]
+        authority = abs(self.servo.pidf.Kp) * self.uncertainty.step[1]
         return self.demands.effort_weight * self.trial.unit * effort / authority
 
 
@@ -198,8 +198,8 @@ class Attempt:
         beyond, servo, known = question.demands.beyond, question.servo, question.uncertainty
         if beyond.machines == 0:
             return None
-        force = beyond.friction * abs(servo.controller.Kp) * known.step[0] * servo.k_T / servo.R
-        force = max(known.friction[1], force) if servo.rigid else known.friction[1]
+        force = servo.torque_of(beyond.friction * abs(servo.pidf.Kp) * known.step[0])
+        force = max(known.friction[1], force) if servo.takes_friction else known.friction[1]
         wide = widened(known, question.demands)
         ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))
         members = draw_independently(servo, ranges, beyond.machines, self._seed + 1)
@@ -233,7 +233,7 @@ def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> 
     return ""
 
 
-def _lag(servo: Servo, law: Controller) -> float:
+def _lag(servo: Plant, law: Controller) -> float:
     """s: steady error behind a ramp, per speed; the motor integrates, so a law without integral action lags."""
     if law.Ki:
         return 0.0
@@ -244,7 +244,7 @@ def _lag(servo: Servo, law: Controller) -> float:
     return abs(needed - law.velocity_feedforward) / abs(law.Kp)
 
 
-def _seed(servo: Servo, uncertainty: Uncertainty, setting: Design, seed: int) -> int:
+def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) -> int:
     """Seed that depends on the whole question: equal ones are answered equally, others by other machines.
 
     A feedforward counts by what it leaves of the bias.

@@ -16,7 +16,7 @@ from itertools import islice
 from time import perf_counter
 
 from servotwin.control.controller import Controller
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
@@ -38,7 +38,7 @@ _WORTH = 1.03
 
 
 def certify(
-    servo: Servo,
+    servo: Plant,
     uncertainty: Uncertainty,
     demands: Demands | None = None,
     trial: Trial | None = None,
@@ -53,7 +53,7 @@ def certify(
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         The model; candidates are its own controller with scaled gains, at its sample rate if it has one.
     uncertainty : Uncertainty
     demands : Demands, optional
@@ -99,7 +99,7 @@ def certify(
 
 
 def confirm(
-    servo: Servo,
+    servo: Plant,
     uncertainty: Uncertainty,
     setting: Design,
     demands: Demands,
@@ -149,13 +149,13 @@ def _any_of(kinds: Sequence[Callable[[Design], bool]]) -> Callable[[Design], boo
     return lambda setting: any(of_kind(setting) for of_kind in kinds)
 
 
-def known_bias(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> float:
+def known_bias(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> float:
     """V: an input bias up to this counts as known, since the error that it leaves is a small share of the smallest
     step."""
-    return demands.known * abs(servo.controller.Kp) * uncertainty.step[0]
+    return demands.known * abs(servo.pidf.Kp) * uncertainty.step[0]
 
 
-def is_disturbed(servo: Servo, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
+def is_disturbed(servo: Plant, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
     """True where friction acts, or a bias that is not known."""
     low, high = (bias + feedforward for bias in uncertainty.input_bias)
     return max(abs(low), abs(high)) > known_bias(servo, uncertainty, demands) or uncertainty.friction[1] > 0.0
@@ -170,7 +170,7 @@ def _for_disturbance(demands: Demands, disturbed: bool) -> Demands:
 
 
 def candidates_of(
-    servo: Servo, uncertainty: Uncertainty, demands: Demands, disturbed: bool, noisy: bool
+    servo: Plant, uncertainty: Uncertainty, demands: Demands, disturbed: bool, noisy: bool
 ) -> list[Design]:
     """Every combination of scales, shapes, feedforwards, integral action and dead zone within the bounds on Ms.
 
@@ -199,32 +199,32 @@ def candidates_of(
 
 
 @lru_cache(maxsize=16)
-def _without_zone(servo: Servo, within: tuple[Controller, ...], demands: Demands, step: float) -> tuple[Design, ...]:
+def _without_zone(servo: Plant, within: tuple[Controller, ...], demands: Demands, step: float) -> tuple[Design, ...]:
     """Candidates without a dead zone that stops the whole law, the same for every gap, for a smallest step (m)."""
     laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
     stopped = [each for law in laws if law.Ki for each in _stopped(servo, law, step, demands)]
     return (*(Design(law) for law in laws), *stopped)
 
 
-def _with_velocity(servo: Servo, law: Controller, demands: Demands) -> list[Controller]:
+def _with_velocity(servo: Plant, law: Controller, demands: Demands) -> list[Controller]:
     """A law as it is, and with velocity feedforwards."""
-    needed, own = servo.k_B / servo.p, abs(servo.controller.Kp)
-    shares = demands.velocity if demands.velocity_feedforward and own > 0.0 else ()
+    needed, own = servo.command_per_speed / servo.p, abs(servo.pidf.Kp)
+    shares = demands.velocity if demands.velocity_feedforward and own > 0.0 and needed > 0.0 else ()
     time = _VELOCITY_TIME * needed / own if shares else law.velocity_time
     return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
 
 
-def _with_friction(servo: Servo, laws: list[Controller], friction: float, demands: Demands) -> list[Controller]:
+def _with_friction(servo: Plant, laws: list[Controller], friction: float, demands: Demands) -> list[Controller]:
     """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
     every reversal what it holds against it."""
-    fed = min(friction * servo.R / servo.k_T, demands.friction_limit)
+    fed = min(float(servo.command_of(friction)), demands.friction_limit)
     if not demands.friction_feedforward or not fed:
         return []
-    fed = math.copysign(fed, servo.controller.Kp)
+    fed = math.copysign(fed, servo.pidf.Kp)
     return [law.replace(friction_feedforward=fed) for law in laws if not law.Ki]
 
 
-def _stopped(servo: Servo, law: Controller, step: float, demands: Demands) -> list[Design]:
+def _stopped(servo: Plant, law: Controller, step: float, demands: Demands) -> list[Design]:
     """A law with dead zones that stop its integral only, for a smallest step (m)."""
     counts = COUNTS * servo.position_resolution
     zones = [(share * step + counts, leave) for share, leave in demands.stops]
@@ -247,7 +247,7 @@ def _ranked_in_stages(
     The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
     would otherwise take turns, whenever the evidence moves a little.
     """
-    own = _gains(question.servo.controller)
+    own = _gains(question.servo.pidf)
     plain = [setting for setting in candidates if not setting.controller.Ki]
     if plain and len(plain) < len(candidates):
         fed = _velocities(screening.ranked(plain), own)

@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.trial import Trial
@@ -56,7 +56,7 @@ _decoder = msgspec.msgpack.Decoder(CertificateFile)
 
 
 @lru_cache(maxsize=16)
-def fallback_certificate(servo: Servo, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> Certificate:
+def fallback_certificate(servo: Plant, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> Certificate:
     """Return the certificate of the setting for all of the uncertainty: from the cache, or verified now.
 
     Raises

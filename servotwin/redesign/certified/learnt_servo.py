@@ -8,6 +8,7 @@ import numpy as np
 
 from servotwin.estimation.learning.motor import BACK_EMF, LAG, LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
+from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
@@ -26,22 +27,22 @@ def narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
 
 
 def learnt_servo(
-    servo: Servo, known: Uncertainty, machine: FactorPrior | None, motor: LearntMotor | None
-) -> tuple[Servo, LearntFactors] | None:
+    servo: Plant, known: Uncertainty, machine: FactorPrior | None, motor: LearntMotor | None
+) -> tuple[Plant, LearntFactors] | None:
     """The servo with its learnt numbers, and what is left open of them; None: nothing was learnt.
 
     The motor's numbers count where the windows told more of them than was stated.
     """
     names, variances = list[str](), list[Array]()
     if machine is not None:
-        servo = adapted(servo, machine.mean)
+        servo = adapted(servo, machine.mean) if isinstance(servo, Servo) else _scaled(servo, machine.mean)
         names += ["k", "c", "p"]
         variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))
     if motor is not None:
         for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
             relative = motor.std(index) / (1.0 + motor.mean[index])
             if math.sqrt(3.0) * relative < _WELL_KNOWN * width:
-                servo = servo.replace(**{name: getattr(servo, name) * (1.0 + motor.mean[index]) ** sign})
+                servo = servo.scaled({name: (1.0 + motor.mean[index]) ** sign})
                 names.append(name)
                 variances.append(np.array([[relative**2]]))
     if not names:
@@ -52,3 +53,8 @@ def learnt_servo(
     covariance = block_diag(*variances)
     spread = tuple(tuple(row) for row in covariance.tolist())
     return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
+
+
+def _scaled(axis: Axis, factors: Array) -> Axis:
+    """The axis with other logarithms of stiffness, damping and ratio; a ratio of masses stays the model's."""
+    return axis.scaled(dict(zip(("k", "c", "p"), map(math.exp, factors[:3].tolist()), strict=True)))

@@ -11,9 +11,9 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Plant
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
-from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 
@@ -37,7 +37,7 @@ def widened(uncertainty: Uncertainty, demands: Demands) -> Uncertainty:
 
 
 @lru_cache(maxsize=16)
-def plant_set(servo: Servo, uncertainty: Uncertainty, rate: float | None) -> PlantSet:
+def plant_set(servo: Plant, uncertainty: Uncertainty, rate: float | None) -> PlantSet:
     """The model, the corners of the uncertainty and plants within, for a law with this rate."""
     servos = extreme_plants(servo, uncertainty, _WITHIN, seed=0)
     return PlantSet.of([each.plant() for each in servos], rate)
@@ -49,12 +49,12 @@ def delays_of(law: Controller, uncertainty: Uncertainty) -> tuple[int, ...]:
 
 
 @lru_cache(maxsize=256)
-def loop_margins(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
+def loop_margins(servo: Plant, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
     """Margins of a law on the model and over all plants of an uncertainty.
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     uncertainty : Uncertainty
         Of the plant alone, as `widened` makes it: equal ones share a stored result.
     law : Controller
@@ -79,7 +79,7 @@ def loop_margins(servo: Servo, uncertainty: Uncertainty, law: Controller) -> Loo
 
 
 @lru_cache(maxsize=256)
-def nominal_margins(servo: Servo, law: Controller) -> Margins:
+def nominal_margins(servo: Plant, law: Controller) -> Margins:
     """Margins of a law on the model itself, at the law's own rate."""
     if law.sample_rate is None:
         return servo.margins(law)
@@ -93,13 +93,13 @@ def nominal_margins(servo: Servo, law: Controller) -> Margins:
 
 @lru_cache(maxsize=16)
 def laws_within(
-    servo: Servo, uncertainty: Uncertainty, demands: Demands, integral: tuple[float, ...]
+    servo: Plant, uncertainty: Uncertainty, demands: Demands, integral: tuple[float, ...]
 ) -> tuple[Controller, ...]:
     """Scaled controllers that are stable on all plants and keep to the bounds on Ms.
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
     uncertainty : Uncertainty
         Of the plant alone, as `widened` makes it.
     demands : Demands
@@ -111,9 +111,9 @@ def laws_within(
     InvalidInput
         There is none.
     """
-    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
-    delays = delays_of(servo.controller, uncertainty)
-    own = servo.controller
+    plants = plant_set(servo, uncertainty, servo.pidf.sample_rate)
+    delays = delays_of(servo.pidf, uncertainty)
+    own = servo.pidf
     notched = with_notch(servo) if demands.notch else None
     known: dict[Controller, bool] = {}
 
@@ -157,7 +157,7 @@ def _lively(laws: list[Controller], passes: Callable[[Controller], bool], always
     return [law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law)]
 
 
-def with_notch(servo: Servo) -> Controller | None:
+def with_notch(servo: Plant) -> Controller | None:
     """The servo's controller with a notch at the first resonance of its structure; None: nothing resonates, or at a
     frequency that a sampled law hardly resolves."""
     poles = servo.plant().poles()
@@ -167,13 +167,13 @@ def with_notch(servo: Servo) -> Controller | None:
         return None
     first = complex(resonant[np.argmin(np.abs(resonant))])
     hertz, damping = abs(first) / (2.0 * math.pi), -first.real / abs(first)
-    rate = servo.controller.sample_rate
+    rate = servo.pidf.sample_rate
     if rate is not None and hertz > _RESOLVED * rate:
         return None
     # Rounded: what a window adds to a learnt resonance is not worth another notch.
     hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
     depth = min(0.9, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
-    return servo.controller.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
+    return servo.pidf.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
 def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demands: Demands) -> bool:
@@ -185,10 +185,10 @@ def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demand
 
 
 def _none_within(
-    servo: Servo, uncertainty: Uncertainty, demands: Demands, plants: PlantSet, laws: list[Controller]
+    servo: Plant, uncertainty: Uncertainty, demands: Demands, plants: PlantSet, laws: list[Controller]
 ) -> str:
     """Reason why none of the laws is within the bounds."""
-    rate, delays = servo.controller.sample_rate, delays_of(servo.controller, uncertainty)
+    rate, delays = servo.pidf.sample_rate, delays_of(servo.pidf, uncertainty)
     at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
     stable = [law for law in laws if _stable(plants, law, delays)]
     peaks = [max(float(plants.peaks(law, delay).max()) for delay in delays) for law in stable]
@@ -216,7 +216,7 @@ def unfed(law: Controller) -> Controller:
     return plain.replace(velocity_feedforward=0.0, velocity_time=1.0, friction_feedforward=0.0)
 
 
-def margins_in_every_zone(servo: Servo, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
+def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
     """`loop_margins`, for a dead zone that stops the integral only the worse of those with and without the integral."""
     acting = loop_margins(servo, uncertainty, unfed(law))
     if not law.integral_only:

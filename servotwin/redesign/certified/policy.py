@@ -14,7 +14,7 @@ from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
@@ -65,7 +65,7 @@ class CertifiedPolicy:
 
     Parameters
     ----------
-    servo : Servo
+    servo : Servo or Axis
         The model.
     uncertainty : Uncertainty
         Prior knowledge, before any window; the fallback set is verified for its range of gaps.
@@ -80,7 +80,7 @@ class CertifiedPolicy:
         s, from which the certificates' computing times are taken.
     """
 
-    servo: Servo
+    servo: Plant
     uncertainty: Uncertainty = field(default_factory=lambda: Uncertainty(input_bias=(-0.1, 0.1)))
     demands: Demands = field(default_factory=Demands)
     trial: Trial | None = None
@@ -104,7 +104,7 @@ class CertifiedPolicy:
     @property
     def smallest_answer(self) -> float:
         """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
-        return abs(self.servo.controller.Kp) * self.uncertainty.step[0]
+        return abs(self.servo.pidf.Kp) * self.uncertainty.step[0]
 
     @property
     def bias_floor(self) -> float:
@@ -150,13 +150,13 @@ class CertifiedPolicy:
         return self.verify_on(self.servo, region.within(self.uncertainty), region, running)
 
     def verify_on(
-        self, servo: Servo, known: Uncertainty, region: Region, running: Setting | None
+        self, servo: Plant, known: Uncertainty, region: Region, running: Setting | None
     ) -> Certificate | NotVerified:
         """Verify as `verify` does, on a servo with an uncertainty of its own."""
         demands, trial = self.demands_within_band(), self.simulations
         fed, in_force = region.feedforward, None
         if running is not None and running.gains is not None:
-            in_force = Design(with_gains(servo.controller, running.gains), running.tolerance)
+            in_force = Design(with_gains(servo.pidf, running.gains), running.tolerance)
         return certify(servo, known, demands, trial, fed, region.noise, self.clock, in_force)
 
     def confirm(
@@ -304,7 +304,7 @@ class CertifiedPolicy:
         motor, servo = self._motor(evidence), self.servo
         learnt = learnt_servo(servo, self.uncertainty, None, evidence.motor)
         # Learnt as a voltage: as a torque it is that of the motor on which it is simulated.
-        torque = (servo if learnt is None else learnt[0]).k_T / servo.R
+        torque = (servo if learnt is None else learnt[0]).torque_of(1.0)
         if motor is not None:
             least, most = motor.friction
             # Friction that is not significant counts at most as stated.
@@ -326,7 +326,7 @@ class _LearntVerifier:
     """
 
     policy: CertifiedPolicy
-    servo: Servo
+    servo: Plant
     learnt: LearntFactors
     provisional: ClassVar[bool] = False
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.assess import nearness, stillness
 from servotwin.redesign.certified.certificate import RampResult
@@ -18,7 +18,7 @@ _RAMP = 12.0
 _PLANTS = 2
 
 
-def follow_ramp(servo: Servo, uncertainty: Uncertainty, setting: Design, trial: Trial, seed: int) -> RampResult:
+def follow_ramp(servo: Plant, uncertainty: Uncertainty, setting: Design, trial: Trial, seed: int) -> RampResult:
     """Simulate a ramp to the largest step, its reversal, and the stop where it began.
 
     It runs on the model and on a drawn plant, each with the largest and the smallest gap.

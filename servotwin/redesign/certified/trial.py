@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from servotwin.control.controller import Controller
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,
@@ -63,7 +63,7 @@ class Trial:
         return self.duration / _LENGTH if self.period is None else self.period
 
 
-def trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Trial:
+def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
     """Trial that a servo needs: long enough for its slowest mode, sampled fast enough for its fastest motion.
 
     Raises
@@ -75,16 +75,16 @@ def trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Trial
 
 
 @lru_cache(maxsize=16)
-def _trial_for(servo: Servo, uncertainty: Uncertainty, demands: Demands) -> Trial:
+def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
     laws = laws_within(servo, uncertainty, demands, (0.0,))
-    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
+    plants = plant_set(servo, uncertainty, servo.pidf.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
-    loop = nominal_margins(servo, unfed(_reference(servo.controller, laws)))
+    loop = nominal_margins(servo, unfed(_reference(servo.pidf, laws)))
     crossover = loop.gain_crossovers[-1].omega if loop.gain_crossovers else slowest
     duration = max(_LENGTH / crossover, _DECAYS / slowest)
     resonance = loop.Ms_omega if loop.Ms_omega < math.inf else 0.0
     rate = min(max(_SAMPLING * crossover, _RESONANCE * resonance), _MOST_SAMPLES / duration)
-    sampled = servo.controller.sample_rate
+    sampled = servo.pidf.sample_rate
     if sampled is not None:
         rate = sampled / max(1, round(sampled / rate))
     return Trial(duration, _JUDGED * duration, rate, None, 1.0 / crossover)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.servo import Servo
+from servotwin.plant.axis import Plant
 from servotwin.redesign.certified.sobol import sobol
 
 Range = tuple[float, float]
@@ -194,14 +194,14 @@ class SimulatedMachines:
 
     Attributes
     ----------
-    plants : tuple of P Servo
+    plants : tuple of P Servo or Axis
     gap, step, input_bias, theta_d0, friction, delay : (P, C) array
         rad, m, V, rad, N m, samples.
     whole : SimulatedMachines, optional
         Those that these are a part of.
     """
 
-    plants: tuple[Servo, ...]
+    plants: tuple[Plant, ...]
     gap: Array
     step: Array
     input_bias: Array
@@ -211,7 +211,7 @@ class SimulatedMachines:
     whole: SimulatedMachines | None = None
 
     @property
-    def model(self) -> Servo:
+    def model(self) -> Plant:
         """The servo in whose units errors are judged: the first of all machines."""
         return self.plants[0] if self.whole is None else self.whole.model
 
@@ -232,7 +232,7 @@ class SimulatedMachines:
         return SimulatedMachines(plants, **conditions, whole=self)
 
 
-def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> SimulatedMachines:
+def draw(servo: Plant, uncertainty: Uncertainty, plants: int, conditions: int, seed: int = 0) -> SimulatedMachines:
     """Draw `plants` times `conditions` machines, spread evenly (scrambled Sobol); equal calls draw equal machines.
 
     The first plant is the model itself. The first two conditions of every plant have the largest and the smallest gap
@@ -244,7 +244,7 @@ def draw(servo: Servo, uncertainty: Uncertainty, plants: int, conditions: int, s
     return _machines(drawn_plants(servo, uncertainty, plants, seed), uncertainty, places)
 
 
-def draw_independently(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> SimulatedMachines:
+def draw_independently(servo: Plant, uncertainty: Uncertainty, count: int, seed: int) -> SimulatedMachines:
     """Draw `count` machines independently of one another, each a plant of its own in one condition.
 
     Shares of such machines are binomial, which those of an even spread are not.
@@ -254,7 +254,7 @@ def draw_independently(servo: Servo, uncertainty: Uncertainty, count: int, seed:
     return _machines(_scaled_plants(servo, factors), uncertainty, rng.random((count, 1, _CONDITIONS)))
 
 
-def drawn_plants(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Servo, ...]:
+def drawn_plants(servo: Plant, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Plant, ...]:
     """The model and `count` - 1 plants drawn about it."""
     return _plants(servo, parameters_of(uncertainty), count, seed)
 
@@ -266,7 +266,7 @@ def parameters_of(uncertainty: Uncertainty) -> Uncertainty:
     )
 
 
-def extreme_plants(servo: Servo, uncertainty: Uncertainty, more: int, seed: int) -> tuple[Servo, ...]:
+def extreme_plants(servo: Plant, uncertainty: Uncertainty, more: int, seed: int) -> tuple[Plant, ...]:
     """The model, every corner of the parameters' ranges, and `more` plants within.
 
     Corners of learnt parameters are two standard deviations off along each axis of their covariance.
@@ -282,7 +282,7 @@ def extreme_plants(servo: Servo, uncertainty: Uncertainty, more: int, seed: int)
 
 
 @lru_cache(maxsize=16)
-def _plants(servo: Servo, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Servo, ...]:
+def _plants(servo: Plant, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Plant, ...]:
     factors = _factors(uncertainty, _sobol(len(PARAMETERS), count, seed))
     factors[0] = 1.0
     return _scaled_plants(servo, factors)
@@ -299,7 +299,7 @@ def _factors(uncertainty: Uncertainty, places: Array) -> Array:
     return np.asarray(factors)
 
 
-def _machines(plants: tuple[Servo, ...], uncertainty: Uncertainty, places: Array) -> SimulatedMachines:
+def _machines(plants: tuple[Plant, ...], uncertainty: Uncertainty, places: Array) -> SimulatedMachines:
     """Machines of plants for (P, C, conditions) places in 0 .. 1."""
     gap = _spread(uncertainty.gap, places[..., 0])
     step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), places[..., 1]))
@@ -314,7 +314,7 @@ def _machines(plants: tuple[Servo, ...], uncertainty: Uncertainty, places: Array
     )
 
 
-def _scaled_plants(servo: Servo, factors: Array) -> tuple[Servo, ...]:
+def _scaled_plants(servo: Plant, factors: Array) -> tuple[Plant, ...]:
     return tuple(servo.scaled(dict(zip(PARAMETERS, row, strict=True))) for row in factors.tolist())
 
 

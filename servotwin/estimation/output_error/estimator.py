@@ -1,0 +1,128 @@
+"""Gap of an axis whose shaft is free in the gap, or of one mass behind a rigid screw, by an output-error fit.
+
+The load's motion under the measured motion of the motor is simulated exactly, contacts included, and fitted to the
+measured position with the axis's numbers free within what is known of them. docs/estimator.md explains it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.axis_model import has_servo
+from servotwin.estimation.core.visible import counted
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
+from servotwin.estimation.output_error.fit import Problem, Search, search
+from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
+from servotwin.estimation.output_error.settings import OutputErrorSettings
+from servotwin.estimation.output_error.verdict import Verdict, judge
+from servotwin.estimation.paper.zero_phase import ZeroPhase
+from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
+from servotwin.plant.basis import Play
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import Array
+
+__all__ = ["METHOD", "OutputErrorSettings", "estimate", "shortest_window"]
+
+METHOD = "output_error"
+SHORTEST = 400  # samples
+_LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
+_SAMPLES_LATE = 3.0
+_CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
+
+
+def shortest_window(_settings: OutputErrorSettings, _axis: object, sample_rate: float) -> tuple[float, str]:
+    """Shortest window (s) at a sample rate (Hz), and the reason in words."""
+    return SHORTEST / sample_rate, f"method {METHOD!r}, which needs {SHORTEST} samples"
+
+
+def estimate(
+    window: Window, axis: Axis | Servo, prior: float | GapEstimate | None, settings: OutputErrorSettings | None
+) -> GapEstimate:
+    """Estimate the total gap (rad at the motor) from a window with theta_m and position.
+
+    Parameters
+    ----------
+    window : Window
+    axis : Axis
+        With a shaft that is free in the gap, or one mass behind a rigid transmission.
+    prior : float or GapEstimate, optional
+        Total gap, rad: one of the starts.
+    settings : OutputErrorSettings, optional
+
+    Raises
+    ------
+    InvalidInput
+        Another kind of axis, no theta_m, a window too short.
+    """
+    settings = settings or OutputErrorSettings()
+    theta_m = _checked(window, axis)
+    assert isinstance(axis, Axis)
+    blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
+    still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
+    if still:
+        return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
+    expected = prior.gap if isinstance(prior, GapEstimate) else prior
+    problem = _problem(window, theta_m, axis, settings)
+    found = search(problem, 0.5 * axis.p * (expected or 0.0))
+    unit = 2.0 / axis.p
+    return _stated(blank, found, judge(found, settings, unit), unit)
+
+
+def _checked(window: Window, axis: Axis | Servo) -> Array:
+    """The motor's angle of a window that can be fitted."""
+    if isinstance(axis, Servo) or has_servo(axis):
+        raise InvalidInput(
+            f"method {METHOD!r} is for a shaft that is free in the gap, or one mass behind a rigid transmission: "
+            'give method = "whitened"'
+        )
+    if axis.play is Play.HELD:
+        raise InvalidInput(
+            'transmission in_gap = "held" with a finite k_d and one mass: no method estimates this gap; describe the '
+            'transmission as "free", or as rigid'
+        )
+    if window.theta_m is None:
+        raise InvalidInput(f"{window.where}the window has no theta_m: method {METHOD!r} needs the motor's angle in rad")
+    if window.position.size < SHORTEST:
+        size = window.position.size
+        raise InvalidInput(f"{window.where}the window has {size} samples: method {METHOD!r} needs at least {SHORTEST}")
+    return window.theta_m
+
+
+def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings) -> Problem:
+    """The window with its model."""
+    interval = 1.0 / window.sample_rate
+    at_motor = max(axis.encoder_resolution, counted(theta_m))
+    at_load = max(axis.sensors.position_resolution, counted(window.position))
+    free, late = axis.play is Play.FREE, _SAMPLES_LATE * interval
+    if free:
+        own = math.sqrt(axis.transmission.k_d / axis.load.m[0])
+        late = max(late, _LATE / own)
+        theta_m = _smooth(theta_m, _CUT * own / (2.0 * math.pi), window.sample_rate) if at_motor > 0.0 else theta_m
+    priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
+    model: MotionModel = ShaftModel(axis, priors) if free else PlayModel(axis, priors)
+    return Problem(model, axis.p * theta_m, window.position, interval, math.hypot(axis.p * at_motor, at_load))
+
+
+def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:
+    """(N,) angle without its counts; as it is where the cut-off (Hz) is too high for the sample rate (Hz)."""
+    if cutoff >= 0.4 * rate:
+        return theta_m
+    return ZeroPhase(cutoff, 3, rate, "odd", min(round(rate / cutoff), theta_m.size - 1)).respond(theta_m)
+
+
+def _stated(blank: GapEstimate, found: Search, verdict: Verdict, unit: float) -> GapEstimate:
+    """Fill a blank estimate."""
+    rms = float(np.sqrt(np.mean(found.best.raw**2)))
+    made = replace(blank, status=verdict.status, reasons=verdict.reasons, rms=rms, evaluations=found.best.evaluations)
+    gap, total = unit * verdict.half, unit * verdict.std_total
+    if verdict.status is GapStatus.LOWER_BOUND:
+        return replace(made, gap=gap, interval=(gap, math.inf))
+    if verdict.status is not GapStatus.OK:
+        return made
+    interval = max(0.0, gap - NORMAL_95 * total), gap + NORMAL_95 * total
+    return replace(made, gap=gap, std=unit * verdict.std, std_total=total, interval=interval)

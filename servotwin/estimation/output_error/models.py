@@ -1,0 +1,219 @@
+"""The two models: a load behind an elastic shaft that is free in the gap, and one mass on a rigid screw."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from servotwin.estimation.output_error.shaft import run_shaft
+from servotwin.plant.axis import Axis
+from servotwin.plant.backlash import play
+from servotwin.plant.signals import Array
+from servotwin.plant.structure import chain
+
+_FASTEST = 1.2  # of a sample: the largest rate of the flow times the interval, for the Taylor series to converge
+_EXPONENTIAL = 20  # terms of the series, for a norm below one
+_RELAXED = 12.0  # a shaft that relaxes faster than that in a sample is taken as relaxed
+
+
+class Motion(NamedTuple):
+    """A simulated window.
+
+    Attributes
+    ----------
+    position, velocity, driven : (N,) arrays
+        Last mass and driven end, at the load.
+    sides : (N,) int8 array
+        Flank in contact, -1, 0 or 1.
+    """
+
+    position: Array
+    velocity: Array
+    driven: Array
+    sides: NDArray[np.int8]
+
+
+class Unknown(NamedTuple):
+    """One unknown of a model: name, standard deviation beforehand (inf: nothing known), and unit of its size.
+
+    The unit is "load" (m or rad at the load), "speed" (that per s), "time" (s), "factor" (a logarithm), or "damping": a
+    factor on a number that is hardly ever known.
+    """
+
+    name: str
+    std: float
+    unit: str
+
+
+class MotionModel(Protocol):
+    """Model of a window: its unknowns and its motion. The first two unknowns are half gap and offset, at the load."""
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]: ...
+    @property
+    def speed(self) -> float: ...
+    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion: ...
+    def start(self, half: float, offset: float, first: tuple[float, float]) -> Array: ...
+
+
+class Priors(NamedTuple):
+    """Relative standard deviations of the model's numbers beforehand, and that of the delay, s."""
+
+    stiffness: float
+    damping: float
+    mass_ratio: float
+    ratio: float
+    delay: float
+
+
+_COMMON = ("half gap", "offset", "delay", "ratio")
+HALF, OFFSET, DELAY, RATIO = range(4)
+
+
+def _common(priors: Priors) -> tuple[Unknown, ...]:
+    return (
+        Unknown("half gap", math.inf, "load"),
+        Unknown("offset", math.inf, "load"),
+        Unknown("delay", priors.delay, "time"),
+        Unknown("ratio", priors.ratio, "factor"),
+    )
+
+
+@dataclass(frozen=True)
+class ShaftModel:
+    """Chain of masses behind an elastic shaft that is free in the gap."""
+
+    axis: Axis
+    priors: Priors
+
+    @property
+    def speed(self) -> float:
+        """Rate of the first observer, 1/s: the shaft's own frequency."""
+        return math.sqrt(self.axis.transmission.k_d / self.axis.load.m[0])
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """Half gap, offset of the motor's encoder, delay, ratio; factors; first positions and speeds of the masses."""
+        load, known = self.axis.load, self.priors
+        factors = [Unknown("shaft stiffness", known.stiffness, "factor")]
+        if self.axis.transmission.c_d > 0.0:
+            factors.append(Unknown("shaft damping", known.damping, "damping"))
+        if any(load.c):
+            factors.append(Unknown("load damping", known.damping, "damping"))
+        if any(load.k):
+            factors.append(Unknown("load stiffness", known.stiffness, "factor"))
+        if load.n > 1:
+            factors.append(Unknown("mass ratio", known.mass_ratio, "factor"))
+        if not load.free:
+            factors.append(Unknown("position offset", math.inf, "load"))
+        places = [Unknown(f"q{i + 1}", math.inf, "load") for i in range(load.n)]
+        speeds = [Unknown(f"v{i + 1}", math.inf, "speed") for i in range(load.n)]
+        return (*_common(known), *factors, *places, *speeds)
+
+    def start(self, half: float, offset: float, first: tuple[float, float]) -> Array:
+        """Unknowns (u,) at the model's numbers, for the last mass's first position and speed."""
+        values = np.zeros(len(self.unknowns))
+        n = self.axis.n
+        values[[HALF, OFFSET]] = half, offset
+        values[-2 * n : -n], values[-n:] = first
+        return values
+
+    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
+        """Motion under the motor's motion (N,) at the load, for unknowns (u,).
+
+        With a `rate` (1/s) above 0 an observer of that speed pulls the last mass towards the measured position (N,).
+        """
+        n = self.axis.n
+        named = {unknown.name: value for unknown, value in zip(self.unknowns, values.tolist(), strict=True)}
+        factors = tuple(
+            math.exp(named.get(name, 0.0))
+            for name in ("shaft stiffness", "shaft damping", "load damping", "load stiffness", "mass ratio")
+        )
+        flows, steps, push, fine = _matrices(self.axis, factors, interval)
+        driven = math.exp(named["ratio"]) * drive + named["offset"]
+        if fine > 1:
+            at = np.arange((driven.size - 1) * fine + 1) / fine
+            driven = np.interp(at, np.arange(driven.size), driven)
+        state = np.concatenate([values[-2 * n :], [values[-2 * n], 0.0]])
+        out, sides = np.empty((3, driven.size)), np.empty(driven.size, dtype=np.int8)
+        work = np.empty((18 + 14 // state.size, state.size))
+        half = math.exp(named["ratio"]) * abs(named["half gap"])
+        zero = named.get("position offset", 0.0)
+        gains = 2.0 * rate * interval, rate * rate * interval
+        run_shaft(driven, interval / fine, half, flows, steps, push, measured - zero, gains, work, state, out, sides)
+        position, velocity, end = out[:, ::fine]
+        return Motion(position + zero, velocity, end, sides[::fine])
+
+
+@lru_cache(maxsize=64)
+def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, Array, Array, int]:
+    """Flows and steps (2, size, size) in the gap and in contact, the force's row, parts of a sample that are needed."""
+    k_d, c_d, c, k, ratio = factors
+    load, shaft, n = axis.load, axis.transmission, axis.n
+    masses = load.masses.copy()
+    masses[-1] *= ratio
+    k_d, c_d = k_d * shaft.k_d, c_d * shaft.c_d
+    links = chain(masses, k * load.stiffnesses, c * load.dampings, k_d, c_d)
+    size, rate = 2 * n + 2, k_d / c_d if c_d > 0.0 else math.inf
+    flows, push = np.zeros((2, size, size)), np.zeros(size)
+    flows[0, : 2 * n, : 2 * n], flows[1, : 2 * n, : 2 * n] = links.A_open, links.A
+    flows[1, : 2 * n, 2 * n], flows[1, : 2 * n, 2 * n + 1] = links.B_position, links.B_velocity
+    flows[1, 2 * n, 2 * n + 1] = 1.0
+    flows[0, 2 * n, n] = 1.0
+    if rate * interval < _RELAXED:
+        flows[0, 2 * n, [0, 2 * n]] = rate, -rate
+    push[: 2 * n], push[2 * n :] = links.reaction, (k_d, c_d)
+    fastest = max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
+    fine = max(1, math.ceil(fastest * interval / _FASTEST))
+    steps = np.array([_exponential(flow * interval / fine) for flow in flows])
+    return flows, steps, push, fine
+
+
+def _exponential(matrix: Array) -> Array:
+    """Exponential of a small matrix by its series, scaled and squared: scipy's starts threads for it."""
+    halvings = max(0, math.ceil(math.log2(max(1e-300, float(np.abs(matrix).sum(axis=1).max())))))
+    part = matrix / 2.0**halvings
+    term = result = np.eye(len(matrix))
+    for k in range(1, _EXPONENTIAL):
+        term = term @ part / k
+        result = result + term
+    for _ in range(halvings):
+        result = result @ result
+    return result
+
+
+@dataclass(frozen=True)
+class PlayModel:
+    """One mass on a rigid screw: the play operator."""
+
+    axis: Axis
+    priors: Priors
+
+    @property
+    def speed(self) -> float:
+        """No observer."""
+        return 0.0
+
+    @property
+    def unknowns(self) -> tuple[Unknown, ...]:
+        """Half gap, offset of the position, delay, ratio, first place of the screw."""
+        return (*_common(self.priors), Unknown("first place", math.inf, "load"))
+
+    def start(self, half: float, offset: float, first: tuple[float, float]) -> Array:
+        """Unknowns (u,) for a first position of the mass."""
+        return np.array([half, offset, 0.0, 0.0, first[0]])
+
+    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
+        """Motion under the motor's motion (N,) at the load, for unknowns (u,); there is nothing to observe."""
+        del measured, rate
+        half, offset, _, ratio, first = values.tolist()
+        driven, half = math.exp(ratio) * drive + offset, math.exp(ratio) * abs(half)
+        place = play(driven, 2.0 * half, first)
+        lead = driven - place
+        sides = np.where(np.abs(lead) >= half * (1.0 - 1e-9), np.sign(lead), 0.0).astype(np.int8)
+        return Motion(place, np.gradient(place, interval), place, sides)

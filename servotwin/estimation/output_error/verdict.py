@@ -1,0 +1,142 @@
+"""Verdict on a fit: status, reasons and spread of a gap."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.estimation.estimate import NORMAL_95, GapStatus
+from servotwin.estimation.output_error.fit import Fit, Search, one_flank
+from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.settings import OutputErrorSettings
+from servotwin.plant.signals import Array
+
+_BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
+_RIVAL = 30.0  # the same of another gap that explains the window as well
+_UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
+_APART = 4.0  # standard deviations between the halves of a window
+_UNEXPLAINED = 0.05  # of the position's variation
+_CHANCE = 2.0  # times the usual variance of an average of white noise
+_TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
+_BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the way off a flank; smallest bound that says anything
+# The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
+_DOUBT = 1.5  # interval over the computed one
+_ROUNDED = 0.6  # of a count: standard deviation of an error that does not average out
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Status of a gap with its spread, all at the load.
+
+    Attributes
+    ----------
+    status : GapStatus
+    half : float
+        Half gap, or half the lower bound.
+    std, std_total : float
+        Of the half gap.
+    reasons : tuple of str
+    """
+
+    status: GapStatus
+    half: float
+    std: float
+    std_total: float
+    reasons: tuple[str, ...]
+
+
+def judge(found: Search, settings: OutputErrorSettings, unit: float) -> Verdict:
+    """Decide on a fit; `unit` is the total gap at the motor (rad) per half gap at the load, for the words."""
+    best, problem = found.best, found.problem
+    half = float(best.values[HALF])
+    std = settings.calibration * best.std(HALF, found.free)
+    total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count)
+    mismatches = _mismatches(found)
+    if mismatches:
+        return Verdict(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)
+    single, off = one_flank(found)
+    rise = (single.cost - best.cost) / best.variance()
+    if rise < _BELIEVED:
+        bound = _BOUND * off - 2.0 * float(np.std(single.raw)) - problem.count
+        enough = bound > _BOUND_COUNTS * problem.count
+        words = "one flank explains the window nearly as well as two"
+        status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
+        return Verdict(status, 0.5 * bound if enough else math.nan, math.inf, math.inf, (words,))
+    doubts = tuple(filter(None, (_wide(found, half, std, settings, unit), _rival(found, half, total, unit))))
+    status = GapStatus.UNIDENTIFIABLE if doubts else GapStatus.OK
+    return Verdict(status, math.nan if doubts else half, std, total, doubts)
+
+
+def _wide(found: Search, half: float, std: float, settings: OutputErrorSettings, unit: float) -> str:
+    if math.isinf(std):
+        return "the measurements do not depend on the gap"
+    problem = found.problem
+    travel = 0.5 * _TRAVEL * float(np.ptp(problem.drive))
+    allowed = max(settings.largest_share * half, 0.5 * settings.counts * problem.count, travel)
+    if std <= allowed:
+        return ""
+    return f"the gap is known to {_deg(unit * std)} only, and {_deg(unit * allowed)} are allowed"
+
+
+def _rival(found: Search, half: float, total: float, unit: float) -> str:
+    best = found.best
+    for other in found.others:
+        apart = abs(float(other.values[HALF]) - half)
+        if apart > NORMAL_95 * total and (other.cost - best.cost) / best.variance() < _RIVAL:
+            return f"a gap of {_deg(unit * float(other.values[HALF]))} explains the window nearly as well"
+    return ""
+
+
+def _mismatches(found: Search) -> tuple[str, ...]:
+    """List the signs that the model is not that of the machine."""
+    best, problem = found.best, found.problem
+    sentences = []
+    variation = float(np.std(problem.position))
+    share = _slow(best.raw) / variation if variation > 0.0 else math.inf
+    if share > _UNEXPLAINED:
+        sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
+    limits = problem.limits()
+    for i, unknown in enumerate(problem.model.unknowns):
+        size = abs(float(best.values[i]))
+        known = math.isfinite(unknown.std) and unknown.unit != "damping"
+        if known and (size > _UNUSUAL * unknown.std or size >= limits[i]):
+            late = unknown.unit == "time"
+            change = f"{1e3 * best.values[i]:+.3g} ms" if late else f"{100.0 * math.expm1(best.values[i]):+.2g} %"
+            sentences.append(f"the {unknown.name} would be off by {change}")
+    apart = _between_halves(best, found)
+    if apart > _APART:
+        sentences.append(f"the gaps of the window's halves are {apart:.2g} standard deviations apart")
+    return tuple(sentences)
+
+
+def _slow(raw: Array) -> float:
+    """rms of a residual averaged over a hundredth of the window, beyond what white noise would leave."""
+    size = max(1, raw.size // 100)
+    left = float(np.mean(np.convolve(raw, np.full(size, 1.0 / size), "valid") ** 2))
+    return math.sqrt(max(0.0, left - _CHANCE * 0.5 * float(np.mean(np.diff(raw) ** 2)) / size))
+
+
+def _between_halves(fit: Fit, found: Search) -> float:
+    """Difference of the gap between the halves of a window, linearised, in its standard deviations."""
+    data = fit.raw.size
+    middle = data // 2
+    places = np.flatnonzero(found.free)
+    at = int(np.flatnonzero(places == HALF)[0])
+    gaps, spreads = [], []
+    for part in (slice(0, middle), slice(middle, data)):
+        keep = np.r_[part, data : fit.residual.size]
+        rows, residual = fit.rows[np.ix_(places, keep)], fit.residual[keep]
+        size = np.linalg.norm(rows, axis=1)
+        size[size == 0.0] = 1.0
+        scaled = rows / size[:, None]
+        inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)
+        gaps.append(-float(inverse[at] @ (scaled @ residual)) / size[at])
+        spreads.append(math.sqrt(max(0.0, inverse[at, at]) * fit.variance()) / size[at])
+    joint = math.hypot(*spreads, _ROUNDED * found.problem.count)
+    return abs(gaps[0] - gaps[1]) / joint if min(spreads) > 0.0 else 0.0
+
+
+def _deg(angle: float) -> str:
+    return f"{math.degrees(angle):.3g} deg"

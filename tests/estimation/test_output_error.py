@@ -1,0 +1,175 @@
+"""Gaps of shafts that are free in the gap and of one mass on a rigid screw."""
+
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks.axis_windows import SCREW, SHAFT, screw_case, shaft_case, tally
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.output_error import OutputErrorSettings
+from servotwin.estimation.output_error.models import Priors, ShaftModel
+from servotwin.estimation.whitened import WhitenedSettings
+from servotwin.estimation.window import Window
+from servotwin.plant.actuator import TorqueDrive, VelocityDrive
+from servotwin.plant.axis import Axis
+from servotwin.plant.backlash import play
+from servotwin.plant.load import Load
+from servotwin.plant.sensors import Sensors
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.plant.transmission import Transmission
+from servotwin.simulation import simulate
+
+TWO_MASS = Axis(
+    TorqueDrive(J=0.4, lag=1e-3, friction=0.05),
+    Transmission(p=1.0, k_d=3300.0, c_d=2.0, in_gap="free"),
+    Load((5.6,), (0.0,), (0.3,), "rotary"),
+    Controller(Kp=60.0, Ki=20.0, Kd=40.0, Tf=0.01),
+)
+UNDAMPED = TWO_MASS.replace(
+    transmission=Transmission(0.5, 330.0, in_gap="free"),
+    controller=Controller(Kp=4.0, Ki=0.2, Kd=3.0, Tf=0.05),
+    load=Load((5.6,), (2.0,), (9.0,), "rotary"),
+)
+TWO_LOADS = TWO_MASS.replace(
+    load=Load((3.0, 2.6), (0.0, 9e4), (0.3, 90.0), "rotary"), controller=Controller(4.0, 0.2, 3.0, 0.05)
+)
+PRIORS = Priors(0.08, 0.5, 0.05, 0.005, 1e-3)
+TABLE = Axis(VelocityDrive(5e-3), Transmission(1e-3), Load((20.0,)), Controller(3e4, 1e4, 0.0, 0.1))
+
+
+def recorded(axis: Axis, gap: float, noise: float = 0.0, rate: float = 1000.0, begin: float = 0.2) -> Window:
+    """Three seconds about a step of the reference, white noise on the position."""
+    run = simulate(axis, 4.0, reference=SquareWave(0.2, 4.0), gap=gap, sample_rate=rate)
+    part = slice(int(begin * rate), int((begin + 3.0) * rate))
+    rough = noise * np.random.default_rng(1).normal(size=run.position.size)
+    return Window((run.position + rough)[part], run.theta_m[part], sample_rate=rate)
+
+
+@pytest.mark.parametrize(("axis", "gap"), [(TWO_MASS, 0.03), (UNDAMPED, 0.1), (TWO_LOADS, 0.03)])
+def test_the_load_under_the_motor_s_motion_is_that_of_the_exact_simulation(axis: Axis, gap: float) -> None:
+    """The motor's angle is linear between samples: the error falls with the square of the interval."""
+    model, errors = ShaftModel(axis, PRIORS), []
+    for rate in (1000.0, 4000.0):
+        run = simulate(axis, 4.0, reference=SquareWave(0.2, 4.0), gap=gap, sample_rate=rate)
+        values = model.start(0.5 * axis.p * gap, 0.0, (0.0, 0.0))
+        moved = model.simulate(axis.p * run.theta_m, run.position, 1.0 / rate, values, 0.0)
+        errors.append(float(np.abs(moved.position - run.position).max()) / (axis.p * gap))
+    assert errors[1] < 1e-4
+    assert 10.0 < errors[0] / errors[1] < 25.0
+
+
+@pytest.mark.parametrize(("axis", "gap"), [(TWO_MASS, 0.03), (UNDAMPED, 0.1), (TWO_LOADS, 0.03)])
+def test_the_gap_of_a_free_shaft_is_found_without_noise(axis: Axis, gap: float) -> None:
+    estimate = estimate_gap(recorded(axis, gap), axis)
+    assert estimate.ok, estimate.reasons
+    assert abs(estimate.gap - gap) < 0.01 * gap
+    assert estimate.interval[0] < gap < estimate.interval[1]
+    assert (estimate.method, estimate.model_version) == ("output_error", axis.version)
+
+
+def test_a_stiffness_and_an_inertia_that_are_off_stay_inside_the_interval() -> None:
+    wrong = TWO_MASS.replace(
+        transmission=Transmission(1.0, 1.05 * 3300.0, 3.0, "free"), load=Load((0.95 * 5.6,), (0.0,), (0.45,), "rotary")
+    )
+    estimate = estimate_gap(recorded(TWO_MASS, 0.03, 1e-4), wrong)
+    assert estimate.ok, estimate.reasons
+    assert estimate.interval[0] < 0.03 < estimate.interval[1]
+
+
+def test_the_same_machine_in_other_units_has_the_same_estimate() -> None:
+    """Ten times as slow, a hundred times as heavy, geared a hundred to one: gap and spread scale with the ratio."""
+    slow, mass, ratio = 10.0, 100.0, 0.01
+    k, c = mass / slow**2, mass / slow
+    other = TWO_MASS.replace(
+        actuator=TorqueDrive(0.4 * mass * ratio**2, 1e-3 * slow, 0.05 * c * ratio**2),
+        transmission=Transmission(ratio, 3300.0 * k, 2.0 * c, "free"),
+        load=Load((5.6 * mass,), (0.0,), (0.3 * c,), "rotary"),
+    )
+    window = recorded(TWO_MASS, 0.03, 1e-4)
+    assert window.theta_m is not None
+    slower = Window(window.position, window.theta_m / ratio, sample_rate=window.sample_rate / slow)
+    ours, theirs = estimate_gap(window, TWO_MASS), estimate_gap(slower, other)
+    assert theirs.ok
+    assert theirs.gap * ratio == pytest.approx(ours.gap, rel=1e-3)
+    assert theirs.std_total * ratio == pytest.approx(ours.std_total, rel=1e-2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SHAFT)
+def test_random_drives_are_estimated_within_their_intervals(kind: str) -> None:
+    result = tally(shaft_case, kind, 6, 3)
+    assert result.false == result.bounds_above == 0, result
+    assert len(result.errors) >= 3, result
+    assert result.inside == len(result.errors), result
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", SCREW)
+def test_random_tables_are_estimated_within_their_intervals(kind: str) -> None:
+    result = tally(screw_case, kind, 30, 3)
+    assert result.false == result.bounds_above == 0, result
+    assert len(result.errors) >= 18, result
+    assert result.inside >= len(result.errors) - 1, result
+
+
+def test_a_gap_of_five_micrometres_shows_in_counts_of_a_tenth() -> None:
+    p, gap = 5e-3 / (2.0 * math.pi), 5e-6 / (5e-3 / (2.0 * math.pi))
+    time = np.arange(4000) / 2000.0
+    angle = np.round(0.05 * np.sin(4.0 * time) / 6e-5) * 6e-5
+    position = np.round(p * play(angle, gap) / 1e-7) * 1e-7
+    axis = TABLE.replace(transmission=Transmission(p), sensors=Sensors(6e-5, 1e-7))
+    estimate = estimate_gap(Window(position, angle, sample_rate=2000.0), axis)
+    assert estimate.ok, estimate.reasons
+    assert abs(estimate.gap - gap) * p < 2e-7
+    assert estimate.interval[0] < gap < estimate.interval[1]
+
+
+def test_one_flank_gives_a_lower_bound() -> None:
+    time = np.arange(2000) / 1000.0
+    angle = np.where(time < 1.0, time, 2.0 - time)
+    window = Window(1e-3 * play(angle, 1.5, -0.75), angle, sample_rate=1000.0)
+    estimate = estimate_gap(window, TABLE)
+    assert estimate.status is GapStatus.LOWER_BOUND, estimate.reasons
+    assert 0.5 < estimate.gap <= 1.5
+    assert math.isinf(estimate.interval[1])
+
+
+def test_a_load_that_does_not_follow_the_model_is_refused() -> None:
+    window = recorded(TWO_MASS, 0.03)
+    slack = window.position + 0.02 * np.sin(7.0 * window.time)
+    assert not estimate_gap(Window(slack, window.theta_m, sample_rate=1000.0), TWO_MASS).ok
+
+
+@pytest.mark.parametrize(
+    ("axis", "method", "words"),
+    [
+        (Servo.preset("paper"), "output_error", 'give method = "whitened"'),
+        (TWO_MASS, "whitened", "need a transmission that is held in the gap"),
+        (TABLE, "paper", "at least 2 masses"),
+        (TABLE.replace(transmission=Transmission(1e-3, 1e6)), None, "no method estimates this gap"),
+        (TWO_MASS.replace(sensors=Sensors(feedback="motor")), None, "give the load's own position"),
+    ],
+)
+def test_refusals_are_one_sentence(axis: Axis, method: str | None, words: str) -> None:
+    time = np.arange(500) / 1000.0
+    window = Window(axis.p * time, time, sample_rate=1000.0)
+    with pytest.raises(InvalidInput, match=words):
+        estimate_gap(window, axis, method)
+
+
+def test_windows_and_settings_that_do_not_fit_are_refused() -> None:
+    time = np.arange(500) / 1000.0
+    with pytest.raises(InvalidInput, match="has no theta_m"):
+        estimate_gap(Window(time, sample_rate=1000.0), TABLE)
+    with pytest.raises(InvalidInput, match="needs at least 400"):
+        estimate_gap(Window(time[:100], time[:100], sample_rate=1000.0), TABLE)
+    with pytest.raises(InvalidInput, match="do not belong to method 'output_error'"):
+        estimate_gap(Window(time, time, sample_rate=1000.0), TABLE, settings=WhitenedSettings())
+    still = estimate_gap(Window(0.0 * time, time, sample_rate=1000.0), TABLE, settings=OutputErrorSettings())
+    assert still.status is GapStatus.UNIDENTIFIABLE
+    assert "position is constant" in still.reasons[0]
