@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "Axis": "servotwin.plant.axis",
+    "Cascade": "servotwin.control.cascade",
     "Certificate": "servotwin.redesign.certified.certificate",
     "Controller": "servotwin.control",
     "CycleResult": "servotwin.analysis.limit_cycles.cycle",
@@ -17,6 +18,7 @@ _HOMES = {
     "GapEstimate": "servotwin.estimation.estimate",
     "GapStatus": "servotwin.estimation.estimate",
     "InvalidInput": "servotwin.errors",
+    "LinearLaw": "servotwin.control.linear_law",
     "Load": "servotwin.plant.load",
     "Loop": "servotwin.cosim",
     "Noise": "servotwin.plant.noise",
@@ -54,6 +56,8 @@ if TYPE_CHECKING:
     from servotwin.analysis.maps.result import StabilityMap
     from servotwin.analysis.tuning.tune import Tuning
     from servotwin.control import Controller
+    from servotwin.control.cascade import Cascade
+    from servotwin.control.linear_law import LinearLaw
     from servotwin.cosim import Loop, cosimulate
     from servotwin.cosim.scenario import Scenario
     from servotwin.design import stability_map, tune
@@ -79,6 +83,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Axis",
+    "Cascade",
     "Certificate",
     "Controller",
     "CycleResult",
@@ -87,6 +92,7 @@ __all__ = [
     "GapEstimate",
     "GapStatus",
     "InvalidInput",
+    "LinearLaw",
     "Load",
     "Loop",
     "Noise",

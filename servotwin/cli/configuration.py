@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from servotwin.commissioning.edge_settings import Recording
+from servotwin.config.keys import Maker
 from servotwin.config.reference import TableSpec, markdown, schema
 from servotwin.control.controller import Controller
 from servotwin.cosim import scenario_file as tables
@@ -23,6 +26,9 @@ from servotwin.estimation.gap import METHODS
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.actuator import ACTUATORS
+from servotwin.plant.axis_file import LOADS, TRANSMISSIONS, controller_keys
+from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.twin.model_registry import servo_table
 from servotwin.twin.settings import TwinSettings
@@ -68,8 +74,50 @@ _ESTIMATOR = TableSpec(
 _TWIN = TableSpec((TwinSettings,), "The twin.", {"estimator": _ESTIMATOR})
 _DRIVES = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in SUPERVISED.items()}
 
+
+def _controller_of(unit: str, motion: str) -> TableSpec:
+    """Keys of a controller in the units of an axis."""
+    names = {name: shown for shown, name in controller_keys(unit, motion).items()}
+    return TableSpec((Controller,), names=names)
+
+
+def _kinds(words: str, makers: Mapping[str, Maker]) -> TableSpec:
+    return TableSpec(help=words, kinds={f'kind = "{kind}"': TableSpec((maker,)) for kind, maker in makers.items()})
+
+
+def _axis(controller: TableSpec) -> TableSpec:
+    """File of an axis with some controller."""
+    return TableSpec(
+        tables={
+            "actuator": _kinds("The actuator.", ACTUATORS),
+            "transmission": _kinds("Transmission; the gap counts at the motor.", TRANSMISSIONS),
+            "load": _kinds("The load.", LOADS),
+            "sensors": TableSpec((Sensors,), "Encoders; ideal where the table is absent."),
+            "controller": controller,
+        }
+    )
+
+
+_CONTROLLERS = TableSpec(
+    help="The controller that runs; its keys have the units of command and position.",
+    kinds={
+        f"command {unit}, load {motion}": _controller_of(unit, motion)
+        for unit in ("V", "N m", "rad/s", "rad")
+        for motion in LOADS
+    },
+)
+_SHOWN = _controller_of("N m", "linear")
+_SHOWN_HELP = (
+    "The controller that runs. Its keys have the units of command and position: here those of a torque and a linear "
+    "load. With a voltage `n_m` is `v` and the limit `voltage_limit_v`, with a speed `rad_per_s` and "
+    "`speed_limit_rad_per_s`, with an angle `rad` and `angle_limit_rad`; with a rotary load `m` is `rad`: "
+    "`kp_v_per_m`, `ki_rad_per_s_per_rad_s`."
+)
+AXIS_SHOWN = _axis(replace(_SHOWN, help=_SHOWN_HELP))
+"""File of an axis for the reference, with one controller for all units."""
 FILES = {
     "servo": ("Servo: `servo.toml`", TableSpec((Servo,))),
+    "axis": ("Axis made of parts: `axis.toml`", _axis(_CONTROLLERS)),
     "scenario": (
         "Scenario of a co-simulation: `scenario.toml`",
         TableSpec(
@@ -143,7 +191,7 @@ FILES = {
 
 def texts() -> dict[str, str]:
     """The files of the reference, by their path below docs/."""
-    pages = [markdown(title, spec) for title, spec in FILES.values()]
+    pages = [markdown(title, AXIS_SHOWN if name == "axis" else spec) for name, (title, spec) in FILES.items()]
     schemas = {f"schemas/{name}.json": _json(title, spec) for name, (title, spec) in FILES.items()}
     return {"configuration.md": "\n".join([HEAD, *pages]).rstrip() + "\n", **schemas}
 

@@ -36,7 +36,11 @@ def limit_cycle(
     tolerance_mm: Annotated[
         float | None, typer.Option(help="Half-width of the dead zone, mm; none by default.")
     ] = None,
-    step_mm: Annotated[float, typer.Option(help="Reference step from rest, mm; the result may depend on it.")] = 1.0,
+    tolerance_deg: Annotated[float | None, typer.Option(help="The same of a rotary axis, deg.")] = None,
+    step_mm: Annotated[
+        float | None, typer.Option(help="Reference step from rest, mm; the result may depend on it; 1 by default.")
+    ] = None,
+    step_deg: Annotated[float | None, typer.Option(help="The same of a rotary axis, deg; 1 by default.")] = None,
     enter: _Enter = None,
     leave: _Leave = None,
     json: _Json = False,
@@ -44,7 +48,8 @@ def limit_cycle(
     """Compute the exact limit cycle, stable or not, beside the describing function's prediction."""
     from servotwin.cli.limit_cycle import print_limit_cycle
 
-    print_limit_cycle(servo, gap_deg, tolerance_mm, step_mm, enter, leave, json)
+    positions = {"mm": (tolerance_mm, step_mm), "deg": (tolerance_deg, step_deg)}
+    print_limit_cycle(servo, gap_deg, positions, enter, leave, json)
 
 
 def tune(

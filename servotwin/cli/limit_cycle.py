@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,8 +16,8 @@ from servotwin.analysis.limit_cycles.describing import Prediction, limit_cycle_n
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Plant, resolve_plant
+from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit
 
-_MM = 1e3
 # Orbits whose frequencies differ by a smaller share are the same orbit.
 _SAME = 1e-6
 
@@ -57,43 +58,47 @@ def findings(servo: Plant, gap: float, tolerance: float | None, step: float) -> 
 def print_limit_cycle(
     name: str,
     gap_deg: float,
-    tolerance_mm: float | None,
-    step_mm: float,
+    positions: Mapping[str, tuple[float | None, float | None]],
     enter: float | None,
     leave: float | None,
     as_json: bool,
 ) -> None:
-    """Print a table, or one JSON object, on the standard output."""
+    """Print a table, or one JSON object, on the standard output; `positions`: tolerance and step by their unit."""
     servo = resolve_plant(name)
+    unit = position_unit(servo)
+    tolerance_shown, step_shown = _in_unit(unit, positions)
     # The exact orbit is that of the continuous-time loop.
     servo = servo.replace(sample_rate=None)
     servo = servo if enter is None else servo.replace(enter=enter)
     servo = servo if leave is None else servo.replace(leave=leave)
-    tolerance = None if tolerance_mm is None else tolerance_mm / _MM
+    tolerance = None if tolerance_shown is None else unit.si_of(tolerance_shown)
     if not 0.0 <= gap_deg <= 360.0:
         raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be from 0 to 360, one turn")
-    computed = findings(servo, math.radians(gap_deg), tolerance, step_mm / _MM)
+    computed = findings(servo, math.radians(gap_deg), tolerance, unit.si_of(step_shown))
     if as_json:
-        print(json.dumps(as_dict(computed), indent=2))
+        print(json.dumps(as_dict(computed, unit), indent=2))
         return
     console = Console()
-    console.print(f"{name}: gap {gap_deg:g} deg in all, {_dead_zone(tolerance_mm)}, after a step of {step_mm:g} mm")
-    _print(console, computed)
+    console.print(
+        f"{name}: gap {gap_deg:g} deg in all, {_dead_zone(tolerance_shown, unit)}, after a step of "
+        f"{step_shown:g} {unit.name}"
+    )
+    _print(console, computed, unit)
 
 
-def as_dict(computed: Findings) -> dict[str, Any]:
-    """Make the JSON object: plain numbers, with units in the keys."""
+def as_dict(computed: Findings, unit: ShownUnit = MILLIMETRES) -> dict[str, Any]:
+    """Make the JSON object: plain numbers, with units in the keys; `unit` is that of positions."""
     return {
         "status": computed.result.status.value,
         "reason": computed.result.reason,
-        "orbit": _orbit(computed.result.orbit),
+        "orbit": _orbit(computed.result.orbit, unit),
         "describing_function": [
             {
                 "frequency_hz": one.frequency,
                 "motor_amplitude_deg": math.degrees(one.motor_amplitude),
-                "amplitude_mm": one.amplitude * _MM,
+                f"amplitude_{unit.name}": one.amplitude * unit.factor,
                 "stable": one.stable,
-                "orbit": _orbit(near.orbit),
+                "orbit": _orbit(near.orbit, unit),
                 "reason": near.reason,
             }
             for one, near in computed.predictions
@@ -102,15 +107,15 @@ def as_dict(computed: Findings) -> dict[str, Any]:
     }
 
 
-def _orbit(orbit: Orbit | None) -> dict[str, Any] | None:
+def _orbit(orbit: Orbit | None, unit: ShownUnit) -> dict[str, Any] | None:
     if orbit is None:
         return None
     half = orbit.half_multipliers
     return {
         "frequency_hz": orbit.frequency,
-        "amplitude_mm": orbit.amplitude * _MM,
-        "lowest_mm": orbit.lowest * _MM,
-        "highest_mm": orbit.highest * _MM,
+        f"amplitude_{unit.name}": orbit.amplitude * unit.factor,
+        f"lowest_{unit.name}": orbit.lowest * unit.factor,
+        f"highest_{unit.name}": orbit.highest * unit.factor,
         "motor_amplitude_deg": math.degrees(orbit.motor_amplitude),
         "stable": orbit.stable,
         "symmetric": orbit.symmetric,
@@ -121,27 +126,40 @@ def _orbit(orbit: Orbit | None) -> dict[str, Any] | None:
     }
 
 
-def _dead_zone(tolerance_mm: float | None) -> str:
-    return f"dead zone ±{tolerance_mm:g} mm" if tolerance_mm else "no dead zone"
+def _in_unit(unit: ShownUnit, positions: Mapping[str, tuple[float | None, float | None]]) -> tuple[float | None, float]:
+    """Tolerance and step, in the unit of a machine; refused in another."""
+    for other, given in positions.items():
+        for option, value in zip(("tolerance", "step"), given, strict=True):
+            if value is not None and other != unit.name:
+                raise InvalidInput(
+                    f"--{option}-{other} {value:g}: positions of this machine are in {unit.name}; "
+                    f"give --{option}-{unit.name}"
+                )
+    tolerance, step = positions[unit.name]
+    return tolerance, 1.0 if step is None else step
 
 
-def _print(console: Console, computed: Findings) -> None:
+def _dead_zone(tolerance: float | None, unit: ShownUnit) -> str:
+    return f"dead zone ±{tolerance:g} {unit.name}" if tolerance else "no dead zone"
+
+
+def _print(console: Console, computed: Findings, unit: ShownUnit) -> None:
     result = computed.result
     orbit = result.orbit
     console.print(f"[bold]{result.status.value}[/]{': ' if result.reason else ''}{result.reason}")
-    table = Table("", "frequency\nHz", "position\n± mm", "motor\n± deg", "", box=None, pad_edge=False)
+    table = Table("", "frequency\nHz", f"position\n± {unit.name}", "motor\n± deg", "", box=None, pad_edge=False)
     if orbit is not None:
-        table.add_row("exact, after the step", *_cells(orbit))
+        table.add_row("exact, after the step", *_cells(orbit, unit))
     for one, near in computed.predictions:
         table.add_row(
             "describing function",
             f"{one.frequency:.4f}",
-            f"{one.amplitude * _MM:.4f}",
+            f"{one.amplitude * unit.factor:.4f}",
             f"{math.degrees(one.motor_amplitude):.2f}",
             _stability(one.stable),
         )
         if near.orbit is not None and (orbit is None or abs(near.orbit.frequency / orbit.frequency - 1.0) > _SAME):
-            table.add_row("exact, near that", *_cells(near.orbit))
+            table.add_row("exact, near that", *_cells(near.orbit, unit))
     if table.rows:
         console.print(table, highlight=False)
     if orbit is not None:
@@ -150,9 +168,9 @@ def _print(console: Console, computed: Findings) -> None:
         console.print(f"no describing function: {computed.no_prediction}", style="dim", highlight=False)
 
 
-def _cells(orbit: Orbit) -> tuple[str, ...]:
+def _cells(orbit: Orbit, unit: ShownUnit) -> tuple[str, ...]:
     angle = math.degrees(orbit.motor_amplitude)
-    return f"{orbit.frequency:.9f}", f"{orbit.amplitude * _MM:.9f}", f"{angle:.4f}", _stability(orbit.stable)
+    return f"{orbit.frequency:.9f}", f"{orbit.amplitude * unit.factor:.9f}", f"{angle:.4f}", _stability(orbit.stable)
 
 
 def _stability(stable: bool) -> str:

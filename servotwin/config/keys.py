@@ -85,6 +85,15 @@ _PLAIN = {
     "tolerances": "tolerances", "n_m_per_rad": "N m/rad", "n_m_s_per_rad": "N m s/rad", "n": "N",
     "v_s2_per_rad": "V s^2/rad",
 }  # fmt: skip
+# Gains of axes: command per position, by time or with it.
+for _command, _per in (("v", "V"), ("n_m", "N m"), ("rad_per_s", "rad/s"), ("rad", "rad")):
+    _PLAIN[f"{_command}_per_s"] = f"{_per}/s" if "/" not in _per else "rad/s^2"
+    for _position in ("m", "rad"):
+        _top = _per.removesuffix("/s")
+        _bottom = f"({_position} s)" if _top != _per else _position
+        _PLAIN[f"{_command}_per_{_position}"] = f"{_top}/{_bottom}"
+        _PLAIN[f"{_command}_per_{_position}_s"] = f"{_top}/({_position} s{'^2' if _top != _per else ''})"
+        _PLAIN[f"{_command}_s_per_{_position}"] = f"{_top}/{_position}" if _top != _per else f"{_per} s/{_position}"
 _SUFFIXES = {**_SCALED, **{suffix: Unit(name, name) for suffix, name in _PLAIN.items()}}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servotwin.config.keys import Form, Item, Maker, items_of, unit_of
@@ -35,6 +35,8 @@ class TableSpec:
         Name of the inner tables, where the table holds any number of them.
     text : bool
         True: the table holds any keys, with texts as values.
+    names : mapping of str to str
+        Other names of some keys.
     """
 
     makers: tuple[Maker, ...] = ()
@@ -45,11 +47,17 @@ class TableSpec:
     partial: bool = False
     repeated: str = ""
     text: bool = False
+    names: Mapping[str, str] = field(default_factory=dict)
 
     def items(self) -> tuple[Item, ...]:
         """The attributes with a key in this table or in an inner one."""
         items = (item for maker in self.makers for item in items_of(maker) if item.key.in_file)
-        return tuple(item for item in items if self.only is None or item.name in self.only)
+        return tuple(self._named(item) for item in items if self.only is None or item.name in self.only)
+
+    def _named(self, item: Item) -> Item:
+        if not self.names:
+            return item
+        return replace(item, key=replace(item.key, names=tuple(self.names.get(name, name) for name in item.names)))
 
 
 def markdown(title: str, spec: TableSpec) -> str:
@@ -106,7 +114,9 @@ def _describe(kind: str, spec: TableSpec) -> str:
     """Heading of a kind of table: its key and first sentence."""
     text = inspect.getdoc(spec.makers[0]) if spec.makers else ""
     sentence = (text or "").partition("\n")[0].rstrip(".")
-    return f"`{kind}`, {sentence[:1].lower()}{sentence[1:]}" if "=" in kind else sentence
+    # Not of an abbreviation.
+    lowered = sentence if sentence[1:2].isupper() else sentence[:1].lower() + sentence[1:]
+    return f"`{kind}`, {lowered}" if "=" in kind else sentence
 
 
 def _rows(spec: TableSpec, table: str) -> list[str]:

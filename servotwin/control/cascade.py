@@ -1,6 +1,6 @@
 """The cascade of industrial drives, as a description: position loop around a velocity loop on the motor's speed."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from math import expm1, pi
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ Row = dict[str, float]
 
 
 @settings("cascade")
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Cascade:
     """Position P on load or motor, velocity PI on the motor's speed, feedforwards, notch and low-pass; a linear law.
 
@@ -128,6 +128,11 @@ class Cascade:
             ):
                 if given is not None:
                     raise InvalidInput(f"cascade {name} = {given!r}: needs a velocity loop; give its velocity_gain")
+
+    def __repr__(self) -> str:
+        """Whatever is not its default."""
+        shown = [f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if getattr(self, f.name) != f.default]
+        return f"Cascade({', '.join(shown)})"
 
     def replace(self, **changes: Any) -> "Cascade":
         """A copy with some values changed, checked again.

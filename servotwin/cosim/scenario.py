@@ -23,9 +23,8 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN
-from servotwin.plant.axis import Plant
+from servotwin.plant.axis import PLANT_KEY, Plant
 from servotwin.plant.noise import Noise
-from servotwin.plant.servo import SERVO_KEY
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings
@@ -66,7 +65,7 @@ class Scenario:
         A value is out of its range, the gap goes below zero, a rate does not divide, a window is too short.
     """
 
-    servo: Annotated[Plant, SERVO_KEY]
+    servo: Annotated[Plant, PLANT_KEY]
     duration: Annotated[float, key("duration_s", above=0.0, help="Simulated time, a whole number of samples.")]
     seed: Annotated[
         int,

@@ -50,7 +50,9 @@ class ShaftPolynomials(NamedTuple):
 @settings("actuator")
 @dataclass(frozen=True)
 class DcMotor:
-    """DC motor behind a voltage (Eqs 1-8): L I' + R I = u - k_B omega, J omega' = k_T I + torque.
+    """DC motor behind a voltage (Eqs 1-8).
+
+    L I' + R I = u - k_B omega, J omega' = k_T I + torque.
 
     Raises
     ------
@@ -103,8 +105,9 @@ class DcMotor:
 @settings("actuator")
 @dataclass(frozen=True)
 class TorqueDrive:
-    """Motor behind a current loop, whose command is a torque: J omega' = torque - friction omega, with a first-order
-    lag from command to torque.
+    """Motor behind a current loop, whose command is a torque.
+
+    J omega' = torque - friction omega, with a first-order lag from command to torque.
 
     Raises
     ------
@@ -132,8 +135,9 @@ class TorqueDrive:
     def matrices(self) -> ShaftMatrices:
         """Matrices of (torque, speed, theta_m); without lag of (speed, theta_m)."""
         J, drag = self.J, self.friction
-        # Without friction a shaft never stops by itself: one second of the torque stands for the time it takes.
-        yielding = 1.0 / drag if drag > 0.0 else (self.lag or 1.0) / J
+        # In the current loop's time, or until friction limits it; a shaft without either never stops by itself.
+        times = [self.lag / J] if self.lag > 0.0 else []
+        yielding = min([*times, 1.0 / drag] if drag > 0.0 else times, default=1.0 / J)
         if self.lag == 0.0:
             A = np.array([[-drag / J, 0.0], [1.0, 0.0]])
             column = np.array([1.0 / J, 0.0])

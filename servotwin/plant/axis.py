@@ -15,6 +15,7 @@ from typing import Any, TypeAlias, Unpack
 
 import numpy as np
 
+from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
 from servotwin.control.cascade import Cascade
@@ -153,8 +154,10 @@ class Axis:
         InvalidInput
             Its controller is a linear law.
         """
-        if not isinstance(self.controller, Controller):
-            raise InvalidInput(f"axis controller = {self.controller!r}: a file of an axis holds a Controller only")
+        if isinstance(self.controller, LinearLaw):
+            raise InvalidInput(
+                f"axis controller = {self.controller!r}: a file of an axis holds a Controller or a Cascade"
+            )
         parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
         return dumps(values_of_parts(parts))
 
@@ -447,3 +450,21 @@ def structure_of(plant: Plant) -> tuple[object, ...]:
     guide = plant.guide
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
     return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces
+
+
+def _named_plant(table: Table, name: str, plant: str, folder: Path) -> Plant:
+    """Load the servo or axis that a file names."""
+    if plant not in (*PRESETS, *AXES) and not (folder / plant).is_file():
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(plant, every)
+        allowed = f"one of {', '.join(every)}, or the path of a servo's or an axis's TOML, relative to this file{hint}"
+        raise table.invalid(name, allowed)
+    return resolve_plant(plant, folder)
+
+
+PLANT_KEY = key(
+    form=Form.TEXT,
+    parse=_named_plant,
+    help="A preset, or the path of the TOML of a servo or of an axis, relative to this file.",
+)
+"""Key of a machine in the files that name one."""

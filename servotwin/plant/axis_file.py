@@ -10,6 +10,7 @@ from typing import Annotated, NamedTuple
 from servotwin.config.keys import items_of, key, unit_of
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, part, read, read_kind, values_of
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.plant.actuator import ACTUATORS, Actuator
 from servotwin.plant.load import LINEAR, ROTARY, Load
@@ -95,6 +96,8 @@ def rotary_load(
     return Load(m, k, c, ROTARY, friction, force)
 
 
+FILTERED_PID, CASCADE = "filtered_pid", "cascade"
+CONTROLLERS: dict[str, type] = {FILTERED_PID: Controller, CASCADE: Cascade}
 TRANSMISSIONS = {"screw": screw, "gear": gear}
 LOADS = {"linear": linear_load, "rotary": rotary_load}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
@@ -106,7 +109,7 @@ class Parts(NamedTuple):
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Controller
+    controller: Controller | Cascade
     sensors: Sensors
 
 
@@ -126,15 +129,27 @@ def read_parts(table: Table) -> Parts:
     if motion != _MOTIONS[kind]:
         raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
     load: Load = read_kind(tables["load"], LOADS, Path())
-    controller = tables["controller"].renamed(controller_keys(actuator.unit, motion))
-    law: Controller = read(controller, Controller)
-    controller.done()
+    law = _read_controller(tables["controller"], actuator.unit, motion, transmission.p)
     sensors: Sensors = part(table, "sensors", Sensors)
     table.done()
     return Parts(actuator, transmission, load, law, sensors)
 
 
-def controller_keys(unit: str, motion: str) -> Mapping[str, str]:
+def _read_controller(table: Table, unit: str, motion: str, ratio: float) -> Controller | Cascade:
+    """Read the controller in the units of its axis; a cascade's ratio is the transmission's where it is not given."""
+    kind = table.text("kind", FILTERED_PID, choices=tuple(CONTROLLERS))
+    controller = table.renamed(controller_keys(unit, motion, CONTROLLERS[kind]))
+    controller.known("kind")
+    law: Controller | Cascade
+    if kind == CASCADE and "travel_m_per_rad" not in controller.values:
+        law = read(controller, Cascade, ratio=ratio)
+    else:
+        law = read(controller, CONTROLLERS[kind])
+    controller.done()
+    return law
+
+
+def controller_keys(unit: str, motion: str, described: type = Controller) -> Mapping[str, str]:
     """Keys of the controller's table in the units of an axis, and those of a voltage and a position in metres.
 
     Parameters
@@ -143,11 +158,13 @@ def controller_keys(unit: str, motion: str) -> Mapping[str, str]:
         Unit of the actuator's command.
     motion : str
         Of the load.
+    described : type
+        Class of the controller.
     """
     command, word = _COMMANDS[unit]
     position = "m" if motion == LINEAR else "rad"
     names = {}
-    for name in _keys_with_units():
+    for name in _keys_with_units(described):
         suffix = _suffix(name)
         renamed = {"v": command, "m": position}
         units = "_".join(renamed.get(each, each) for each in suffix.split("_"))
@@ -155,9 +172,9 @@ def controller_keys(unit: str, motion: str) -> Mapping[str, str]:
     return names
 
 
-def _keys_with_units() -> list[str]:
+def _keys_with_units(described: type) -> list[str]:
     """Keys of a controller whose units contain volts or metres."""
-    names = [item.exact_name for item in items_of(Controller)]
+    names = [item.exact_name for item in items_of(described)]
     return [name for name in names if {"v", "m"} & set(_suffix(name).split("_"))]
 
 
@@ -174,8 +191,10 @@ def values_of_parts(axis: Parts) -> Values:
     motion = axis.load.motion
     kind = next(kind for kind, moves in _MOTIONS.items() if moves == motion)
     actuator = next(name for name, maker in ACTUATORS.items() if isinstance(axis.actuator, maker))
-    keys = {name: shown for shown, name in controller_keys(axis.actuator.unit, motion).items()}
-    controller = {keys.get(name, name): value for name, value in values_of(axis.controller).items()}
+    law = type(axis.controller)
+    keys = {name: shown for shown, name in controller_keys(axis.actuator.unit, motion, law).items()}
+    named = {} if law is Controller else {"kind": CASCADE}
+    controller = named | {keys.get(name, name): value for name, value in values_of(axis.controller).items()}
     return {
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
         "transmission": {"kind": kind, **_transmission_values(axis.transmission, kind)},

@@ -15,7 +15,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias, Unpack
 
 import numpy as np
 
-from servotwin.config.keys import Form, check, items_of, key, settings
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps, read, values_of
 from servotwin.control.controller import Controller, ControllerChanges
@@ -37,21 +37,6 @@ _PLANT = (
 """The plant's numbers in the order of the file, of which `Servo.version` is the hash."""
 PRESETS = ("paper", "table1", "paper-gain2")
 _CONTROLLER_FIELDS = tuple(field.name for field in dataclasses.fields(Controller))
-
-
-def _named_servo(table: Table, name: str, servo: str, folder: Path) -> Servo:
-    """Load the servo that a file names."""
-    if servo not in PRESETS and not (folder / servo).is_file():
-        presets = ", ".join(PRESETS)
-        hint = did_you_mean(servo, PRESETS)
-        raise table.invalid(name, f"one of {presets}, or the path of a servo's TOML, relative to this file{hint}")
-    return Servo.resolve(servo, folder)
-
-
-SERVO_KEY = key(
-    form=Form.TEXT, parse=_named_servo, help="A preset, or the path of a servo's TOML, relative to this file."
-)
-"""Key of a servo in the files that name one."""
 
 
 class Control(NamedTuple):

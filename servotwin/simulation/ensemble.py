@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, AutomatonStack
 from servotwin.hybrid.ensemble import FigureOptions, Members, figures_of_family, run_family
@@ -325,7 +326,9 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     check_constants(constants)
     every_servo = list(np.broadcast_to(plants, shape).ravel())
     given = np.broadcast_to(laws, shape).ravel()
-    every_law = [servo.controller if law is None else law for servo, law in zip(every_servo, given, strict=True)]
+    every_law = [
+        filtered_pid(servo.controller if law is None else law) for servo, law in zip(every_servo, given, strict=True)
+    ]
     # Thousands of members share a few controllers: each is checked once.
     for law in {id(law): law for law in every_law}.values():
         if law.sample_rate is not None or law.rate_limit is not None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.axis import Plant
+from servotwin.plant.shown import command_unit, position_unit
 from servotwin.runtime.notebook import html_table
 from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.views import Panel, arrow_table, pandas_table, stacked_figure
@@ -76,7 +77,7 @@ class Run:
 
     @property
     def voltage(self) -> Array:
-        """Voltage of the controller, V; an input bias comes on top of it."""
+        """Voltage of the controller, V, or another actuator's command; an input bias comes on top of it."""
         return self._column("voltage")
 
     @property
@@ -127,6 +128,7 @@ class Run:
 
     def _repr_html_(self) -> str:
         """Table for notebooks."""
+        unit = position_unit(self.servo)
         return html_table(
             "Run",
             {
@@ -134,25 +136,30 @@ class Run:
                 "samples": f"{self.samples} at {self.sample_rate:g} Hz",
                 "servo": repr(self.servo),
                 "gap": f"{np.degrees(self.gap[0]):.3f} to {np.degrees(self.gap[-1]):.3f} deg",
-                "largest error": f"{1e3 * np.abs(self.reference - self.position).max():.4f} mm",
+                "largest error": f"{unit.factor * np.abs(self.reference - self.position).max():.4f} {unit.name}",
                 "events": str(len(self.events)),
             },
         )
 
     @property
     def columns(self) -> dict[str, Array]:
-        """Signals by name with their unit, as log files name them; each ``(N,)``."""
+        """Signals by name with their unit, as log files name them; each ``(N,)``.
+
+        Positions of a rotary axis end with ``_rad``, and the command with its actuator's unit.
+        """
+        position, command = position_unit(self.servo).si, command_unit(self.servo).lower()
+        command = f"command_{command.replace(' ', '_').replace('/', '_per_')}"
         return {
             "time_s": self.time,
-            "position_m": self.position,
-            "measured_position_m": self.measured_position,
-            "reference_m": self.reference,
+            f"position_{position}": self.position,
+            f"measured_position_{position}": self.measured_position,
+            f"reference_{position}": self.reference,
             "theta_m_rad": self.theta_m,
             "theta_d_rad": self.theta_d,
-            "voltage_v": self.voltage,
+            "voltage_v" if command == "command_v" else command: self.voltage,
             "gap_rad": self.gap,
-            "tolerance_m": self.tolerance,
-            **{f"q{i + 1}_m": np.ascontiguousarray(self.q[:, i]) for i in range(self.servo.n)},
+            f"tolerance_{position}": self.tolerance,
+            **{f"q{i + 1}_{position}": np.ascontiguousarray(self.q[:, i]) for i in range(self.servo.n)},
         }
 
     def plot(self) -> Figure:
@@ -163,15 +170,16 @@ class Run:
         InvalidInput
             matplotlib is not installed.
         """
-        errors = {"error": 1e3 * (self.reference - self.position)}
+        name, factor, _ = position_unit(self.servo)
+        errors = {"error": factor * (self.reference - self.position)}
         if self.tolerance.any():
             # matplotlib leaves labels that begin with an underscore out of the legend.
-            errors |= {"dead zone": 1e3 * self.tolerance, "_": -1e3 * self.tolerance}
+            errors |= {"dead zone": factor * self.tolerance, "_": -factor * self.tolerance}
         panels = (
-            Panel("position, mm", {"reference": 1e3 * self.reference, "position": 1e3 * self.position}),
-            Panel("error, mm", errors),
+            Panel(f"position, {name}", {"reference": factor * self.reference, "position": factor * self.position}),
+            Panel(f"error, {name}", errors),
             Panel("total gap, deg", {"gap": np.degrees(self.gap)}),
-            Panel("voltage, V", {"voltage": self.voltage}),
+            Panel(f"command, {command_unit(self.servo)}", {"command": self.voltage}),
         )
         return stacked_figure(repr(self).strip("<>"), self.time, panels)
 

@@ -32,8 +32,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
-from servotwin.plant.axis import Plant
-from servotwin.plant.servo import SERVO_KEY
+from servotwin.plant.axis import PLANT_KEY, Plant
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
@@ -179,7 +178,7 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     return ServoModel(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
 
 
-def servo_table(servo: Annotated[Plant, SERVO_KEY]) -> Plant:
+def servo_table(servo: Annotated[Plant, PLANT_KEY]) -> Plant:
     """Return the servo that a model names."""
     return servo
 

@@ -9,6 +9,7 @@ from axis_oracle import positions
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import DcMotor, Stepper, TorqueDrive, VelocityDrive
+from servotwin.plant.axis import AXES as PRESETS
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
 from servotwin.plant.sensors import Sensors
@@ -37,6 +38,7 @@ def undamped(stiffness: float) -> Axis:
     return TWO_MASS.replace(transmission=UNDAMPED, controller=SOFT, load=load, sensors=sensors)
 
 
+HALF = 1.5  # s, half a period
 # Axis, amplitude (m or rad) and gap (rad).
 AXES = {
     "two masses": (TWO_MASS, 0.2, 0.03),
@@ -95,16 +97,42 @@ AXES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AXES)
 def test_an_axis_agrees_with_an_independent_integrator(name: str) -> None:
     axis, amplitude, gap = AXES[name]
     axis.check_loop()
-    run = simulate(axis, 8.0, reference=SquareWave(amplitude, 8.0), gap=gap, sample_rate=100.0)
-    expected, changes = positions(axis, gap, amplitude, 4.0, run.time[:-1])
+    run = simulate(axis, 2.0 * HALF, reference=SquareWave(amplitude, 2.0 * HALF), gap=gap, sample_rate=100.0)
+    expected, changes = positions(axis, gap, amplitude, HALF, run.time[:-1])
     assert np.abs(run.position[:-1] - expected).max() < 1e-8 * amplitude
     events = run.events[np.isin(run.events.kind, ("contact", "release"))].time
     assert len(changes) >= 3
     assert events == pytest.approx(changes, abs=1e-6)
+
+
+# Half period (s), amplitude (m or rad) and gap (rad) of each preset: about a healthy gap.
+SHELF = {
+    "two-mass-drive": (1.0, 0.2, 0.02),
+    "ball-screw": (0.1, 1e-3, 6.3e-3),
+    "robot-joint": (0.4, 0.02, 0.092),
+    "telescope": (4.0, 1e-3, 0.098),
+    "stepper-stage": (1.0, 1e-4, 0.0126),
+    "micro-positioner": (0.15, 1e-5, 0.16),
+    "gantry": (0.8, 5e-3, 0.02),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_agrees_with_an_independent_integrator(name: str) -> None:
+    """With a continuous law without limit, and ideal encoders: the oracle has neither."""
+    half_period, amplitude, gap = SHELF[name]
+    axis = Axis.preset(name).replace(sample_rate=None, voltage_limit=None, sensors=Sensors())
+    reference = SquareWave(amplitude, 2.0 * half_period)
+    run = simulate(axis, 2.0 * half_period, reference=reference, gap=gap, sample_rate=100.0)
+    expected, changes = positions(axis, gap, amplitude, half_period, run.time[:-1])
+    assert np.abs(run.position[:-1] - expected).max() < 1e-8 * amplitude
+    assert len(changes) >= 3
 
 
 @pytest.mark.parametrize("name", AXES)

@@ -8,16 +8,20 @@ import pytest
 from law_oracle import IDLE, ContinuousOracle, HeldOracle, continuous_positions
 from test_axis import ELASTIC, TWO_MASS
 
+from servotwin.analysis.limit_cycles.cycle import limit_cycle
 from servotwin.control.cascade import Cascade
+from servotwin.control.linear_tick import linear_tick
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
 from servotwin.plant.noise import Noise
 from servotwin.plant.sensors import Sensors
+from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Simulation, simulate
+from servotwin.simulation.ensemble import simulate_ensemble
 
 P = 1e-3 / math.pi
 # Axis with its cascade, amplitude (m or rad) and gap (rad).
@@ -161,6 +165,23 @@ def test_counts_and_noise_reach_the_law() -> None:
     assert 0.0 < np.abs(ideal.position - runs[0].position).max() < 2e-3
 
 
+def test_the_compiled_loop_gives_the_edge_s_bits() -> None:
+    """The interpreted law, fed with what was measured in the compiled loop, gives the same commands."""
+    axis, amplitude, gap = AXES["two masses"]
+    axis = axis.replace(sensors=Sensors(encoder_resolution=1e-4, position_resolution=2e-5))
+    law, tolerance = axis.controller.replace(sample_rate=2e3, limit=20.0, leave=1.5), 5e-3
+    signals = {"reference": SquareWave(amplitude, 2.0), "gap": gap, "tolerance": tolerance, "noise": Noise(std=1e-4)}
+    run = simulate(axis, 4.0, controller=law, sample_rate=2e3, **signals)
+    parameters, state, commands = law.linear().parameters(tolerance), law.linear().start(0.0, 0.0), []
+    measured = (run.reference, run.measured("theta_m"), run.measured_position)
+    for row in zip(*(each.tolist() for each in measured), strict=True):
+        state = linear_tick(parameters, state, *row)
+        commands.append(state.command)
+    assert np.array_equal(run.voltage, commands)
+    assert {"enter", "leave"} <= set(run.events.kind)
+    assert np.abs(run.voltage).max() == 20.0
+
+
 @pytest.mark.parametrize("sample_rate", [None, 1e3])
 def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -> None:
     axis = AXES["two masses"][0]
@@ -174,9 +195,30 @@ def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -
     assert abs(voltage[300] - voltage[299]) < 2.0 * abs(voltage[299] - voltage[298]) + 1e-9
 
 
+@pytest.mark.parametrize("name", AXES)
+def test_a_file_of_an_axis_holds_its_cascade(name: str) -> None:
+    axis = AXES[name][0]
+    text = axis.dumps()
+    assert 'kind = "cascade"' in text
+    again = Axis.loads(text, "axis.toml")
+    assert again.controller == axis.controller
+    assert (again.transmission, again.load, again.actuator) == (axis.transmission, axis.load, axis.actuator)
+    if name == "two masses":
+        short = "\n".join(line for line in text.splitlines() if not line.startswith("travel"))
+        assert Axis.loads(short, "axis.toml").controller == axis.controller
+        with pytest.raises(InvalidInput, match="velocity_gain_n_m_s_per_rad"):
+            Axis.loads(
+                text.replace("velocity_gain_n_m_s_per_rad = 30.0", "velocity_gain_n_m_s_per_rad = -3.0"), "a.toml"
+            )
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (
+            lambda: Servo.preset("paper").margins(AXES["two masses"][0].controller.linear()),
+            "must be a Controller, a filtered PID",
+        ),
         (lambda: AXES["two masses"][0].check_loop(Cascade(900.0, 1.0, velocity_gain=30.0)), "is unstable on this axis"),
         (
             lambda: simulate(AXES["two masses"][0].replace(sensors=Sensors(feedback="motor")), 1.0),
@@ -189,9 +231,45 @@ def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -
             ),
             "noise is on the load's encoder, which the controller does not read",
         ),
-        (lambda: AXES["two masses"][0].dumps(), "a file of an axis holds a Controller only"),
+        (
+            lambda: simulate(AXES["ball screw"][0], 1.0, noise=Noise(std=1e-6)),
+            "noise is on the load's encoder, which the controller does not read",
+        ),
+        (
+            lambda: AXES["two masses"][0].replace(controller=AXES["two masses"][0].controller.linear()).dumps(),
+            "a file of an axis holds a Controller or a Cascade",
+        ),
     ],
 )  # fmt: skip
 def test_refusals_are_one_sentence(make: object, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
         make()  # type: ignore[operator]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("in_gap", ["free", "held"])
+def test_friction_and_gravity_act_under_a_cascade_too(in_gap: str) -> None:
+    axis, amplitude, gap = AXES["two masses"]
+    elastic = Transmission(1.0, 3300.0, 2.0, "free") if in_gap == "free" else Transmission(1.0, 3300.0)
+    load = Load((5.6,), (0.0,), (0.3,), "rotary", friction=1.5, force=0.5)
+    axis = axis.replace(transmission=elastic, load=load)
+    run = simulate(axis, 2.0, reference=SquareWave(amplitude, 4.0), gap=gap, sample_rate=100.0)
+    law = axis.controller.replace(sample_rate=1e5)
+    sampled = simulate(axis, 2.0, controller=law, reference=SquareWave(amplitude, 4.0), gap=gap, sample_rate=100.0)
+    assert {"stick", "slip"} <= set(run.events.kind)
+    assert np.abs(sampled.position - run.position).max() < 2e-4 * amplitude
+
+
+def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
+    """Position on the load around a velocity loop with integral action: the gap swings."""
+    axis, _, gap = AXES["two masses"]
+    law = axis.controller.replace(limit=None, position_gain=4.0, velocity_feedforward=0.0, acceleration_feedforward=0.0)
+    result = limit_cycle(axis, gap, controller=law, step=0.1)
+    assert result.orbit is not None
+    run = simulate(axis, 120.0, controller=law, reference=0.1, gap=gap, sample_rate=200.0)
+    tail = run.position[-8000:]
+    assert 0.5 * np.ptp(tail) == pytest.approx(result.orbit.amplitude, rel=1e-3)
+    spectrum = np.abs(np.fft.rfft((tail - tail.mean()) * np.hanning(tail.size)))
+    assert np.argmax(spectrum) / 40.0 == pytest.approx(result.orbit.frequency, abs=0.03)
+    with pytest.raises(InvalidInput, match=r"controller = Cascade\(.*must be a Controller, a filtered PID"):
+        simulate_ensemble(axis, 1.0, reference=0.1, gap=gap, controller=law)

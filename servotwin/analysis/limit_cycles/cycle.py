@@ -19,11 +19,11 @@ import numpy as np
 from servotwin.analysis.limit_cycles.orbit import ClosedOrbit, Orbit, closed_orbit
 from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section, guard_events
 from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
-from servotwin.control.controller import Controller
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
-from servotwin.plant.axis import Plant
+from servotwin.plant.axis import Axis, Plant
 
 # The first part of the run is 32 characteristic times of the loop long, each of the others twice as long as the one
 # before: with little integral action a cycle is that slow.
@@ -70,7 +70,7 @@ def limit_cycle(
     servo: Plant,
     gap: float,
     tolerance: float | None = None,
-    controller: Controller | None = None,
+    controller: AnyController | None = None,
     step: float = 1e-3,
 ) -> CycleResult:
     """Find the limit cycle on which the loop ends after a reference step from rest.
@@ -82,7 +82,7 @@ def limit_cycle(
         rad, total gap, constant.
     tolerance : float, optional
         m, half-width of the dead zone; None or 0: no dead zone.
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Continuous; the servo's own by default.
     step : float
         m, size of the step; the reference is constant after it. With a dead zone the loop has several ends, and
@@ -100,8 +100,9 @@ def limit_cycle(
     if not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
     loop = scaled_loop(servo, gap, tolerance, controller, step)
-    law = filtered_pid(servo.controller) if controller is None else controller
-    if gap == 0.0 and not tolerance and law.voltage_limit is None:
+    law = law_of(servo.controller if controller is None else controller)
+    limit = law.limit if isinstance(law, LinearLaw) else law.voltage_limit
+    if gap == 0.0 and not tolerance and limit is None:
         return _linear(servo, law)
     try:
         return _searched(loop)
@@ -109,9 +110,11 @@ def limit_cycle(
         return CycleResult(CycleStatus.CHATTERS, None, str(error))
 
 
-def _linear(servo: Plant, controller: Controller) -> CycleResult:
+def _linear(servo: Plant, law: Law) -> CycleResult:
     """Result without gap, dead zone and limit: the poles decide, nothing is simulated."""
-    if servo.closed_loop(controller).is_stable():
+    axis = isinstance(servo, Axis) and isinstance(law, LinearLaw)
+    closed = servo.closed_loop(law) if axis else servo.closed_loop(filtered_pid(law))  # type: ignore[arg-type]
+    if closed.is_stable():
         return CycleResult(CycleStatus.SETTLES, None, "without gap, dead zone and limit the loop is linear and stable")
     return CycleResult(CycleStatus.DIVERGES, None, "without gap, dead zone and limit the loop is linear and not stable")
 

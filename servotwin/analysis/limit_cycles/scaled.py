@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.analysis.limit_cycles.poincare import Flags, GuardId
-from servotwin.control.controller import Controller
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.automaton import ServoAutomaton
-from servotwin.plant.axis import Plant
+from servotwin.plant.axis import Axis, Plant
 from servotwin.plant.margins import gain_crossovers
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.simulate import Simulation
@@ -153,7 +153,7 @@ class ScaledLoop:
 
 
 def scaled_loop(
-    servo: Plant, gap: float, tolerance: float | None, controller: Controller | None, step: float
+    servo: Plant, gap: float, tolerance: float | None, controller: AnyController | None, step: float
 ) -> ScaledLoop:
     """The loop at rest just after a reference step (m); see `limit_cycle`.
 
@@ -162,7 +162,7 @@ def scaled_loop(
     InvalidInput
         The controller is sampled or has a rate limit, or a number is outside its range.
     """
-    law = filtered_pid(servo.controller) if controller is None else controller
+    law = law_of(servo.controller if controller is None else controller)
     if law.sample_rate is not None:
         rate = f"sample_rate = {law.sample_rate:g} Hz"
         raise InvalidInput(f"controller {rate}: limit cycles are those of the continuous law; give sample_rate = None")
@@ -184,10 +184,15 @@ def scaled_loop(
     return ScaledLoop(loop, scaled, mode, unit, displacement, servo.p, time, free, reflection)
 
 
-def characteristic_time(servo: Plant, controller: Controller) -> float:
+def characteristic_time(servo: Plant, controller: Law) -> float:
     """s: one turn at the first gain crossover without a gap, or, where there is none, of the slowest lasting motion."""
-    crossovers = gain_crossovers(servo.loop(controller))
+    if isinstance(servo, Axis) and isinstance(controller, LinearLaw):
+        crossovers = servo.margins(controller).gain_crossovers
+        closed = servo.closed_loop(controller)
+    else:
+        pid = filtered_pid(controller)
+        crossovers, closed = gain_crossovers(servo.loop(pid)), servo.closed_loop(pid)
     if crossovers:
         return 2.0 * math.pi / crossovers[0].omega
-    sizes = np.abs(servo.closed_loop(controller).poles())
+    sizes = np.abs(closed.poles())
     return float(2.0 * math.pi / np.min(sizes[sizes > 0.0]))

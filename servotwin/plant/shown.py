@@ -1,0 +1,45 @@
+"""Units in which people see the position of a machine: millimetres, or degrees of a rotary axis."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.load import ROTARY
+
+
+class ShownUnit(NamedTuple):
+    """A unit of position for tables and plots.
+
+    Attributes
+    ----------
+    name : str
+        At the end of a key too.
+    factor : float
+        Number in this unit per metre, or per radian.
+    si : str
+        The unit inside: m or rad.
+    """
+
+    name: str
+    factor: float
+    si: str
+
+    def si_of(self, value: float) -> float:
+        """The value in m or rad."""
+        return value / self.factor
+
+
+MILLIMETRES = ShownUnit("mm", 1e3, "m")
+DEGREES = ShownUnit("deg", 180.0 / math.pi, "rad")
+
+
+def position_unit(plant: Plant) -> ShownUnit:
+    """Unit of a plant's position."""
+    return DEGREES if isinstance(plant, Axis) and plant.load.motion == ROTARY else MILLIMETRES
+
+
+def command_unit(plant: Plant) -> str:
+    """Unit of the command of a plant's actuator."""
+    return plant.actuator.unit if isinstance(plant, Axis) else "V"
