@@ -76,7 +76,7 @@ def estimate_gap(
         places; "whitened" also returns it where the window does not show the gap.
     settings : optional
         The method's own `Settings`. Without them the largest accepted spread of an axis is at least 0.6 counts of the
-        motor's encoder, and its model error half a count.
+        motor's encoder, its shift and model error half a count.
 
     Raises
     ------
@@ -128,6 +128,7 @@ def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.Wh
     return replace(
         settings,
         largest_std=max(settings.largest_std, _ALLOWED * count),
+        largest_shift=max(settings.largest_shift, _ROUNDED * count),
         model_error=max(settings.model_error, _ROUNDED * count),
     )
 
