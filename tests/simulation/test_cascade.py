@@ -273,3 +273,18 @@ def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
     assert np.argmax(spectrum) / 40.0 == pytest.approx(result.orbit.frequency, abs=0.03)
     with pytest.raises(InvalidInput, match=r"controller = Cascade\(.*must be a Controller, a filtered PID"):
         simulate_ensemble(axis, 1.0, reference=0.1, gap=gap, controller=law)
+
+
+def test_a_continuous_cascade_is_replaced_within_rounding() -> None:
+    """Another structure too: the notch is new, the integral is gone."""
+    axis = AXES["two masses"][0]
+    first = axis.controller.replace(limit=None)
+    for second in (first.replace(position_gain=1.0, notch_hz=8.0), first.replace(integral_time=None, low_pass_hz=50.0)):
+        simulation = Simulation(axis, 1.0, first, reference=0.1, gap=0.03, sample_rate=1e3)
+        simulation.advance(300)
+        before = simulation.engine.channel("voltage", 300, 301)[0]
+        simulation.set_controller(second)
+        after = simulation.engine.channel("voltage", 300, 301)[0]
+        assert after == pytest.approx(before, abs=1e-12)
+        simulation.advance(1000)
+        assert np.isfinite(simulation.run().position).all()
