@@ -106,6 +106,59 @@ def guard_series(
 
 
 @bare
+def later(terms: Array, time: float, out: Array) -> None:
+    """State (size,) at a time, from its Taylor coefficients."""
+    for j in range(out.size):
+        total = 0.0
+        for k in range(_TERMS - 1, -1, -1):
+            total = total * time + terms[k, j]
+        out[j] = total
+
+
+@bare
+def through_sample(
+    side: int,
+    begin: float,
+    end: float,
+    interval: float,
+    half: float,
+    flows: Array,
+    steps: Array,
+    push: Array,
+    work: Array,
+    state: Array,
+) -> int:
+    """Advance the state by one interval in which the motor moves from `begin` to `end`; return the flank at its end.
+
+    The other arguments are those of `run_shaft`.
+    """
+    kept, rate = state.size - 3, (end - begin) / interval
+    terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
+    now, left = begin, interval
+    for change in range(_CHANGES):
+        if change == 0:
+            advance(steps[1] if side != 0 else steps[0], state, after)
+            if guard(side, end, after, push, half) >= 0.0:
+                break
+        series(flows[1] if side != 0 else flows[0], state, terms)
+        if change > 0:
+            later(terms, left, after)
+            if guard(side, end, after, push, half) >= 0.0 or change == _CHANGES - 1:
+                break
+        ahead = 1 if end > after[kept] else -1
+        guard_series(side, ahead, now, rate, terms, push, half, polynomial)
+        time = first_fall(polynomial, left)
+        later(terms, time, state)
+        now += rate * time
+        left -= time
+        side = ahead if side == 0 else 0
+        drive_to(state, side, now, rate, half, kept)
+    for j in range(state.size):
+        state[j] = after[j]
+    return side
+
+
+@bare
 def run_shaft(
     drive: Array,
     interval: float,
@@ -127,10 +180,8 @@ def run_shaft(
     ----------
     drive : (N,) array
         Motor's position seen at the load, m or rad.
-    interval : float
-        s.
-    half : float
-        Half of the gap at the load.
+    interval, half : float
+        s, and half of the gap at the load.
     flows, steps : (2, size, size) arrays
         Flow and its exponential over one interval, in the gap and in contact, of (q (n), v (n), driven end, its rate,
         1); size = 2 n + 3.
@@ -152,14 +203,9 @@ def run_shaft(
     sides : (N,) int8 array
         Out: flank in contact, -1, 0 or 1.
     """
-    size = state.size
-    n, kept = (size - 3) // 2, size - 3
-    terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
-    side, part = 0, (drive.size - 1) // (measured.size - 1)
-    if drive[0] - state[kept] > half:
-        side = 1
-    elif state[kept] - drive[0] > half:
-        side = -1
+    n, kept = (state.size - 3) // 2, state.size - 3
+    part, lead = (drive.size - 1) // (measured.size - 1), drive[0] - state[kept]
+    side = 0 if abs(lead) <= half else (1 if lead > 0.0 else -1)
     for i in range(drive.size):
         rate = (drive[i + 1] - drive[i]) / interval if i + 1 < drive.size else 0.0
         drive_to(state, side, drive[i], rate, half, kept)
@@ -170,35 +216,6 @@ def run_shaft(
         state[2 * n - 1] += gains[1] * error
         if i + 1 == drive.size:
             break
-        now, left = drive[i], interval
-        for change in range(_CHANGES):
-            flow = flows[1] if side != 0 else flows[0]
-            if change == 0:
-                advance(steps[1] if side != 0 else steps[0], state, after)
-                if guard(side, drive[i + 1], after, push, half) >= 0.0:
-                    break
-            series(flow, state, terms)
-            if change > 0:
-                for j in range(size):
-                    total = 0.0
-                    for k in range(_TERMS - 1, -1, -1):
-                        total = total * left + terms[k, j]
-                    after[j] = total
-                if guard(side, drive[i + 1], after, push, half) >= 0.0 or change == _CHANGES - 1:
-                    break
-            ahead = 1 if drive[i + 1] > after[kept] else -1
-            guard_series(side, ahead, now, rate, terms, push, half, polynomial)
-            time = first_fall(polynomial, left)
-            for j in range(size):
-                total = 0.0
-                for k in range(_TERMS - 1, -1, -1):
-                    total = total * time + terms[k, j]
-                state[j] = total
-            now += rate * time
-            left -= time
-            side = ahead if side == 0 else 0
-            drive_to(state, side, now, rate, half, kept)
-        for j in range(size):
-            state[j] = after[j]
+        side = through_sample(side, drive[i], drive[i + 1], interval, half, flows, steps, push, work, state)
         speed = state[2 * n - 1]
         state[2 * n - 1] = speed - min(max(speed, -friction), friction)
