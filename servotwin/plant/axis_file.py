@@ -9,7 +9,7 @@ from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import items_of, key, unit_of
 from servotwin.config.table import Table
-from servotwin.config.toml import Values, part, read, read_kind, values_of
+from servotwin.config.toml import Values, kind_of, part, read, read_kind, values_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.plant.actuator import ACTUATORS, Actuator
@@ -123,9 +123,9 @@ def read_parts(table: Table) -> Parts:
     """
     tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
     actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
-    kind = tables["transmission"].text("kind", choices=tuple(TRANSMISSIONS))
+    kind = kind_of(tables["transmission"], TRANSMISSIONS)
     transmission: Transmission = read_kind(tables["transmission"], TRANSMISSIONS, Path())
-    motion = tables["load"].text("kind", choices=tuple(LOADS))
+    motion = kind_of(tables["load"], LOADS)
     if motion != _MOTIONS[kind]:
         raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
     load: Load = read_kind(tables["load"], LOADS, Path())
@@ -137,7 +137,7 @@ def read_parts(table: Table) -> Parts:
 
 def _read_controller(table: Table, unit: str, motion: str, ratio: float) -> Controller | Cascade:
     """Read the controller in the units of its axis; a cascade's ratio is the transmission's where it is not given."""
-    kind = table.text("kind", FILTERED_PID, choices=tuple(CONTROLLERS))
+    kind = kind_of(table, CONTROLLERS, FILTERED_PID)
     controller = table.renamed(controller_keys(unit, motion, CONTROLLERS[kind]))
     controller.known("kind")
     law: Controller | Cascade
