@@ -59,7 +59,7 @@ def two_mass_drive(random: np.random.Generator) -> tuple[Axis, float]:
             Tf=0.1 / omega,
         )
         axis = Axis(
-            TorqueDrive(share * m * p * p, 0.05 / omega, 0.3 * drag * p * p),
+            TorqueDrive(J=share * m * p * p, lag=0.05 / omega, friction=0.3 * drag * p * p),
             Transmission(p, m * omega**2, damping if random.random() < 0.8 else 0.0, "free"),
             Load((m,), (0.0,), (drag,), "rotary"),
             law,

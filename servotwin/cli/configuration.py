@@ -11,6 +11,7 @@ from pathlib import Path
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.config.keys import Maker
 from servotwin.config.reference import TableSpec, markdown, schema
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.cosim import scenario_file as tables
 from servotwin.cosim.scenario import Scenario
@@ -75,10 +76,10 @@ _TWIN = TableSpec((TwinSettings,), "The twin.", {"estimator": _ESTIMATOR})
 _DRIVES = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in SUPERVISED.items()}
 
 
-def _controller_of(unit: str, motion: str) -> TableSpec:
+def _controller_of(unit: str, motion: str, kind: type = Controller) -> TableSpec:
     """Keys of a controller in the units of an axis."""
-    names = {name: shown for shown, name in controller_keys(unit, motion).items()}
-    return TableSpec((Controller,), names=names)
+    names = {name: shown for shown, name in controller_keys(unit, motion, kind).items()}
+    return TableSpec((kind,), names=names)
 
 
 def _kinds(words: str, makers: Mapping[str, Maker]) -> TableSpec:
@@ -101,19 +102,26 @@ def _axis(controller: TableSpec) -> TableSpec:
 _CONTROLLERS = TableSpec(
     help="The controller that runs; its keys have the units of command and position.",
     kinds={
-        f"command {unit}, load {motion}": _controller_of(unit, motion)
+        # Partial, for the ratio of a cascade may be the transmission's.
+        f"command {unit}, load {motion}{tagged}": replace(_controller_of(unit, motion, kind), partial=kind is Cascade)
+        for tagged, kind in (("", Controller), (', kind = "cascade"', Cascade))
         for unit in ("V", "N m", "rad/s", "rad")
         for motion in LOADS
     },
 )
 _SHOWN = _controller_of("N m", "linear")
 _SHOWN_HELP = (
-    "The controller that runs. Its keys have the units of command and position: here those of a torque and a linear "
+    "The controller that runs, a filtered PID where `kind` is absent. "
+    "Its keys have the units of command and position: here those of a torque and a linear "
     "load. With a voltage `n_m` is `v` and the limit `voltage_limit_v`, with a speed `rad_per_s` and "
     "`speed_limit_rad_per_s`, with an angle `rad` and `angle_limit_rad`; with a rotary load `m` is `rad`: "
     "`kp_v_per_m`, `ki_rad_per_s_per_rad_s`."
 )
-AXIS_SHOWN = _axis(replace(_SHOWN, help=_SHOWN_HELP))
+_EITHER = {
+    'kind = "filtered_pid"': _SHOWN,
+    'kind = "cascade"': _controller_of("N m", "linear", Cascade),
+}
+AXIS_SHOWN = _axis(TableSpec(help=_SHOWN_HELP, kinds=_EITHER))
 """File of an axis for the reference, with one controller for all units."""
 FILES = {
     "servo": ("Servo: `servo.toml`", TableSpec((Servo,))),

@@ -83,7 +83,7 @@ _PLAIN = {
     "v_s_per_m": "V s/m", "kg_m2": "kg m^2", "n_m_per_a": "N m/A", "v_s_per_rad": "V s/rad", "m_per_rad": "m/rad",
     "n_per_m": "N/m", "n_s_per_m": "N s/m", "per_s": "1/s", "per_minute": "1/min", "days": "days", "bytes": "bytes",
     "tolerances": "tolerances", "n_m_per_rad": "N m/rad", "n_m_s_per_rad": "N m s/rad", "n": "N",
-    "v_s2_per_rad": "V s^2/rad",
+    "v_s2_per_rad": "V s^2/rad", "n_m_s2_per_rad": "N m s^2/rad",
 }  # fmt: skip
 # Gains of axes: command per position, by time or with it.
 for _command, _per in (("v", "V"), ("n_m", "N m"), ("rad_per_s", "rad/s"), ("rad", "rad")):

@@ -28,7 +28,14 @@ class Cascade:
     position_gain: Annotated[
         float, key("position_gain_per_s", minimum=0.0, help="Speed command per error of the position (Kv).")
     ]
-    ratio: Annotated[float, key("travel_m_per_rad", above=0.0, help="Travel of the load per angle of the motor.")]
+    ratio: Annotated[
+        float,
+        key(
+            "travel_m_per_rad",
+            above=0.0,
+            help="Travel of the load per angle of the motor; in the file of an axis the transmission's where absent.",
+        ),
+    ]
     velocity_gain: Annotated[
         float | None,
         key(

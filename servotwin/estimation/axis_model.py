@@ -45,6 +45,11 @@ def servo_of(axis: Axis) -> Servo:
             'least 2 masses; leave the method out, or give method = "output_error"'
         )
     load, motor = axis.load, axis.actuator
+    if load.friction > 0.0:
+        raise InvalidInput(
+            f'load friction = {load.friction!r}: methods "whitened" and "paper" know no Coulomb friction of the load; '
+            "its transmission must be free in the gap for an estimate"
+        )
     # With a rigid transmission the first spring is inert: a free load may have any.
     springs = (load.k[0] or load.k[1], *load.k[1:]) if axis.rigid else _grounded(load.k)
     J, R, k_T, k_B, L = 1.0, 1.0, 1.0, _loop_gain(axis), 1.0

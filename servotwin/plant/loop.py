@@ -13,6 +13,7 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawState, tick
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ShaftMatrices, ShaftPolynomials
 from servotwin.plant.linear import (
@@ -143,6 +144,7 @@ def check_stable(plant: LinearSystem, law: Controller, described: str, command: 
 
 def pidf(controller: Controller) -> LinearSystem:
     """C_PIDF = Kp + Ki/s + Kd s/(Tf s + 1) (Eq 14) and the notch behind it; terms whose gain is zero have no state."""
+    controller = filtered_pid(controller)
     system = gain(controller.Kp)
     if controller.Ki != 0.0:
         system = parallel(system, integrator(controller.Ki))
@@ -205,6 +207,7 @@ def sampled_law(controller: Controller) -> StateMatrices:
     InvalidInput
         The controller is continuous.
     """
+    controller = filtered_pid(controller)
     if controller.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: a sampled loop needs a rate in Hz")
     law = controller.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).law(None)

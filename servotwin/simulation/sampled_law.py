@@ -8,7 +8,6 @@ import numpy as np
 
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearParameters, LinearState
-from servotwin.errors import InvalidInput
 from servotwin.simulation.inputs import quantised
 from servotwin.simulation.law_ticks import TwoSensors, law_tick_and_record, run_law_ticks
 from servotwin.simulation.sampled import SampledEngine
@@ -20,11 +19,6 @@ class SampledLawEngine(SampledEngine):
     """Engine of a `Simulation` whose controller is a linear law with a sample rate."""
 
     controller: LinearLaw  # type: ignore[assignment]
-
-    def __post_init__(self) -> None:
-        if self.noise is not None and not self.controller.reads("y_load"):
-            raise InvalidInput("noise is on the load's encoder, which the controller does not read: noise must be None")
-        super().__post_init__()
 
     def _started(self) -> tuple[LinearState, LinearParameters]:
         return self.controller.start(*self._present()), _with_arrays(self.controller.parameters())

@@ -119,6 +119,8 @@ class Simulation:
 
     def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
         servo, law, inputs, samples, keep = self.servo, self.controller, self.inputs, self.samples, self.keep
+        if noise is not None and isinstance(law, LinearLaw) and not law.reads("y_load"):
+            raise InvalidInput("noise is on the load's encoder, which the controller does not read: noise must be None")
         if law.sample_rate is None:
             source = None if noise is None else noise.source(inputs.sample_rate, rng)
             return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)

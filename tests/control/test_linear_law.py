@@ -8,6 +8,7 @@ from scipy import signal
 from scipy.linalg import expm
 
 from servotwin.control import Controller, linear_tick, start, tick
+from servotwin.control.cascade import Cascade
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearParameters, LinearState
 from servotwin.control.matrices import at_rest, exponential
@@ -40,13 +41,25 @@ def random_law(seed: int, n: int, **values: object) -> LinearLaw:
     )
 
 
+CASCADE = Cascade(
+    0.3, 0.5, velocity_gain=0.02, integral_time=0.05, speed_filter=2e-2, velocity_feedforward=0.9,
+    acceleration_feedforward=1e-4, reference_filter=2e-2, notch_hz=45.0, low_pass_hz=300.0, limit=2.5,
+    rate_limit=1500.0, enter=0.5, leave=1.5, sample_rate=1e3,
+)  # fmt: skip
 LIMITS = {"limit": 2.5, "rate_limit": 1500.0, "enter": 0.5, "leave": 1.5, "feedforward": 0.1}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "opens", "count"), [(3, False, 1_000_000), (7, True, 100_000)])
-def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(n: int, opens: bool, count: int) -> None:
-    law = random_law(n, n, on="motor", ratio=0.3, opens=opens, **LIMITS)
+@pytest.mark.parametrize(
+    ("law", "count"),
+    [
+        (random_law(3, 3, on="motor", ratio=0.3, **LIMITS), 1_000_000),
+        (random_law(7, 7, on="motor", ratio=0.3, opens=True, **LIMITS), 100_000),
+        (CASCADE.linear(), 1_000_000),
+    ],
+    ids=["random", "opens", "cascade"],
+)
+def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(law: LinearLaw, count: int) -> None:
     parameters, first = law.parameters(0.6), law.start(0.0, 0.0)._replace(offset=1.3)
     inputs = np.random.default_rng(9).normal(size=(count, 3))
     advance, output = np.array(parameters.advance), np.array(parameters.output)

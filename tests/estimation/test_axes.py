@@ -57,3 +57,10 @@ def test_an_elastic_screw_that_is_held_needs_a_grounded_load() -> None:
     window = Window(np.zeros(500), np.zeros(500), sample_rate=1e3)
     with pytest.raises(InvalidInput, match=r"load k\[0\] = 0.0"):
         estimate_gap(window, free)
+
+
+def test_friction_of_the_load_behind_a_rigid_screw_is_refused() -> None:
+    rubbing = PARTS.replace(load=dataclasses.replace(PARTS.load, friction=1.0))
+    window = Window(np.zeros(500), np.zeros(500), sample_rate=1e3)
+    with pytest.raises(InvalidInput, match="know no Coulomb friction of the load"):
+        estimate_gap(window, rubbing)

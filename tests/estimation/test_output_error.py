@@ -63,6 +63,20 @@ def test_the_load_under_the_motor_s_motion_is_that_of_the_exact_simulation(axis:
     assert 10.0 < errors[0] / errors[1] < 25.0
 
 
+@pytest.mark.parametrize(("friction", "force", "errors"), [(0.0, 3.0, (2e-3, 1e-4)), (4.0, 3.0, (4e-3, 2e-3))])
+def test_friction_and_gravity_act_on_the_load(friction: float, force: float, errors: tuple[float, float]) -> None:
+    """Friction is taken off once a sample: the error falls with the interval only."""
+    axis = TWO_MASS.replace(load=Load((5.6,), (0.0,), (0.3,), "rotary", friction, force))
+    model = ShaftModel(axis, PRIORS)
+    for rate, allowed in zip((1000.0, 4000.0), errors, strict=True):
+        run = simulate(axis, 4.0, reference=SquareWave(0.2, 4.0), gap=0.03, sample_rate=rate)
+        moved = model.simulate(run.theta_m, run.position, 1.0 / rate, model.start(0.015, 0.0, (0.0, 0.0)), 0.0)
+        assert float(np.abs(moved.position - run.position).max()) < allowed * 0.03
+    estimate = estimate_gap(recorded(axis, 0.03, 1e-4), axis)
+    assert estimate.ok, estimate.reasons
+    assert abs(estimate.gap - 0.03) < 0.01 * 0.03
+
+
 @pytest.mark.parametrize(("axis", "gap"), [(TWO_MASS, 0.03), (UNDAMPED, 0.1), (TWO_LOADS, 0.03)])
 def test_the_gap_of_a_free_shaft_is_found_without_noise(axis: Axis, gap: float) -> None:
     estimate = estimate_gap(recorded(axis, gap), axis)
@@ -86,7 +100,7 @@ def test_the_same_machine_in_other_units_has_the_same_estimate() -> None:
     slow, mass, ratio = 10.0, 100.0, 0.01
     k, c = mass / slow**2, mass / slow
     other = TWO_MASS.replace(
-        actuator=TorqueDrive(0.4 * mass * ratio**2, 1e-3 * slow, 0.05 * c * ratio**2),
+        actuator=TorqueDrive(J=0.4 * mass * ratio**2, lag=1e-3 * slow, friction=0.05 * c * ratio**2),
         transmission=Transmission(ratio, 3300.0 * k, 2.0 * c, "free"),
         load=Load((5.6 * mass,), (0.0,), (0.3 * c,), "rotary"),
     )

@@ -10,12 +10,14 @@ from test_axis import ELASTIC, TWO_MASS
 
 from servotwin.analysis.limit_cycles.cycle import limit_cycle
 from servotwin.control.cascade import Cascade
+from servotwin.control.linear_tick import linear_tick
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
 from servotwin.plant.noise import Noise
 from servotwin.plant.sensors import Sensors
+from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Simulation, simulate
@@ -163,6 +165,23 @@ def test_counts_and_noise_reach_the_law() -> None:
     assert 0.0 < np.abs(ideal.position - runs[0].position).max() < 2e-3
 
 
+def test_the_compiled_loop_gives_the_edge_s_bits() -> None:
+    """The interpreted law, fed with what was measured in the compiled loop, gives the same commands."""
+    axis, amplitude, gap = AXES["two masses"]
+    axis = axis.replace(sensors=Sensors(encoder_resolution=1e-4, position_resolution=2e-5))
+    law, tolerance = axis.controller.replace(sample_rate=2e3, limit=20.0, leave=1.5), 5e-3
+    signals = {"reference": SquareWave(amplitude, 2.0), "gap": gap, "tolerance": tolerance, "noise": Noise(std=1e-4)}
+    run = simulate(axis, 4.0, controller=law, sample_rate=2e3, **signals)
+    parameters, state, commands = law.linear().parameters(tolerance), law.linear().start(0.0, 0.0), []
+    measured = (run.reference, run.measured("theta_m"), run.measured_position)
+    for row in zip(*(each.tolist() for each in measured), strict=True):
+        state = linear_tick(parameters, state, *row)
+        commands.append(state.command)
+    assert np.array_equal(run.voltage, commands)
+    assert {"enter", "leave"} <= set(run.events.kind)
+    assert np.abs(run.voltage).max() == 20.0
+
+
 @pytest.mark.parametrize("sample_rate", [None, 1e3])
 def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -> None:
     axis = AXES["two masses"][0]
@@ -196,6 +215,10 @@ def test_a_file_of_an_axis_holds_its_cascade(name: str) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
+        (
+            lambda: Servo.preset("paper").margins(AXES["two masses"][0].controller.linear()),
+            "must be a Controller, a filtered PID",
+        ),
         (lambda: AXES["two masses"][0].check_loop(Cascade(900.0, 1.0, velocity_gain=30.0)), "is unstable on this axis"),
         (
             lambda: simulate(AXES["two masses"][0].replace(sensors=Sensors(feedback="motor")), 1.0),
@@ -206,6 +229,10 @@ def test_a_file_of_an_axis_holds_its_cascade(name: str) -> None:
                 AXES["ball screw"][0], 1.0, controller=AXES["ball screw"][0].controller.replace(sample_rate=1e3),
                 noise=Noise(std=1e-6),
             ),
+            "noise is on the load's encoder, which the controller does not read",
+        ),
+        (
+            lambda: simulate(AXES["ball screw"][0], 1.0, noise=Noise(std=1e-6)),
             "noise is on the load's encoder, which the controller does not read",
         ),
         (
@@ -246,3 +273,18 @@ def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
     assert np.argmax(spectrum) / 40.0 == pytest.approx(result.orbit.frequency, abs=0.03)
     with pytest.raises(InvalidInput, match=r"controller = Cascade\(.*must be a Controller, a filtered PID"):
         simulate_ensemble(axis, 1.0, reference=0.1, gap=gap, controller=law)
+
+
+def test_a_continuous_cascade_is_replaced_within_rounding() -> None:
+    """Another structure too: the notch is new, the integral is gone."""
+    axis = AXES["two masses"][0]
+    first = axis.controller.replace(limit=None)
+    for second in (first.replace(position_gain=1.0, notch_hz=8.0), first.replace(integral_time=None, low_pass_hz=50.0)):
+        simulation = Simulation(axis, 1.0, first, reference=0.1, gap=0.03, sample_rate=1e3)
+        simulation.advance(300)
+        before = simulation.engine.channel("voltage", 300, 301)[0]
+        simulation.set_controller(second)
+        after = simulation.engine.channel("voltage", 300, 301)[0]
+        assert after == pytest.approx(before, abs=1e-12)
+        simulation.advance(1000)
+        assert np.isfinite(simulation.run().position).all()

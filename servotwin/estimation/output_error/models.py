@@ -105,6 +105,10 @@ class ShaftModel:
             factors.append(Unknown("shaft damping", known.damping, "damping"))
         if any(load.c):
             factors.append(Unknown("load damping", known.damping, "damping"))
+        if load.friction > 0.0:
+            factors.append(Unknown("load friction", known.damping, "damping"))
+        if load.force != 0.0:
+            factors.append(Unknown("load force", known.stiffness, "factor"))
         if any(load.k):
             factors.append(Unknown("load stiffness", known.stiffness, "factor"))
         if load.n > 1:
@@ -132,20 +136,42 @@ class ShaftModel:
         named = {unknown.name: value for unknown, value in zip(self.unknowns, values.tolist(), strict=True)}
         factors = tuple(
             math.exp(named.get(name, 0.0))
-            for name in ("shaft stiffness", "shaft damping", "load damping", "load stiffness", "mass ratio")
+            for name in (
+                "shaft stiffness",
+                "shaft damping",
+                "load damping",
+                "load stiffness",
+                "mass ratio",
+                "load force",
+            )
         )
         flows, steps, push, fine = _matrices(self.axis, factors, interval)
         driven = math.exp(named["ratio"]) * drive + named["offset"]
         if fine > 1:
             at = np.arange((driven.size - 1) * fine + 1) / fine
             driven = np.interp(at, np.arange(driven.size), driven)
-        state = np.concatenate([values[-2 * n :], [values[-2 * n], 0.0]])
+        state = np.concatenate([values[-2 * n :], [values[-2 * n], 0.0, 1.0]])
         out, sides = np.empty((3, driven.size)), np.empty(driven.size, dtype=np.int8)
         work = np.empty((18 + 14 // state.size, state.size))
         half = math.exp(named["ratio"]) * abs(named["half gap"])
         zero = named.get("position offset", 0.0)
+        friction = math.exp(named.get("load friction", 0.0)) * self.axis.load.friction / self.axis.load.m[-1]
         gains = 2.0 * rate * interval, rate * rate * interval
-        run_shaft(driven, interval / fine, half, flows, steps, push, measured - zero, gains, work, state, out, sides)
+        run_shaft(
+            driven,
+            interval / fine,
+            half,
+            flows,
+            steps,
+            push,
+            measured - zero,
+            gains,
+            friction * interval / fine,
+            work,
+            state,
+            out,
+            sides,
+        )
         position, velocity, end = out[:, ::fine]
         return Motion(position + zero, velocity, end, sides[::fine])
 
@@ -153,13 +179,13 @@ class ShaftModel:
 @lru_cache(maxsize=64)
 def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, Array, Array, int]:
     """Flows and steps (2, size, size) in the gap and in contact, the force's row, parts of a sample that are needed."""
-    k_d, c_d, c, k, ratio = factors
+    k_d, c_d, c, k, ratio, force = factors
     load, shaft, n = axis.load, axis.transmission, axis.n
     masses = load.masses.copy()
     masses[-1] *= ratio
     k_d, c_d = k_d * shaft.k_d, c_d * shaft.c_d
     links = chain(masses, k * load.stiffnesses, c * load.dampings, k_d, c_d)
-    size, rate = 2 * n + 2, k_d / c_d if c_d > 0.0 else math.inf
+    size, rate = 2 * n + 3, k_d / c_d if c_d > 0.0 else math.inf
     flows, push = np.zeros((2, size, size)), np.zeros(size)
     flows[0, : 2 * n, : 2 * n], flows[1, : 2 * n, : 2 * n] = links.A_open, links.A
     flows[1, : 2 * n, 2 * n], flows[1, : 2 * n, 2 * n + 1] = links.B_position, links.B_velocity
@@ -167,7 +193,8 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
     flows[0, 2 * n, n] = 1.0
     if rate * interval < _RELAXED:
         flows[0, 2 * n, [0, 2 * n]] = rate, -rate
-    push[: 2 * n], push[2 * n :] = links.reaction, (k_d, c_d)
+    push[: 2 * n], push[2 * n : 2 * n + 2] = links.reaction, (k_d, c_d)
+    flows[:, 2 * n - 1, 2 * n + 2] = force * load.force / masses[-1]
     fastest = max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
     fine = max(1, math.ceil(fastest * interval / _FASTEST))
     steps = np.array([_exponential(flow * interval / fine) for flow in flows])

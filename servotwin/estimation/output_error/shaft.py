@@ -68,7 +68,7 @@ def advance(step: Array, state: Array, out: Array) -> None:
 
 @bare
 def drive_to(state: Array, side: int, drive: float, rate: float, half: float, kept: int) -> None:
-    """Set the two last states to the driven end in contact: position and rate; in the gap its rate alone is zero."""
+    """Set the driven end in contact: its position and rate, states `kept` and the next."""
     if side != 0:
         state[kept] = drive - side * half
         state[kept + 1] = rate
@@ -77,7 +77,7 @@ def drive_to(state: Array, side: int, drive: float, rate: float, half: float, ke
 @bare
 def guard(side: int, drive: float, state: Array, push: Array, half: float) -> float:
     """Positive while the mode lasts: force on the flank, or the shorter way to one."""
-    kept = state.size - 2
+    kept = state.size - 3
     if side != 0:
         total = 0.0
         for j in range(state.size):
@@ -99,7 +99,7 @@ def guard_series(
                 total += push[j] * terms[k, j]
             out[k] = side * total
         else:
-            out[k] = ahead * terms[k, size - 2]
+            out[k] = ahead * terms[k, size - 3]
     if side == 0:
         out[0] += half - ahead * drive
         out[1] -= ahead * rate
@@ -115,6 +115,7 @@ def run_shaft(
     push: Array,
     measured: Array,
     gains: tuple[float, float],
+    friction: float,
     work: Array,
     state: Array,
     motion: Array,
@@ -131,8 +132,8 @@ def run_shaft(
     half : float
         Half of the gap at the load.
     flows, steps : (2, size, size) arrays
-        Flow and its exponential over one interval, in the gap and in contact, of (q (n), v (n), driven end, its rate);
-        size = 2 n + 2.
+        Flow and its exponential over one interval, in the gap and in contact, of (q (n), v (n), driven end, its rate,
+        1); size = 2 n + 3.
     push : (size,) array
         Row of the shaft's force on the load in contact.
     measured : (M,) array
@@ -140,6 +141,8 @@ def run_shaft(
     gains : (float, float)
         Shares of the measured position less the simulated one that are added to the last mass's position, and to its
         speed (1/s); 0: none.
+    friction : float
+        Speed that Coulomb friction takes off the last mass in one interval; after each it takes that much at most.
     work : (18, size) array
         Scratch.
     state : (size,) array
@@ -150,7 +153,7 @@ def run_shaft(
         Out: flank in contact, -1, 0 or 1.
     """
     size = state.size
-    n, kept = (size - 2) // 2, size - 2
+    n, kept = (size - 3) // 2, size - 3
     terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
     side, part = 0, (drive.size - 1) // (measured.size - 1)
     if drive[0] - state[kept] > half:
@@ -197,3 +200,5 @@ def run_shaft(
             drive_to(state, side, now, rate, half, kept)
         for j in range(size):
             state[j] = after[j]
+        speed = state[2 * n - 1]
+        state[2 * n - 1] = speed - min(max(speed, -friction), friction)

@@ -22,8 +22,8 @@ _CHANCE = 2.0  # times the usual variance of an average of white noise
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the way off a flank; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
-_DOUBT = 1.5  # interval over the computed one
-_ROUNDED = 0.6  # of a count: standard deviation of an error that does not average out
+_DOUBT = 2.0  # interval over the computed one
+_ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
 
 
 @dataclass(frozen=True)
