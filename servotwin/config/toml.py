@@ -186,11 +186,6 @@ def read_kind(table: Table, makers: Mapping[str, Maker], folder: Path) -> Any:
     return _whole(table, makers[table.text("kind", choices=tuple(makers))], folder)
 
 
-def kind_of(table: Table, makers: Mapping[str, Maker], default: str) -> str:
-    """Name of the maker that a table's key `kind` chooses; a default where it is absent."""
-    return table.text("kind", default, choices=tuple(makers))
-
-
 def _whole(table: Table, maker: Maker, folder: Path) -> Any:
     made = read(table, maker, folder)
     table.done()
