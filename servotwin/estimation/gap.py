@@ -46,6 +46,7 @@ METHODS: Mapping[str, Method] = {
 """The methods for a servo, those of a twin."""
 
 _SAME = 1e-9  # of the motion: rounding
+_ALLOWED, _ROUNDED = 0.6, 0.5  # of a count
 _ALL = {
     **METHODS,
     output_error.METHOD: Method(output_error.estimate, output_error.OutputErrorSettings, output_error.shortest_window),
@@ -74,7 +75,8 @@ def estimate_gap(
         Total gap known before, rad; an estimate that is not OK is ignored. The search starts there, among other
         places; "whitened" also returns it where the window does not show the gap.
     settings : optional
-        The method's own `Settings`.
+        The method's own `Settings`. Without them the largest accepted spread of an axis is at least 0.6 counts of the
+        motor's encoder, its shift and model error half a count.
 
     Raises
     ------
@@ -88,6 +90,8 @@ def estimate_gap(
         _check_position(window, servo)
     if isinstance(servo, Servo) or method == output_error.METHOD:
         return _ALL[method].estimate(window, servo, known, chosen)
+    if settings is None and isinstance(chosen, whitened.WhitenedSettings):
+        chosen = _in_counts(chosen, servo.encoder_resolution)
     estimate: GapEstimate = _ALL[method].estimate(window, servo_of(servo), known, chosen)
     return replace(estimate, model_version=servo.version)
 
@@ -117,6 +121,16 @@ def settings_of(method: str, settings: Any = None) -> Any:
 def shortest_window(method: str, servo: Servo, sample_rate: float, settings: Any = None) -> tuple[float, str]:
     """The shortest window (s) of a servo that a method accepts at a sample rate (Hz), and why, in words."""
     return _ALL[method].shortest(settings_of(method, settings), servo, sample_rate)
+
+
+def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.WhitenedSettings:
+    """The settings with a spread that one count (rad) of a coarse encoder allows, and causes."""
+    return replace(
+        settings,
+        largest_std=max(settings.largest_std, _ALLOWED * count),
+        largest_shift=max(settings.largest_shift, _ROUNDED * count),
+        model_error=max(settings.model_error, _ROUNDED * count),
+    )
 
 
 def _check_position(window: Window, axis: Axis) -> None:

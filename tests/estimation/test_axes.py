@@ -64,3 +64,12 @@ def test_friction_of_the_load_behind_a_rigid_screw_is_refused() -> None:
     window = Window(np.zeros(500), np.zeros(500), sample_rate=1e3)
     with pytest.raises(InvalidInput, match="know no Coulomb friction of the load"):
         estimate_gap(window, rubbing)
+
+
+def test_a_coarse_encoder_shows_a_gap_of_a_tenth_of_a_micrometre_to_a_count() -> None:
+    axis, at_load = Axis.preset("micro-positioner"), 1e-7
+    run = simulate(axis, 3.0, reference=SquareWave(4e-6, 1.0), gap=at_load / axis.p, sample_rate=5000.0)
+    estimate = estimate_gap(Window.from_run(run, 0.5, 1.5), axis)
+    assert estimate.ok, estimate.reasons
+    assert abs(estimate.gap - at_load / axis.p) < axis.encoder_resolution
+    assert estimate.interval[0] < at_load / axis.p < estimate.interval[1]
