@@ -169,14 +169,21 @@ def _of_kind(table: Table, item: Item, folder: Path) -> Any:
     return read_kind(table, makers, folder)
 
 
+def kind_of(table: Table, makers: Mapping[str, Maker], default: str | None = None) -> str:
+    """The kind that a table's key `kind` names; `default` where it has none, otherwise the key is required.
+
+    Raises
+    ------
+    InvalidInput
+        The key is missing, or names no kind.
+    """
+    choices = tuple(makers)
+    return table.text("kind", choices=choices) if default is None else table.text("kind", default, choices=choices)
+
+
 def read_kind(table: Table, makers: Mapping[str, Maker], folder: Path) -> Any:
     """Make what a table describes with the maker that its key `kind` names; the table is read to its last key."""
     return _whole(table, makers[table.text("kind", choices=tuple(makers))], folder)
-
-
-def kind_of(table: Table, makers: Mapping[str, Maker], default: str) -> str:
-    """Name of the maker that a table's key `kind` chooses; a default where it is absent."""
-    return table.text("kind", default, choices=tuple(makers))
 
 
 def _whole(table: Table, maker: Maker, folder: Path) -> Any:

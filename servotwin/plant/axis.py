@@ -45,6 +45,7 @@ AXES = (
     "stepper-stage",
     "micro-positioner",
     "gantry",
+    "emps",
 )
 """Names of the presets of axes."""
 

@@ -123,9 +123,9 @@ def read_parts(table: Table) -> Parts:
     """
     tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
     actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
-    kind = tables["transmission"].text("kind", choices=tuple(TRANSMISSIONS))
+    kind = kind_of(tables["transmission"], TRANSMISSIONS)
     transmission: Transmission = read_kind(tables["transmission"], TRANSMISSIONS, Path())
-    motion = tables["load"].text("kind", choices=tuple(LOADS))
+    motion = kind_of(tables["load"], LOADS)
     if motion != _MOTIONS[kind]:
         raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
     load: Load = read_kind(tables["load"], LOADS, Path())

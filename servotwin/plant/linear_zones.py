@@ -8,9 +8,10 @@ from functools import lru_cache
 import numpy as np
 
 from servotwin.control.linear_law import LinearLaw
-from servotwin.plant.automaton import INPUTS, LoopModes, LoopParts, ServoAutomaton, Shape, constants, mechanical_flow
+from servotwin.plant.automaton import INPUTS, LoopModes, LoopParts, ServoAutomaton, Shape, constants
 from servotwin.plant.axis import Plant
 from servotwin.plant.basis import Basis, GuardRow, input_names, plant_names
+from servotwin.plant.flow import mechanical_flow
 from servotwin.plant.signals import Array
 
 

@@ -22,7 +22,13 @@ BLOCK = re.compile(r"^```(\w+)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 NAME = re.compile(r"`((?:servotwin|benchmarks)(?:\.\w+)+)`")
 FILE = re.compile(r"`((?:servotwin|tests|docs|benchmarks)/[\w./-]+\.\w+)(?:::(\w+))?`")
 
-LOADERS = {"motor": st.Servo.load, "listen": MachineSettings.load, "drive": edge_config_file.load, "models": read_twin}
+LOADERS = {
+    "actuator": st.Axis.from_file,
+    "motor": st.Servo.load,
+    "listen": MachineSettings.load,
+    "drive": edge_config_file.load,
+    "models": read_twin,
+}
 """By a key that only files of this sort have; any other is a scenario."""
 
 
