@@ -65,7 +65,10 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     new = stated_machine(settings) if settings.learning.learn and model is not None and model.rigid else None
 
     def of_model(window: Window, expected: Expectation) -> GapEstimate:
-        if model is None or not isinstance(options, whitened.WhitenedSettings):
+        if model is None:
+            # The methods that settings name are those of a servo.
+            return estimate_gap(window, servo, prior=expected.prior)
+        if not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
         growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
         if new is None or expected.machine is None:
