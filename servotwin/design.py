@@ -14,9 +14,9 @@ from servotwin.analysis.tuning.tune import tune as tune_system
 from servotwin.control.controller import Controller
 from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
 from servotwin.plant.linear import LinearSystem, series
 from servotwin.plant.loop import loop_filter, notch
+from servotwin.plant.plants import Plant
 
 
 def tune(

@@ -18,7 +18,7 @@ from servotwin.config.table import Table, did_you_mean, read_toml
 from servotwin.config.toml import attribute
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy

@@ -15,7 +15,7 @@ from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
 from servotwin.analysis.limit_cycles.describing import Prediction, limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant, resolve_plant
+from servotwin.plant.plants import Plant, resolve_plant
 from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.

@@ -16,8 +16,8 @@ from servotwin.control.controller import Controller
 from servotwin.control.laws import filtered_pid
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import resolve_plant
 from servotwin.plant.margins import Margins
+from servotwin.plant.plants import resolve_plant
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3

@@ -27,7 +27,7 @@ from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.messages import Gains, Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of

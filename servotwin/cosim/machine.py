@@ -11,7 +11,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.endless import FOREVER, UnboundedSimulation, first_stretch

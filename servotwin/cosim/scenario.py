@@ -23,8 +23,8 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN
-from servotwin.plant.axis import PLANT_KEY, Plant
 from servotwin.plant.noise import Noise
+from servotwin.plant.plants import PLANT_KEY, Plant
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
 from servotwin.twin.settings import TwinSettings

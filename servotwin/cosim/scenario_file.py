@@ -20,7 +20,7 @@ from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 

@@ -7,8 +7,9 @@ from functools import lru_cache
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import DcMotor
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
 from servotwin.plant.basis import Play
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 
 _LEAST_MASSES = 2

@@ -19,7 +19,7 @@ import numpy as np
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.window import Window
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import Scales, scales
 from servotwin.plant.signals import Array
 

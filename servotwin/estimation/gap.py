@@ -14,7 +14,8 @@ from servotwin.estimation import output_error, paper, whitened
 from servotwin.estimation.axis_model import has_servo, servo_of
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.window import Window
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 
 

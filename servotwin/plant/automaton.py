@@ -18,7 +18,6 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, Guard, Mode
-from servotwin.plant.axis import Plant
 from servotwin.plant.backlash import (
     OPEN,
     ContactMode,
@@ -46,6 +45,7 @@ from servotwin.plant.friction import (
     stick_slip_modes,
     stopping_speed,
 )
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.zones import LinearPiece, Zone, controller_zones
 

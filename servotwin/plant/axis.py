@@ -10,29 +10,26 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
-from pathlib import Path
-from typing import Any, TypeAlias, Unpack
+from typing import Any, Unpack
 
 import numpy as np
 
-from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller, ControllerChanges
-from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
+from servotwin.control.laws import AnyController, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
 from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
-from servotwin.plant.basis import Guide, PlantNumbers, Play
-from servotwin.plant.law_loop import LawLoop
+from servotwin.plant.basis import Guide, Play
+from servotwin.plant.law_loop import LawLoop, check_encoders
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.sensors import MOTOR, Sensors
-from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import Array, check_gap
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
@@ -400,72 +397,3 @@ class Axis:
         else:
             position = "m" if self.load.motion == LINEAR else "rad"
             loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)
-
-
-Plant: TypeAlias = Servo | Axis
-"""A machine that can be simulated: the paper's servo, or an axis made of parts."""
-
-
-def check_encoders(plant: PlantNumbers, law: Law) -> None:
-    """Refuse a linear law that reads an encoder which the plant's controller does not have.
-
-    Raises
-    ------
-    InvalidInput
-        The law reads the load, and the controller acts on the motor's encoder.
-    """
-    if isinstance(law, LinearLaw) and plant.at_motor and law.reads("y_load"):
-        raise InvalidInput(
-            'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be "load"'
-        )
-
-
-def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
-    """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
-
-    Raises
-    ------
-    InvalidInput
-        There is no such preset or file, or the file is not valid.
-    """
-    if name_or_path in PRESETS:
-        return Servo.preset(name_or_path)
-    path = Path(folder) / name_or_path
-    if name_or_path in AXES:
-        return Axis.preset(name_or_path)
-    # A bare word that is no file is a misspelt preset.
-    if not (path.suffix or path.exists()):
-        every = (*PRESETS, *AXES)
-        hint = did_you_mean(name_or_path, every)
-        raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
-    return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)
-
-
-def plant_of(text: str, source: str) -> Plant:
-    """A servo or an axis from the text of its file; `source` is its name in messages."""
-    return Axis.loads(text, source) if "actuator" in parse_toml(text, source).values else Servo.loads(text, source)
-
-
-def structure_of(plant: Plant) -> tuple[object, ...]:
-    """What plants must share for their automata to have the same states and modes."""
-    guide = plant.guide
-    forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
-    return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces
-
-
-def _named_plant(table: Table, name: str, plant: str, folder: Path) -> Plant:
-    """Load the servo or axis that a file names."""
-    if plant not in (*PRESETS, *AXES) and not (folder / plant).is_file():
-        every = (*PRESETS, *AXES)
-        hint = did_you_mean(plant, every)
-        allowed = f"one of {', '.join(every)}, or the path of a servo's or an axis's TOML, relative to this file{hint}"
-        raise table.invalid(name, allowed)
-    return resolve_plant(plant, folder)
-
-
-PLANT_KEY = key(
-    form=Form.TEXT,
-    parse=_named_plant,
-    help="A preset, or the path of the TOML of a servo or of an axis, relative to this file.",
-)
-"""Key of a machine in the files that name one."""

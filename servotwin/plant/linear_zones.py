@@ -9,9 +9,9 @@ import numpy as np
 
 from servotwin.control.linear_law import LinearLaw
 from servotwin.plant.automaton import INPUTS, LoopModes, LoopParts, ServoAutomaton, Shape, constants
-from servotwin.plant.axis import Plant
 from servotwin.plant.basis import Basis, GuardRow, input_names, plant_names
 from servotwin.plant.flow import mechanical_flow
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 
 

@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
 from servotwin.plant.margins import gain_crossovers
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 
 # Of the loop's own time: the paper's structure is slower than that, with the gains of every preset; a stiff one is not.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
 from servotwin.plant.load import ROTARY
+from servotwin.plant.plants import Plant
 
 
 class ShownUnit(NamedTuple):

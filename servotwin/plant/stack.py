@@ -16,9 +16,10 @@ from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import AutomatonStack
 from servotwin.plant.actuator import ShaftMatrices, stacked
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
 from servotwin.plant.basis import Play
 from servotwin.plant.motor import Motor
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import PerMass, Servo
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain

@@ -10,7 +10,7 @@ from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.messages import Setting
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.uncertainty import Range
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.redesign.settling import settling_map

@@ -13,7 +13,7 @@ from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Gains, Setting
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.uncertainty import Region
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load

@@ -17,7 +17,7 @@ from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.measures import compute_cells
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 
 # In units of p gap, the screw's lost motion; the map's own unit p b is half of it.

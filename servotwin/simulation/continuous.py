@@ -16,9 +16,9 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ON_GRID, Jump, Trajectory
 from servotwin.plant.automaton import INPUTS, ServoAutomaton, Shape, continuous_loop, degree
-from servotwin.plant.axis import Plant
 from servotwin.plant.linear_zones import law_state, linear_loop
 from servotwin.plant.noise import NoiseSource
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.turns import direction_after, turns_of
 from servotwin.simulation.inputs import RunInputs, about, quantised

@@ -16,7 +16,7 @@ from servotwin.hybrid.automaton import Array, AutomatonStack
 from servotwin.hybrid.ensemble import FigureOptions, Members, figures_of_family, run_family
 from servotwin.hybrid.members import Figures
 from servotwin.plant.automaton import ServoAutomaton, Shape, without_feedforward
-from servotwin.plant.axis import Plant, structure_of
+from servotwin.plant.plants import Plant, structure_of
 from servotwin.plant.signals import check_gap
 from servotwin.plant.stack import LoopStack, continuous_loops
 from servotwin.simulation.continuous import controller_constants

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 
 

@@ -22,7 +22,7 @@ from servotwin.hybrid.lifted import BLOCK, COARSE, new_lifted, new_lifted_worksp
 from servotwin.hybrid.tables import search_step
 from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero, plant_start, set_states
 from servotwin.simulation.inputs import RunInputs

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.shown import command_unit, position_unit
 from servotwin.runtime.notebook import html_table
 from servotwin.simulation.inputs import RunInputs, quantised

@@ -19,7 +19,7 @@ from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
 from servotwin.hybrid.threads import on_threads
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
-from servotwin.plant.axis import Plant, structure_of
+from servotwin.plant.plants import Plant, structure_of
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.stack import LoopStack, sampled_plants
 from servotwin.simulation.ensemble import starts_of

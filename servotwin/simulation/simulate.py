@@ -12,8 +12,9 @@ from servotwin.control.laws import AnyController, Law, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant, check_encoders
+from servotwin.plant.law_loop import check_encoders
 from servotwin.plant.noise import Noise
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced

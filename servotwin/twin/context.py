@@ -23,7 +23,8 @@ import msgspec
 import servotwin
 from servotwin.errors import InvalidInput
 from servotwin.estimation.gap import METHODS
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.fallback import flattened
 from servotwin.twin.settings import TwinSettings

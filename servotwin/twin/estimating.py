@@ -26,7 +26,7 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
 from servotwin.messages import Setting
 from servotwin.plant.actuator import DcMotor
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
 from servotwin.redesign.policy import NOT_OBSERVED

@@ -12,7 +12,7 @@ from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Setting
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import policy_of

@@ -32,7 +32,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
-from servotwin.plant.axis import PLANT_KEY, Plant
+from servotwin.plant.plants import PLANT_KEY, Plant
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
 

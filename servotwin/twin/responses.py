@@ -16,7 +16,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.messages import LearntResponse, WindowMessage
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.twin.estimating import DecodedWindow
 from servotwin.twin.settings import TwinSettings

@@ -15,7 +15,7 @@ from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.trend_settings import TrendSettings, trend_maker, wear
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty

@@ -24,7 +24,7 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.quick import NO_SPREAD, MachineSpread, QuickFit, quick_fit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.twin.settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")

@@ -6,7 +6,8 @@ import pytest
 
 import servotwin as st
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import AXES, Axis, resolve_plant
+from servotwin.plant.axis import AXES, Axis
+from servotwin.plant.plants import resolve_plant
 
 BALL_SCREW = Axis.preset("ball-screw")
 TEXT = BALL_SCREW.dumps()

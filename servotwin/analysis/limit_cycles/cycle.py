@@ -23,7 +23,8 @@ from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 
 # The first part of the run is 32 characteristic times of the loop long, each of the others twice as long as the one
 # before: with little integral action a cycle is that slow.

@@ -19,9 +19,9 @@ from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
-from servotwin.plant.axis import Plant
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
+from servotwin.plant.plants import Plant
 
 # Grid intervals within each band of frequencies in which a prediction is possible.
 _GRID = 500

@@ -17,8 +17,9 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.automaton import ServoAutomaton
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
 from servotwin.plant.margins import gain_crossovers
+from servotwin.plant.plants import Plant
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.simulate import Simulation
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import check_gap
 
 Values: TypeAlias = tuple[float, ...]

@@ -13,7 +13,7 @@ from servotwin.analysis.maps.axes import Axes, RatioAxes, as_lists, axis_names
 from servotwin.control.controller import Controller
 from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 
 # Raise it whenever the same settings would give other numbers: stored pieces then no longer match.

@@ -17,8 +17,8 @@ from numpy.polynomial import polynomial as poly
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
 from servotwin.plant.linear import LinearSystem, realised, series
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Samples
 
 

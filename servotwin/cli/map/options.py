@@ -12,7 +12,7 @@ from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import resolve_plant
+from servotwin.plant.plants import resolve_plant
 
 _MAX_VALUES = 4096
 _MAX_PANELS = 36

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from servotwin.control.controller import Controller
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
 from servotwin.redesign.certified.bounds import share_at_least

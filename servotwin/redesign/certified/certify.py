@@ -16,7 +16,7 @@ from itertools import islice
 from time import perf_counter
 
 from servotwin.control.controller import Controller
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified

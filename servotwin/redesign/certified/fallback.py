@@ -21,7 +21,7 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.trial import Trial

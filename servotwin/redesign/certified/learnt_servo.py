@@ -8,7 +8,8 @@ import numpy as np
 
 from servotwin.estimation.learning.motor import BACK_EMF, LAG, LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
-from servotwin.plant.axis import Axis, Plant
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty

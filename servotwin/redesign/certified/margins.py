@@ -11,9 +11,9 @@ import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
-from servotwin.plant.axis import Plant
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 

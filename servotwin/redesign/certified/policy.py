@@ -14,7 +14,7 @@ from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import NEAR
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.assess import nearness, stillness
 from servotwin.redesign.certified.certificate import RampResult

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from servotwin.control.controller import Controller
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,

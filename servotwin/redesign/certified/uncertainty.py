@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.axis import Plant
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.sobol import sobol
 
 Range = tuple[float, float]

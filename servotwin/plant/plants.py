@@ -1,0 +1,67 @@
+"""Machines that can be simulated, by name or file: the paper's servo, and axes made of parts."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TypeAlias
+
+from servotwin.config.keys import Form, key
+from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
+from servotwin.errors import InvalidInput
+from servotwin.plant.axis import AXES, Axis
+from servotwin.plant.servo import PRESETS, Servo
+
+Plant: TypeAlias = Servo | Axis
+"""A machine that can be simulated: the paper's servo, or an axis made of parts."""
+
+
+def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
+    """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
+
+    Raises
+    ------
+    InvalidInput
+        There is no such preset or file, or the file is not valid.
+    """
+    if name_or_path in PRESETS:
+        return Servo.preset(name_or_path)
+    path = Path(folder) / name_or_path
+    if name_or_path in AXES:
+        return Axis.preset(name_or_path)
+    # A bare word that is no file is a misspelt preset.
+    if not (path.suffix or path.exists()):
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(name_or_path, every)
+        raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
+    return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)
+
+
+def plant_of(text: str, source: str) -> Plant:
+    """A servo or an axis from the text of its file; `source` is its name in messages."""
+    return Axis.loads(text, source) if "actuator" in parse_toml(text, source).values else Servo.loads(text, source)
+
+
+def structure_of(plant: Plant) -> tuple[object, ...]:
+    """What plants must share for their automata to have the same states and modes."""
+    guide = plant.guide
+    forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
+    return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces
+
+
+def _named_plant(table: Table, name: str, plant: str, folder: Path) -> Plant:
+    """Load the servo or axis that a file names."""
+    if plant not in (*PRESETS, *AXES) and not (folder / plant).is_file():
+        every = (*PRESETS, *AXES)
+        hint = did_you_mean(plant, every)
+        allowed = f"one of {', '.join(every)}, or the path of a servo's or an axis's TOML, relative to this file{hint}"
+        raise table.invalid(name, allowed)
+    return resolve_plant(plant, folder)
+
+
+PLANT_KEY = key(
+    form=Form.TEXT,
+    parse=_named_plant,
+    help="A preset, or the path of the TOML of a servo or of an axis, relative to this file.",
+)
+"""Key of a machine in the files that name one."""
