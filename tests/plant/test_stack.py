@@ -9,6 +9,7 @@ import pytest
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import AutomatonStack
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop, sampled_plant
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.stack import LoopStack, continuous_loops, sampled_plants
 
@@ -57,6 +58,29 @@ def test_a_stack_is_its_automata(k_d, friction, dead_zone, limit, filtered) -> N
     for place, (servo, law) in enumerate(zip(servos, laws, strict=True)):
         assert_equal(loops, place, continuous_loop(servo, law, shape))
         assert_equal(plants, place, sampled_plant(servo, 1, True, friction))
+
+
+@pytest.mark.parametrize(("name", "friction"), [("two-mass-drive", False), ("robot-joint", True), ("ball-screw", True)])
+def test_a_stack_of_axes_is_their_automata(name: str, friction: bool) -> None:
+    """Shafts that are free in the gap, with friction of motor and load; to rounding, as sums are taken otherwise."""
+    axis = Axis.preset(name).replace(sample_rate=None)
+    axes = [axis.scaled(factors) for factors in ({"k": 1.1}, {"c": 0.5, "p": 1.02}, {"m": 1.2, "k_T": 0.9, "k_B": 1.3})]
+    laws = [axis.pidf.replace(Kp=axis.pidf.Kp * (1.0 + 0.1 * i)) for i in range(len(axes))]
+    shape = Shape(friction=friction, gap=2)
+    loops, plants = continuous_loops(axes, laws, shape), sampled_plants(axes, 1, True, friction)
+    for place, (one, law) in enumerate(zip(axes, laws, strict=True)):
+        for stack, single in (
+            (loops, continuous_loop(one, law, shape)),
+            (plants, sampled_plant(one, 1, True, friction)),
+        ):
+            flows = single.automaton.flows
+            assert np.abs(stack.automata.flows[place] - flows).max() <= 1e-14 * np.abs(flows).max()
+            for m, mode in enumerate(single.automaton.modes):
+                for g, guard in enumerate(mode.guards):
+                    row = np.asarray(guard.row)
+                    assert stack.automata.rows[place, m, g] == pytest.approx(
+                        row, rel=1e-13, abs=1e-13 * np.abs(row).max()
+                    )
 
 
 def test_numbers_of_automata_that_were_made_one_by_one() -> None:
