@@ -8,7 +8,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from servotwin.config.keys import Form, Item, Maker, items_of, unit_of
+from servotwin.config.keys import Form, Item, Maker, items_of
+from servotwin.config.units import unit_of
 
 _Schema = dict[str, Any]
 

@@ -9,8 +9,9 @@ from dataclasses import MISSING
 from pathlib import Path
 from typing import Any
 
-from servotwin.config.keys import Form, Item, Maker, items_of, unit_of
+from servotwin.config.keys import Form, Item, Maker, items_of
 from servotwin.config.table import Table, named
+from servotwin.config.units import unit_of
 
 Values = dict[str, Any]
 

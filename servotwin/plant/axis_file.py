@@ -7,9 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from servotwin.config.keys import items_of, key, unit_of
+from servotwin.config.keys import items_of, key
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, kind_of, part, read, read_kind, values_of
+from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.plant.actuator import ACTUATORS, Actuator

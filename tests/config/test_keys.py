@@ -9,9 +9,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from servotwin.config.keys import check, items_of, key, settings, unit_of
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.config.table import parse_toml
 from servotwin.config.toml import changes, dumps, read, values_of
+from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
 
