@@ -1,7 +1,7 @@
 """Plant, edge, link and twin under one virtual clock."""
 
 from servotwin.cosim.driver import Cosimulation, cosimulate
-from servotwin.cosim.loop import Loop, Transmission
+from servotwin.cosim.loop import Loop, MessageCopy
 from servotwin.cosim.machine import Machine, SimulatedMachine, simulation_of
 from servotwin.cosim.quantisation import Quantisation, quantisation
 
@@ -9,9 +9,9 @@ __all__ = [
     "Cosimulation",
     "Loop",
     "Machine",
+    "MessageCopy",
     "Quantisation",
     "SimulatedMachine",
-    "Transmission",
     "cosimulate",
     "quantisation",
     "simulation_of",

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from servotwin.control.gains import gains_of
-from servotwin.cosim.loop import Loop, Transmission
+from servotwin.cosim.loop import Loop, MessageCopy
 from servotwin.cosim.machine import Machine, SimulatedMachine
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.agent import Agent, ScheduledMessage
@@ -282,10 +282,10 @@ class Cosimulation:
         due = self.twin.next_wake()
         self._wake = None if due is None else self.clock.schedule(max(due, self.clock.now), self._wake_twin)
 
-    def _transmissions(self) -> Iterable[Transmission]:
+    def _transmissions(self) -> Iterable[MessageCopy]:
         for direction, line in (("up", self.link.up), ("down", self.link.down)):
             for r in line.records:
-                yield Transmission(direction, r.serial, r.copy, r.data, r.sent, r.arrival, r.fate)
+                yield MessageCopy(direction, r.serial, r.copy, r.data, r.sent, r.arrival, r.fate)
 
     def _accounts(self) -> Counter[str]:
         delivered = {(boot, sequence) for _, boot, sequence in self.store.windows}

@@ -30,7 +30,7 @@ TRAJECTORY = ("position", "theta_m", "theta_d", "voltage", "measured_position", 
 
 
 @dataclass(frozen=True)
-class Transmission:
+class MessageCopy:
     """One copy of a message on its way.
 
     Attributes
@@ -90,7 +90,7 @@ class Loop:
         Every request of the twin for more informative windows.
     answers : tuple of messages.Answer
         Every answer of the edge to a request, repeated answers included.
-    messages : tuple of Transmission
+    messages : tuple of MessageCopy
         Every copy of every message, in the order of sending.
     accounts : Counter
         Windows cut by the edge, by fate: "delivered", "in flight" (in the outbox, not at the twin), or the reason for
@@ -110,7 +110,7 @@ class Loop:
     excitations: tuple[Decision, ...]
     requests: tuple[Request, ...]
     answers: tuple[Answer, ...]
-    messages: tuple[Transmission, ...]
+    messages: tuple[MessageCopy, ...]
     accounts: Counter[str]
 
     @property

@@ -120,3 +120,12 @@ def commands():
     from servotwin.cli.app import app
 
     return {entry.name or entry.callback.__name__ for entry in app.registered_commands}
+
+
+def test_no_two_public_classes_share_a_name():
+    names: dict[str, list[str]] = {}
+    for path in sorted((ROOT / "servotwin").rglob("*.py")):
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if match := re.match(r"class ([A-Z]\w*)", line):
+                names.setdefault(match[1], []).append(str(path.relative_to(ROOT)))
+    assert {name: files for name, files in names.items() if len(files) > 1} == {}

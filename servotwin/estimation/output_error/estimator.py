@@ -18,7 +18,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_
 from servotwin.estimation.output_error.fit import Problem, Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
 from servotwin.estimation.output_error.settings import OutputErrorSettings
-from servotwin.estimation.output_error.verdict import Verdict, judge
+from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
@@ -115,7 +115,7 @@ def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:
     return ZeroPhase(cutoff, 3, rate, "odd", min(round(rate / cutoff), theta_m.size - 1)).respond(theta_m)
 
 
-def _stated(blank: GapEstimate, found: Search, verdict: Verdict, unit: float) -> GapEstimate:
+def _stated(blank: GapEstimate, found: Search, verdict: JudgedFit, unit: float) -> GapEstimate:
     """Fill a blank estimate."""
     rms = float(np.sqrt(np.mean(found.best.raw**2)))
     made = replace(blank, status=verdict.status, reasons=verdict.reasons, rms=rms, evaluations=found.best.evaluations)

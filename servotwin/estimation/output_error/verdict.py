@@ -27,7 +27,7 @@ _ROUNDED = 1.0  # of a count: standard deviation of an error that does not avera
 
 
 @dataclass(frozen=True)
-class Verdict:
+class JudgedFit:
     """Status of a gap with its spread, all at the load.
 
     Attributes
@@ -47,7 +47,7 @@ class Verdict:
     reasons: tuple[str, ...]
 
 
-def judge(found: Search, settings: OutputErrorSettings, unit: float) -> Verdict:
+def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFit:
     """Decide on a fit; `unit` is the total gap at the motor (rad) per half gap at the load, for the words."""
     best, problem = found.best, found.problem
     half = float(best.values[HALF])
@@ -55,7 +55,7 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> Verdict:
     total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count)
     mismatches = _mismatches(found)
     if mismatches:
-        return Verdict(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)
+        return JudgedFit(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)
     single, off = one_flank(found)
     rise = (single.cost - best.cost) / best.variance()
     if rise < _BELIEVED:
@@ -63,10 +63,10 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> Verdict:
         enough = bound > _BOUND_COUNTS * problem.count
         words = "one flank explains the window nearly as well as two"
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
-        return Verdict(status, 0.5 * bound if enough else math.nan, math.inf, math.inf, (words,))
+        return JudgedFit(status, 0.5 * bound if enough else math.nan, math.inf, math.inf, (words,))
     doubts = tuple(filter(None, (_wide(found, half, std, settings, unit), _rival(found, half, total, unit))))
     status = GapStatus.UNIDENTIFIABLE if doubts else GapStatus.OK
-    return Verdict(status, math.nan if doubts else half, std, total, doubts)
+    return JudgedFit(status, math.nan if doubts else half, std, total, doubts)
 
 
 def _wide(found: Search, half: float, std: float, settings: OutputErrorSettings, unit: float) -> str:
