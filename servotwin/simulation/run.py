@@ -171,6 +171,7 @@ class Run:
             matplotlib is not installed.
         """
         name, factor, _ = position_unit(self.servo)
+        drive = "voltage" if command_unit(self.servo) == "V" else "command"
         errors = {"error": factor * (self.reference - self.position)}
         if self.tolerance.any():
             # matplotlib leaves labels that begin with an underscore out of the legend.
@@ -179,7 +180,7 @@ class Run:
             Panel(f"position, {name}", {"reference": factor * self.reference, "position": factor * self.position}),
             Panel(f"error, {name}", errors),
             Panel("total gap, deg", {"gap": np.degrees(self.gap)}),
-            Panel(f"command, {command_unit(self.servo)}", {"command": self.voltage}),
+            Panel(f"{drive}, {command_unit(self.servo)}", {drive: self.voltage}),
         )
         return stacked_figure(repr(self).strip("<>"), self.time, panels)
 
