@@ -137,7 +137,7 @@ class Cascade:
                     raise InvalidInput(f"cascade {name} = {given!r}: needs a velocity loop; give its velocity_gain")
 
     def __repr__(self) -> str:
-        """Whatever is not its default."""
+        """The values that are not their defaults."""
         shown = [f"{f.name}={getattr(self, f.name)!r}" for f in fields(self) if getattr(self, f.name) != f.default]
         return f"Cascade({', '.join(shown)})"
 

@@ -72,7 +72,7 @@ class Controller:
         key(above=0.0, help="Cut-off of a first-order low-pass on the measurement (section 4.3); none where absent."),
     ] = None
     voltage_limit: Annotated[
-        float | None, key("voltage_limit_v", above=0.0, help="Largest voltage, either sign; no limit where absent.")
+        float | None, key("voltage_limit_v", above=0.0, help="Largest output, either sign; no limit where absent.")
     ] = None
     rate_limit: Annotated[
         float | None,

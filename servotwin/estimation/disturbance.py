@@ -19,6 +19,8 @@ import numpy as np
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.window import Window
+from servotwin.plant.actuator import Stepper
+from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import Scales, scales
 from servotwin.plant.signals import Array
@@ -83,6 +85,8 @@ def disturbance(window: Window, servo: Plant) -> Disturbance:
         For its back EMF and pitch.
     """
     effort = math.nan if window.voltage is None else float(np.sqrt(np.mean(window.voltage**2)))
+    if holds_position(servo):
+        return nothing_known(effort, "a stepper holds its position: its command at rest is no bias")
     missing = [name for name in ("reference", "voltage", "theta_m") if name not in window.channels]
     if missing:
         return nothing_known(effort, f"the window has no {' and no '.join(missing)}")
@@ -97,12 +101,17 @@ def disturbance(window: Window, servo: Plant) -> Disturbance:
     return Disturbance(bias, std, noise, (last - first) / window.sample_rate, effort)
 
 
+def holds_position(servo: Plant) -> bool:
+    """True for a motor whose command is its position."""
+    return isinstance(servo, Axis) and isinstance(servo.actuator, Stepper)
+
+
 def quick_bias(window: Window, servo: Plant) -> tuple[float, float]:
     """Estimate input bias and spread (V) from the last `SHORTEST` s before a reference change or the window's end.
 
     The first such interval at rest counts; without one, or without the channels, the result is (NaN, inf).
     """
-    if any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
+    if holds_position(servo) or any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
         return math.nan, math.inf
     size, least = _sizes(window, scales(servo))
     ends = {last: first for first, last in reversed(_constant(window, size, least))}

@@ -91,10 +91,17 @@ def estimate_gap(
         _check_position(window, servo)
     if isinstance(servo, Servo) or method == output_error.METHOD:
         return _ALL[method].estimate(window, servo, known, chosen)
-    if settings is None and isinstance(chosen, whitened.WhitenedSettings):
-        chosen = _in_counts(chosen, servo.encoder_resolution)
+    chosen = options_for(servo, method, settings)
     estimate: GapEstimate = _ALL[method].estimate(window, servo_of(servo), known, chosen)
     return replace(estimate, model_version=servo.version)
+
+
+def options_for(servo: Plant, method: str, settings: Any = None) -> Any:
+    """Return the settings, or the method's defaults for a plant: an axis's coarse encoder sets limits in counts."""
+    chosen = settings_of(method, settings)
+    if settings is None and isinstance(servo, Axis) and isinstance(chosen, whitened.WhitenedSettings):
+        return _in_counts(chosen, servo.encoder_resolution)
+    return chosen
 
 
 def default_method(servo: Plant) -> str:

@@ -8,7 +8,7 @@ from typing import Annotated, NamedTuple, TypeAlias
 
 import numpy as np
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.plant.linear import product
 from servotwin.plant.signals import Array
 
@@ -47,6 +47,13 @@ class ShaftPolynomials(NamedTuple):
     torque: Array
 
 
+def _checked(actuator: object) -> None:
+    """Refuse values out of their range, and make floats of the others."""
+    check(actuator)
+    for item in items_of(type(actuator)):
+        object.__setattr__(actuator, item.name, float(getattr(actuator, item.name)))
+
+
 @settings("actuator")
 @dataclass(frozen=True)
 class DcMotor:
@@ -75,7 +82,7 @@ class DcMotor:
     unit = "V"
 
     def __post_init__(self) -> None:
-        check(self)
+        _checked(self)
 
     def matrices(self) -> ShaftMatrices:
         """Matrices of (current, speed, theta_m); without inductance of (speed, theta_m)."""
@@ -130,7 +137,7 @@ class TorqueDrive:
     unit = "N m"
 
     def __post_init__(self) -> None:
-        check(self)
+        _checked(self)
 
     def matrices(self) -> ShaftMatrices:
         """Matrices of (torque, speed, theta_m); without lag of (speed, theta_m)."""
@@ -172,7 +179,7 @@ class VelocityDrive:
     unit, coulomb = "rad/s", 0.0
 
     def __post_init__(self) -> None:
-        check(self)
+        _checked(self)
 
     def matrices(self) -> ShaftMatrices:
         """Matrices of (speed, theta_m)."""
@@ -207,7 +214,7 @@ class Stepper:
     unit, coulomb = "rad", 0.0
 
     def __post_init__(self) -> None:
-        check(self)
+        _checked(self)
 
     def matrices(self) -> ShaftMatrices:
         """Matrices of (speed, theta_m)."""

@@ -30,7 +30,7 @@ from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.sensors import MOTOR, Sensors
-from servotwin.plant.signals import Array, check_gap
+from servotwin.plant.signals import Array, tolerance_of
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
@@ -57,6 +57,9 @@ class AxisChanges(ControllerChanges, total=False):
     sensors: Sensors
 
 
+_NONE = Controller(0.0, 0.0, 0.0, 1.0)
+# A cascade may be told a ratio that is off by less.
+_OTHER_RATIO = 0.2
 _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
@@ -99,10 +102,34 @@ class Axis:
             if not isinstance(part, kinds):
                 names = " or ".join(kind.__name__ for kind in kinds)
                 raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
+        if isinstance(self.controller, Cascade):
+            self._check_cascade(self.controller)
+        load = self.load
+        undamped = not any(load.c) and not load.friction and not self.transmission.c_d
+        if load.free and undamped and not (self.n == 1 and self.rigid):
+            raise InvalidInput(
+                f"load c = {load.c!r}: a free load without damping and friction never rests; give the damping or "
+                "friction of its guide, or the damping of the transmission"
+            )
         if self.n == 1 and self.rigid and (self.load.friction or self.load.force):
             raise InvalidInput(
                 "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
                 "nothing; give a finite stiffness, or the friction at the motor"
+            )
+
+    def _check_cascade(self, cascade: Cascade) -> None:
+        """Refuse a cascade whose command or ratio is not this axis's."""
+        follows = isinstance(self.actuator, VelocityDrive)
+        if isinstance(self.actuator, Stepper):
+            raise InvalidInput(
+                "controller: a stepper goes to its commanded angle; a cascade commands a speed or a torque"
+            )
+        if follows != (cascade.velocity_gain is None):
+            wanted = "must be absent: the drive closes the velocity loop" if follows else "is missing"
+            raise InvalidInput(f"controller velocity_gain = {cascade.velocity_gain!r}: {wanted}")
+        if not abs(cascade.ratio / self.p - 1.0) < _OTHER_RATIO:
+            raise InvalidInput(
+                f"controller ratio = {cascade.ratio!r}: the transmission's travel per angle is {self.p!r}; leave it out"
             )
 
     @classmethod
@@ -213,8 +240,9 @@ class Axis:
     @cached_property
     def version(self) -> str:
         """Twelve hexadecimal digits that name the plant's numbers (the controller's do not count)."""
-        parts = (self.actuator, self.transmission, self.load, self.sensors)
-        return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+        plant = values_of_parts(Parts(self.actuator, self.transmission, self.load, _NONE, self.sensors))
+        del plant["controller"]
+        return hashlib.sha256(dumps(plant).encode()).hexdigest()[:12]
 
     def __repr__(self) -> str:
         """Parts in one line."""
@@ -346,9 +374,14 @@ class Axis:
         return dataclasses.replace(self, sensors=sensors)
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
-        """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21)."""
-        check_gap(gap)
-        return k_dz * self.p * gap
+        """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21).
+
+        Raises
+        ------
+        InvalidInput
+            The gap or k_dz is negative or not finite, or the gap is above one turn.
+        """
+        return tolerance_of(self.p, gap, k_dz)
 
     def G2(self) -> LinearSystem:
         """Angle of the driven end to the position of the last mass."""
@@ -395,5 +428,9 @@ class Axis:
         if isinstance(law, LinearLaw):
             self._law_loop(law).check("axis")
         else:
+            if self.rigid and self.at_motor and self.n > 1 and not np.linalg.eigvals(self.chain().A).real.max() < 0.0:
+                raise InvalidInput(
+                    "load c: without damping the load swings for ever, and the motor's encoder does not see it"
+                )
             position = "m" if self.load.motion == LINEAR else "rad"
             loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)

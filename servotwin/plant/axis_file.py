@@ -7,12 +7,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
-from servotwin.config.keys import items_of, key
+from servotwin.config.keys import Maker, items_of, key
 from servotwin.config.table import Table
-from servotwin.config.toml import Values, kind_of, part, read, read_kind, values_of
+from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
 from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
 from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.sensors import Sensors
@@ -40,8 +41,13 @@ def screw(
 
 def gear(
     ratio: Annotated[
-        float, key(above=0.0, unit="turns of the motor per turn of the load", help="Gear ratio; 1: direct drive.")
-    ],
+        float | None,
+        key(above=0.0, unit="turns of the motor per turn of the load", help="Gear ratio; 1: direct drive."),
+    ] = None,
+    p: Annotated[
+        float | None,
+        key("travel_rad_per_rad", above=0.0, help="Turn of the load per turn of the motor, in place of the ratio."),
+    ] = None,
     k_d: Annotated[
         float,
         key("stiffness_n_m_per_rad", above=0.0, infinite=True, help="Stiffness between gap and load, at the load."),
@@ -50,7 +56,9 @@ def gear(
     in_gap: Annotated[str, _IN_GAP] = HELD,
 ) -> Transmission:
     """Gear or direct drive."""
-    return Transmission(1.0 / ratio, k_d, c_d, in_gap)
+    if (ratio is None) == (p is None):
+        raise InvalidInput("transmission: give either ratio or travel_rad_per_rad")
+    return Transmission(p if ratio is None else 1.0 / ratio, k_d, c_d, in_gap)  # type: ignore[arg-type]
 
 
 def linear_load(
@@ -99,8 +107,8 @@ def rotary_load(
 
 FILTERED_PID, CASCADE = "filtered_pid", "cascade"
 CONTROLLERS: dict[str, type] = {FILTERED_PID: Controller, CASCADE: Cascade}
-TRANSMISSIONS = {"screw": screw, "gear": gear}
-LOADS = {"linear": linear_load, "rotary": rotary_load}
+TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
+LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
 
 
@@ -131,7 +139,9 @@ def read_parts(table: Table) -> Parts:
         raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
     load: Load = read_kind(tables["load"], LOADS, Path())
     law = _read_controller(tables["controller"], actuator.unit, motion, transmission.p)
-    sensors: Sensors = part(table, "sensors", Sensors)
+    encoders = table.table("sensors").renamed({_sensor_key(name, motion): name for name in _SENSOR_KEYS})
+    sensors: Sensors = read(encoders, Sensors)
+    encoders.done()
     table.done()
     return Parts(actuator, transmission, load, law, sensors)
 
@@ -205,6 +215,9 @@ def values_of_parts(axis: Parts) -> Values:
     }
 
 
+_SENSOR_KEYS = ("position_resolution_m",)
+
+
 def _sensor_key(name: str, motion: str) -> str:
     return "position_resolution_rad" if motion == ROTARY and name == "position_resolution_m" else name
 
@@ -214,6 +227,6 @@ def _transmission_values(transmission: Transmission, kind: str) -> Values:
         return values_of(transmission, screw)
     near = 1.0 / transmission.p
     close = (near, math.nextafter(near, math.inf), math.nextafter(near, 0.0))
-    ratio = next((each for each in close if 1.0 / each == transmission.p), near)
-    names = ("k_d", "c_d", "in_gap")
-    return {"ratio": ratio, **values_of(transmission, gear, only=names)}
+    ratio = next((each for each in close if 1.0 / each == transmission.p), None)
+    turns = {"travel_rad_per_rad": transmission.p} if ratio is None else {"ratio": ratio}
+    return {**turns, **values_of(transmission, gear, only=("k_d", "c_d", "in_gap"))}

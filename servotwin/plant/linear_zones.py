@@ -57,7 +57,7 @@ def linear_parts(servo: Plant, law: LinearLaw, shape: Shape) -> LoopParts:
         if shape.offset:
             flow[basis["offset"]] = -basis.row("offset") / law.release_time
         flows.append(flow)
-    return modes.parts(flows, error=error, measured_position=measured)
+    return modes.parts(flows, error=error, measured_position=inputs[2])
 
 
 def _names(servo: Plant, law: LinearLaw, shape: Shape) -> list[str]:

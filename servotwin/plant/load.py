@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.signals import Array
+from servotwin.plant.signals import Array, a_number
 
 LINEAR, ROTARY = "linear", "rotary"
 _UNITS = {LINEAR: ("kg", "N/m", "N s/m", "N"), ROTARY: ("kg m^2", "N m/rad", "N m s/rad", "N m")}
@@ -49,7 +49,10 @@ class Load:
         if self.motion not in _UNITS:
             raise InvalidInput(f'load motion = {self.motion!r}: must be "linear" or "rotary"')
         for name, unit in zip(("m", "k", "c"), _UNITS[self.motion], strict=False):
-            values = tuple(float(value) for value in getattr(self, name))
+            given = getattr(self, name)
+            if not isinstance(given, tuple | list | np.ndarray):
+                raise InvalidInput(f"load {name} = {given!r}: must be a tuple of one number for each mass")
+            values = tuple(a_number("load", f"{name}[{i}]", value) for i, value in enumerate(given))
             object.__setattr__(self, name, values)
             if len(values) != len(self.m) or not values:
                 raise InvalidInput(f"load {name} = {values}: must have one value for each of the {len(self.m)} masses")
@@ -58,6 +61,8 @@ class Load:
                 if not (math.isfinite(value) and (value > 0.0 if least == "positive" else value >= 0.0)):
                     raise InvalidInput(f"load {name}[{i}] = {value!r} {unit}: must be finite and {least}")
 
+        for name in ("friction", "force"):
+            object.__setattr__(self, name, a_number("load", name, getattr(self, name)))
         unit = _UNITS[self.motion][3]
         if not (math.isfinite(self.friction) and self.friction >= 0.0):
             raise InvalidInput(f"load friction = {self.friction!r} {unit}: must be finite and 0 or more")

@@ -6,6 +6,8 @@ import os
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
 from servotwin.errors import InvalidInput
@@ -43,10 +45,40 @@ def plant_of(text: str, source: str) -> Plant:
 
 
 def structure_of(plant: Plant) -> tuple[object, ...]:
-    """What plants must share for their automata to have the same states and modes."""
-    guide = plant.guide
+    """Make the key that plants share whose automata have the same states and modes."""
+    guide, damped = plant.guide, bool(np.any(plant.chain().reaction_velocity))
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
-    return plant.n, plant.play, plant.shaft().names, plant.at_motor, *forces
+    return type(plant), plant.n, plant.play, damped, plant.shaft().names, plant.at_motor, *forces
+
+
+def check_homogeneous(plant: Plant, described: str) -> None:
+    """Refuse a plant whose motions do not scale with its gap and reference.
+
+    Raises
+    ------
+    InvalidInput
+        It has Coulomb friction or a constant force.
+    """
+    if plant.motor_friction or plant.guide.friction or plant.guide.force:
+        raise InvalidInput(
+            f"{described}: is computed for one gap and scaled to others, but Coulomb friction and constant forces of "
+            "this axis do not scale with its gap"
+        )
+
+
+def check_load_encoder(plant: Plant, described: str) -> None:
+    """Refuse an axis without an encoder at the load for what needs the load's position.
+
+    Raises
+    ------
+    InvalidInput
+        Its feedback is the motor's encoder.
+    """
+    if plant.at_motor:
+        raise InvalidInput(
+            f'sensors.feedback = "motor": {described} needs the position of the load, which the motor does not show; '
+            'the feedback must be "load"'
+        )
 
 
 def _named_plant(table: Table, name: str, plant: str, folder: Path) -> Plant:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.plant.axis import Axis
-from servotwin.plant.margins import gain_crossovers
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 
@@ -70,9 +69,12 @@ def _units_of_axis(axis: Axis) -> Scales:
     time = float(np.sum(np.sqrt(axis.load.masses[1:] / axis.load.stiffnesses[1:])))
     if not axis.rigid:
         time += math.sqrt(axis.load.m[0] / axis.transmission.k_d)
-    crossovers = gain_crossovers(axis.loop())
+    crossovers = axis.margins().gain_crossovers
     if crossovers:
         time = max(time, _LOOP / crossovers[0].omega)
+    if time == 0.0:
+        # A stiff axis whose loop is slower than any crossover has the time of its actuator.
+        time = 1.0 / float(np.max(np.abs(np.linalg.eigvals(axis.shaft().A))))
     shaft = axis.actuator.polynomials()
     turned = complex(np.polyval(shaft.command[::-1], 1j / time) / np.polyval(shaft.shaft[::-1], 1j / time))
     return Scales(time, axis.p, 1.0 / abs(turned))

@@ -29,7 +29,6 @@ class Sensors:
         float,
         key(
             "position_resolution_m",
-            "position_resolution_rad",
             minimum=0.0,
             help="One count of the load's encoder; 0: ideal.",
         ),
@@ -44,3 +43,5 @@ class Sensors:
 
     def __post_init__(self) -> None:
         check(self)
+        for name in ("encoder_resolution", "position_resolution"):
+            object.__setattr__(self, name, float(getattr(self, name)))

@@ -26,7 +26,7 @@ from servotwin.plant.basis import Guide, Play
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
-from servotwin.plant.signals import Array, check_gap
+from servotwin.plant.signals import Array, tolerance_of
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.runtime.notebook import html_table
 
@@ -273,11 +273,7 @@ class Servo:
         InvalidInput
             The gap or k_dz is negative or not finite, or the gap is above one turn.
         """
-        for name, value, unit in (("gap", gap, "rad"), ("k_dz", k_dz, "tolerances per gap")):
-            if not (math.isfinite(value) and value >= 0.0):
-                raise InvalidInput(f"{name} = {value} {unit}: must be finite and 0 or more")
-        check_gap(gap)
-        return k_dz * self.p * gap
+        return tolerance_of(self.p, gap, k_dz)
 
     @property
     def masses(self) -> Array:

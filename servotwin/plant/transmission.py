@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.basis import Play
+from servotwin.plant.signals import a_number
 
 HELD, FREE = "held", "free"
 
@@ -40,6 +41,8 @@ class Transmission:
     in_gap: str = HELD
 
     def __post_init__(self) -> None:
+        for name in ("p", "k_d", "c_d"):
+            object.__setattr__(self, name, a_number("transmission", name, getattr(self, name)))
         for name, value, finite in (("p", self.p, True), ("k_d", self.k_d, False)):
             if not value > 0.0 or (finite and math.isinf(value)):
                 allowed = "positive and finite" if finite else "positive; inf means rigid"

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.plants import Plant
+from servotwin.plant.plants import Plant, check_homogeneous
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
@@ -73,6 +73,7 @@ def _certified(servo: Plant, options: PolicyOptions) -> Policy:
 
 
 def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
+    check_homogeneous(servo, 'policy = "margin"')
     if servo.pidf.voltage_limit is not None:
         raise InvalidInput(
             "policy 'margin' reads its dead zone from a map that serves every gap, which no map does for a controller "

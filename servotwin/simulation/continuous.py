@@ -290,9 +290,9 @@ def change_controller(
 
 def law_at_rest(law: LinearLaw, now: LoopState, known: dict[str, float]) -> dict[str, float]:
     """States of a linear law in the automaton, at rest under the present measurements; some of them given."""
-    y_motor, measured = now.output("theta_m"), now.output("measured_position")
-    y_load = now.output("sensed")
-    reference = measured if not known else now.value("reference")
+    y_motor, y_load = now.output("theta_m"), now.output("sensed")
+    by_motor, by_load = law.error
+    reference = by_motor * y_motor + by_load * y_load if not known else now.value("reference")
     resting = law.rest((reference, y_motor, y_load), known)
     return {law_state(name): value for name, value in zip(law.names, resting, strict=True)}
 

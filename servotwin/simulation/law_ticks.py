@@ -46,7 +46,7 @@ def take_law_tick(
     tick_inputs: TickInputs,
     output: Output,
 ) -> LinearState:
-    """Measure, tick, record both; the recorded measurement is the one that the dead zone compares."""
+    """Measure, tick, record both; the recorded measurement is the load's."""
     k, at = i - tick_inputs.first, np.uint64(i - output.first_tick)
     zone = np.uint64(k & tick_inputs.zone_mask)
     noise = tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)]
@@ -65,7 +65,7 @@ def take_law_tick(
         parameters.release_step,
     )
     state = tick(now, state, tick_inputs.reference[np.uint64(k & tick_inputs.reference_mask)], y_motor, y_load)
-    output.measured[at] = parameters.motor * y_motor + parameters.load * y_load
+    output.measured[at] = y_load
     output.active[at] = 1 if state.active > 0.5 else 0
     return state
 

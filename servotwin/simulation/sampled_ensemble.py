@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures, figures_of
@@ -182,7 +183,9 @@ def sampled_members(servos: Any, controllers: Any, cases: SampledCases) -> Sampl
         raise InvalidInput("resolution: every value of an ensemble must be finite and 0 m or more")
     every_servo = list(np.broadcast_to(plants, shape).ravel())
     given = np.broadcast_to(laws, shape).ravel()
-    every_law = [servo.controller if law is None else law for servo, law in zip(every_servo, given, strict=True)]
+    every_law = [
+        filtered_pid(servo.controller if law is None else law) for servo, law in zip(every_servo, given, strict=True)
+    ]
     for law in {id(law): law for law in every_law}.values():
         if law.sample_rate is None:
             raise InvalidInput("a sampled ensemble needs controllers with a sample_rate")

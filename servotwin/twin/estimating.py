@@ -18,7 +18,7 @@ from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.controller import ControllerComparison, compare_controller
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
-from servotwin.estimation.gap import estimate_gap, settings_of
+from servotwin.estimation.gap import estimate_gap, options_for
 from servotwin.estimation.learning.machine import nameplate
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
@@ -60,8 +60,13 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
     settings = settings.on(servo)
-    options = settings_of(settings.method, settings.estimator)
     model = servo_for(servo)
+    if model is None and (settings.estimator is not None or settings.method != whitened.METHOD):
+        raise InvalidInput(
+            f"[twin] method = {settings.method!r} and its settings: are for axes that are held in the gap and have "
+            "two masses or more; leave them out for this axis"
+        )
+    options = options_for(servo, settings.method, settings.estimator)
     new = stated_machine(settings) if settings.learning.learn and model is not None and model.rigid else None
 
     def of_model(window: Window, expected: Expectation) -> GapEstimate:

@@ -16,7 +16,7 @@ from itertools import islice
 from time import perf_counter
 
 from servotwin.control.controller import Controller
-from servotwin.plant.plants import Plant
+from servotwin.plant.plants import Plant, check_load_encoder
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
@@ -74,6 +74,7 @@ def certify(
         No candidate is within the bounds on Ms.
     """
     begin = clock()
+    check_load_encoder(servo, "the verification of settings")
     demands = demands or Demands()
     trial = trial or trial_for(servo, uncertainty, demands)
     disturbed = is_disturbed(servo, uncertainty, demands, feedforward)

@@ -8,7 +8,9 @@ counts as absent, and is replaced.
 from __future__ import annotations
 
 import hashlib
+import os
 import platform
+import stat
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import fields, is_dataclass, replace
@@ -88,7 +90,11 @@ def cached_certificate(of: dict[str, str], compute: Callable[[], Certificate]) -
     folder = cache_folder()
     if folder is None:
         return compute()
-    of = {**of, **_environment()}
+    try:
+        of = {**of, **_environment()}
+    except OSError:
+        # Code that cannot be read has no digest.
+        return compute()
     name = hashlib.sha256(repr(sorted(of.items())).encode()).hexdigest()
     path = folder / "certificates" / f"{name}{_SUFFIX}"
     found = _read(path, of)
@@ -97,7 +103,7 @@ def cached_certificate(of: dict[str, str], compute: Callable[[], Certificate]) -
     certificate = compute()
     # A folder that cannot be written to costs time, and nothing else.
     with suppress(OSError, InvalidInput):
-        path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         _write(path, CertificateFile(of, certificate))
         _remove_oldest(path.parent)
     return certificate
@@ -123,15 +129,27 @@ def _environment() -> dict[str, str]:
 def _read(path: Path, of: dict[str, str]) -> Certificate | None:
     """Read a file; None: it is absent, damaged, or of other values."""
     try:
-        if path.stat().st_size > _LARGEST:
-            return None
-        data = path.read_bytes()
-        if hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
+        with open(path, "rb", opener=_without_waiting) as file_object:
+            if not _is_own(os.fstat(file_object.fileno())):
+                return None
+            data = file_object.read(_LARGEST + 1)
+        if len(data) > _LARGEST or hashlib.sha256(data[_DIGEST:]).digest() != data[:_DIGEST]:
             return None
         file = _decoder.decode(data[_DIGEST:])
     except (OSError, msgspec.MsgspecError, ValueError, RecursionError):
         return None
     return file.certificate if file.of == of else None
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    """Open a pipe too at once."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _is_own(found: os.stat_result) -> bool:
+    """True for a plain file of this user that nobody else may write to."""
+    own = not hasattr(os, "geteuid") or found.st_uid == os.geteuid()
+    return stat.S_ISREG(found.st_mode) and own and not found.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
 
 
 def _write(path: Path, file: CertificateFile) -> None:
