@@ -211,6 +211,11 @@ class Axis:
         """Coulomb friction of the motor's shaft, N m."""
         return self.actuator.coulomb
 
+    @property
+    def own_friction(self) -> float:
+        """Coulomb friction of motor and load as a torque on the motor, N m."""
+        return self.motor_friction + self.p * self.load.friction
+
     @cached_property
     def guide(self) -> Guide:
         """Forces on the last mass."""

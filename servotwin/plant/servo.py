@@ -295,7 +295,7 @@ class Servo:
         """True when the first mass follows the screw (k_d infinite)."""
         return math.isinf(self.k_d)
 
-    at_motor, guide, motor_friction = False, Guide(), 0.0
+    at_motor, guide, motor_friction, own_friction = False, Guide(), 0.0, 0.0
 
     @property
     def play(self) -> Play:

@@ -206,7 +206,7 @@ def arrival_error(setting: Design, model: Plant, input_bias: Array, friction: Ar
     law = setting.controller
     # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the
     # motor against what it answers to the error; what is fed forward for it pushes to one side.
-    held = model.command_of(friction) + abs(law.friction_feedforward)
+    held = model.command_of(friction + model.own_friction) + abs(law.friction_feedforward)
     steady = (np.abs(input_bias + law.feedforward) + held) / abs(law.Kp)
     return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
 

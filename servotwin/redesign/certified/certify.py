@@ -159,7 +159,10 @@ def known_bias(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> floa
 def is_disturbed(servo: Plant, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
     """True where friction acts, or a bias that is not known."""
     low, high = (bias + feedforward for bias in uncertainty.input_bias)
-    return max(abs(low), abs(high)) > known_bias(servo, uncertainty, demands) or uncertainty.friction[1] > 0.0
+    return (
+        max(abs(low), abs(high)) > known_bias(servo, uncertainty, demands)
+        or uncertainty.friction[1] + servo.own_friction > 0.0
+    )
 
 
 def _for_disturbance(demands: Demands, disturbed: bool) -> Demands:
@@ -189,7 +192,7 @@ def candidates_of(
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]
-    plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0], demands)]
+    plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0] + servo.own_friction, demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
     if not (0.0 < zone <= demands.tolerance and noisy):
         return plain

@@ -306,7 +306,8 @@ class CertifiedPolicy:
         # Learnt as a voltage: as a torque it is that of the motor on which it is simulated.
         torque = (servo if learnt is None else learnt[0]).torque_of(1.0)
         if motor is not None:
-            least, most = motor.friction
+            # What the model states itself is simulated anyway.
+            least, most = (max(0.0, each - servo.command_of(servo.own_friction)) for each in motor.friction)
             # Friction that is not significant counts at most as stated.
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
         high = max(high, _HOLDS * self._rest(evidence)[2] * torque)

@@ -48,7 +48,7 @@ def leaves_too_much(question: Question, setting: Design) -> bool:
     """
     known, servo, law = question.uncertainty, question.servo, setting.controller
     bias = max(abs(end + law.feedforward) for end in known.input_bias)
-    held = max(0.0, servo.command_of(known.friction[1]) - abs(law.friction_feedforward))
+    held = max(0.0, servo.command_of(known.friction[1] + servo.own_friction) - abs(law.friction_feedforward))
     left = (bias + held) / abs(law.Kp)
     return law.Ki == 0.0 and left > ROUNDED * question.largest_error(setting)
 
