@@ -17,7 +17,8 @@ from servotwin.control.laws import filtered_pid
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
 from servotwin.plant.margins import Margins
-from servotwin.plant.plants import resolve_plant
+from servotwin.plant.plants import Plant, resolve_plant
+from servotwin.plant.shown import gain_units
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
@@ -65,7 +66,7 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     console = Console()
     own = filtered_pid(servo.controller)
     present = evaluate(tuned_system(servo), own, delay)
-    _print(console, {"tuned": (tuning.controller, tuning.margins), "present": (own, present)})
+    _print(console, servo, {"tuned": (tuning.controller, tuning.margins), "present": (own, present)})
     angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))
     console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)
@@ -100,8 +101,9 @@ def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str,
     }
 
 
-def _print(console: Console, rows: dict[str, tuple[Controller, Margins]]) -> None:
-    table = Table("", "Kp\nV/m", "Ki\nV/(m s)", "Kd\nV s/m", "Tf\ns", "Ms", box=None, pad_edge=False)
+def _print(console: Console, servo: Plant, rows: dict[str, tuple[Controller, Margins]]) -> None:
+    heads = (f"{gain}\n{unit}" for gain, unit in zip(("Kp", "Ki", "Kd", "Tf"), gain_units(servo), strict=True))
+    table = Table("", *heads, "Ms", box=None, pad_edge=False)
     for name, (law, margins) in rows.items():
         gains = (f"{value:.6g}" for value in (law.Kp, law.Ki, law.Kd, law.Tf))
         table.add_row(name, *gains, f"{margins.Ms:.4f}")
