@@ -16,9 +16,10 @@ from servotwin.control.controller import Controller
 from servotwin.control.laws import filtered_pid
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
+from servotwin.plant.loop import gain_units
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant, resolve_plant
-from servotwin.plant.shown import gain_units
+from servotwin.plant.shown import command_unit, position_unit
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
@@ -102,7 +103,8 @@ def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str,
 
 
 def _print(console: Console, servo: Plant, rows: dict[str, tuple[Controller, Margins]]) -> None:
-    heads = (f"{gain}\n{unit}" for gain, unit in zip(("Kp", "Ki", "Kd", "Tf"), gain_units(servo), strict=True))
+    units = gain_units(command_unit(servo), position_unit(servo).si)
+    heads = (f"{gain}\n{unit}" for gain, unit in zip(("Kp", "Ki", "Kd", "Tf"), units, strict=True))
     table = Table("", *heads, "Ms", box=None, pad_edge=False)
     for name, (law, margins) in rows.items():
         gains = (f"{value:.6g}" for value in (law.Kp, law.Ki, law.Kd, law.Tf))

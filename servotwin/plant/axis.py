@@ -25,12 +25,14 @@ from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
 from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
 from servotwin.plant.basis import Guide, Play
+from servotwin.plant.fit import check_fit
 from servotwin.plant.law_loop import LawLoop, check_encoders
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
+from servotwin.plant.numbers import tolerance_of
 from servotwin.plant.sensors import MOTOR, Sensors
-from servotwin.plant.signals import Array, tolerance_of
+from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
@@ -57,9 +59,8 @@ class AxisChanges(ControllerChanges, total=False):
     sensors: Sensors
 
 
+# Stands for the controller where only the plant counts.
 _NONE = Controller(0.0, 0.0, 0.0, 1.0)
-# A cascade may be told a ratio that is off by less.
-_OTHER_RATIO = 0.2
 _PARTS: dict[str, tuple[type, ...]] = {
     "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
     "transmission": (Transmission,),
@@ -87,7 +88,7 @@ class Axis:
     Raises
     ------
     InvalidInput
-        A part of another type.
+        A part of another type, or parts that do not fit.
     """
 
     actuator: Actuator
@@ -102,35 +103,7 @@ class Axis:
             if not isinstance(part, kinds):
                 names = " or ".join(kind.__name__ for kind in kinds)
                 raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
-        if isinstance(self.controller, Cascade):
-            self._check_cascade(self.controller)
-        load = self.load
-        undamped = not any(load.c) and not load.friction and not self.transmission.c_d
-        if load.free and undamped and not (self.n == 1 and self.rigid):
-            raise InvalidInput(
-                f"load c = {load.c!r}: a free load without damping and friction never rests; give the damping or "
-                "friction of its guide, or the damping of the transmission"
-            )
-        if self.n == 1 and self.rigid and (self.load.friction or self.load.force):
-            raise InvalidInput(
-                "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
-                "nothing; give a finite stiffness, or the friction at the motor"
-            )
-
-    def _check_cascade(self, cascade: Cascade) -> None:
-        """Refuse a cascade whose command or ratio is not this axis's."""
-        follows = isinstance(self.actuator, VelocityDrive)
-        if isinstance(self.actuator, Stepper):
-            raise InvalidInput(
-                "controller: a stepper goes to its commanded angle; a cascade commands a speed or a torque"
-            )
-        if follows != (cascade.velocity_gain is None):
-            wanted = "must be absent: the drive closes the velocity loop" if follows else "is missing"
-            raise InvalidInput(f"controller velocity_gain = {cascade.velocity_gain!r}: {wanted}")
-        if not abs(cascade.ratio / self.p - 1.0) < _OTHER_RATIO:
-            raise InvalidInput(
-                f"controller ratio = {cascade.ratio!r}: the transmission's travel per angle is {self.p!r}; leave it out"
-            )
+        check_fit(self.actuator, self.transmission, self.load, self.controller)
 
     @classmethod
     def preset(cls, name: str) -> Axis:

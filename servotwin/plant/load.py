@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.signals import Array, a_number
+from servotwin.plant.numbers import a_number
+from servotwin.plant.signals import Array
 
 LINEAR, ROTARY = "linear", "rotary"
 _UNITS = {LINEAR: ("kg", "N/m", "N s/m", "N"), ROTARY: ("kg m^2", "N m/rad", "N m s/rad", "N m")}

@@ -114,6 +114,11 @@ def axis_system(
     return LinearSystem(A, np.concatenate([shaft.B, np.zeros(size)]), C, 0.0, numerator, denominator)
 
 
+def gain_units(command: str, position: str) -> tuple[str, str, str, str]:
+    """Units of Kp, Ki, Kd and Tf of a filtered PID, for those of its command and of the position."""
+    return f"{command}/{position}", f"{command}/({position} s)", f"{command} s/{position}", "s"
+
+
 def check_stable(plant: LinearSystem, law: Controller, described: str, command: str = "V", position: str = "m") -> None:
     """Refuse a controller that does not stabilise a plant, at its sample rate if it has one.
 
@@ -132,7 +137,7 @@ def check_stable(plant: LinearSystem, law: Controller, described: str, command: 
     worst = slowest_pole(plant, law)
     if not worst.real < 0.0:
         rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
-        units = f"{command}/{position}", f"{command}/({position} s)", f"{command} s/{position}", "s"
+        units = gain_units(command, position)
         names = ("Kp", "Ki", "Kd", "Tf")
         gains = ", ".join(f"{name} = {getattr(law, name):g} {unit}" for name, unit in zip(names, units, strict=True))
         raise InvalidInput(

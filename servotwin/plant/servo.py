@@ -26,7 +26,8 @@ from servotwin.plant.basis import Guide, Play
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
-from servotwin.plant.signals import Array, tolerance_of
+from servotwin.plant.numbers import tolerance_of
+from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.runtime.notebook import html_table
 

@@ -44,9 +44,3 @@ def position_unit(plant: Plant) -> ShownUnit:
 def command_unit(plant: Plant) -> str:
     """Unit of the command of a plant's actuator."""
     return plant.actuator.unit if isinstance(plant, Axis) else "V"
-
-
-def gain_units(plant: Plant) -> tuple[str, str, str, str]:
-    """Units of Kp, Ki, Kd and Tf of a plant's filtered PID."""
-    command, position = command_unit(plant), position_unit(plant).si
-    return f"{command}/{position}", f"{command}/({position} s)", f"{command} s/{position}", "s"

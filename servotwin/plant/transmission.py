@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from servotwin.errors import InvalidInput
 from servotwin.plant.basis import Play
-from servotwin.plant.signals import a_number
+from servotwin.plant.numbers import a_number
 
 HELD, FREE = "held", "free"
 

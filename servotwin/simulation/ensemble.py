@@ -20,7 +20,7 @@ from servotwin.plant.plants import Plant, structure_of
 from servotwin.plant.signals import check_gap
 from servotwin.plant.stack import LoopStack, continuous_loops
 from servotwin.simulation.continuous import controller_constants
-from servotwin.simulation.inputs import plant_forces
+from servotwin.simulation.inputs import with_forces
 
 NOT_NEGATIVE = ("gap", "tolerance", "friction")
 
@@ -334,17 +334,6 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
         if law.sample_rate is not None or law.rate_limit is not None:
             raise InvalidInput("an ensemble needs continuous controllers: without sample_rate and rate_limit")
     return EnsembleMembers(shape, every_servo, every_law, with_forces(constants, every_servo))
-
-
-def with_forces(constants: dict[str, Array], plants: Sequence[Plant]) -> dict[str, Array]:
-    """Constants of members, with the plants' own forces beside or among them."""
-    # Thousands of members share a few plants.
-    different = {id(plant): plant for plant in plants}.values()
-    if not any(plant.motor_friction or plant.guide.friction or plant.guide.force for plant in different):
-        return constants
-    own = {name: np.array([plant_forces(plant)[name] for plant in plants]) for name in plant_forces(plants[0])}
-    friction = constants["friction"] + own.pop("friction")
-    return {**constants, "friction": friction, **{name.replace(" ", "_"): values for name, values in own.items()}}
 
 
 def check_constants(constants: dict[str, Array]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,6 +55,17 @@ def plant_forces(servo: Plant) -> dict[str, float]:
         "load force": servo.guide.force,
         "load friction": servo.guide.friction,
     }
+
+
+def with_forces(constants: dict[str, Array], plants: Sequence[Plant]) -> dict[str, Array]:
+    """Constants of members, with the plants' own forces beside or among them."""
+    # Thousands of members share a few plants.
+    different = {id(plant): plant for plant in plants}.values()
+    if not any(plant.motor_friction or plant.guide.friction or plant.guide.force for plant in different):
+        return constants
+    own = {name: np.array([plant_forces(plant)[name] for plant in plants]) for name in plant_forces(plants[0])}
+    friction = constants["friction"] + own.pop("friction")
+    return {**constants, "friction": friction, **{name.replace(" ", "_"): values for name, values in own.items()}}
 
 
 def quantised(values: Array, resolution: float) -> Array:

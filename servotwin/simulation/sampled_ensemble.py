@@ -15,8 +15,8 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures, figures_of
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_pieces
-from servotwin.simulation.ensemble import Cases, check_constants, samples_of, with_forces
-from servotwin.simulation.inputs import RunInputs
+from servotwin.simulation.ensemble import Cases, check_constants, samples_of
+from servotwin.simulation.inputs import RunInputs, with_forces
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.sampled_groups import SampledMembers, SampledSpan, groups_of, in_blocks, run_group
 from servotwin.simulation.sampled_members import SampledResults
