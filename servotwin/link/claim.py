@@ -13,7 +13,7 @@ from threading import Lock
 from typing import Protocol
 
 from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
-from servotwin.messages import PROTOCOL, Claim, Refusal, Standing
+from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
 _TRIES = 8
@@ -31,7 +31,7 @@ class ClaimingTransport(Transport, Protocol):
 
     claim: Held
 
-    def ask(self, claim: Claim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> Standing | None:
         """Send a question or a claim; None: the twin is of a version without claims.
 
         Raises
@@ -168,6 +168,6 @@ class ExclusiveTransport:
         self._held = self._transport.claim = held
 
     def _ask(self, takes: int) -> Standing | None:
-        question = Claim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software)
+        question = EdgeClaim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software)
         self.twin = self._transport.ask(question)
         return self.twin

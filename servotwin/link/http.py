@@ -15,7 +15,7 @@ import msgspec
 from servotwin.link.claim import Held
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
-from servotwin.messages import MAX_BYTES, Acknowledge, Claim, InvalidMessage, Refusal, Standing, decode, encode
+from servotwin.messages import MAX_BYTES, Acknowledge, EdgeClaim, InvalidMessage, Refusal, Standing, decode, encode
 
 if TYPE_CHECKING:
     import ssl
@@ -200,7 +200,7 @@ class HttpTransport:
             _checked(self._down.request("GET", path, None, self._claimed(), 4 * MAX_BYTES), (200,)).body
         )
 
-    def ask(self, claim: Claim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> Standing | None:
         """Send a question or a claim; see `ClaimingTransport`."""
         headers = {"Content-Type": BODY}
         response = self._up.request("POST", f"{self._base}/claim", encode(claim), headers, _LONGEST_RESPONSE)

@@ -32,7 +32,7 @@ from servotwin.link.mqtt_messages import (
 )
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import MAX_BYTES, Claim, InvalidMessage, Refusal, Standing
+from servotwin.messages import MAX_BYTES, EdgeClaim, InvalidMessage, Refusal, Standing
 
 _SESSION_S = 3600
 _NO_MESSAGE = 2**53
@@ -95,7 +95,7 @@ class MqttTransport:
             raise Unreachable("the answer to a poll holds no messages")
         return response.messages
 
-    def ask(self, claim: Claim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> Standing | None:
         """Send a question or a claim; see `ClaimingTransport`."""
         # In a poll for messages that there cannot be: a twin without claims answers it like any other.
         response = self._request(PollRequest(_NO_MESSAGE, 0.0, question=claim), self._timeout)

@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from servotwin.link.seal import OVERHEAD, TO_TWIN, Sealed, opened, seal
-from servotwin.messages import MAX_BYTES, Claim, InvalidMessage, Refusal, Standing
+from servotwin.messages import MAX_BYTES, EdgeClaim, InvalidMessage, Refusal, Standing
 from servotwin.messages.checks import Count
 
 ROOT = "servotwin"
@@ -57,14 +57,14 @@ class PollRequest(Struct, frozen=True, omit_defaults=True, tag="listen/1"):
         Time to wait for the first one, s.
     claim : str
         Claim that the sender holds; "": none.
-    question : Claim or None
+    question : EdgeClaim, optional
         Question or claim, which is answered at once, without messages. A twin of a version without claims ignores it.
     """
 
     after: Count
     wait: Annotated[float, Meta(ge=0.0, le=30.0)]
     claim: ClaimText = ""
-    question: Claim | None = None
+    question: EdgeClaim | None = None
 
 
 class PutResponse(Struct, frozen=True, tag="taken/1"):

@@ -14,7 +14,7 @@ PROTOCOL = 2
 """Version of the protocol between edge and twin: 1 had no claims and did not tell its number."""
 
 
-class Claim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
+class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
     """Question of an edge that runs, which claim of its servo counts; or its claim.
 
     Attributes

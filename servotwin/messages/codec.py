@@ -9,7 +9,7 @@ from typing import TypeVar, get_args
 import msgspec
 
 from servotwin.messages.checks import InvalidMessage, Refusal, require
-from servotwin.messages.claims import Claim, Standing
+from servotwin.messages.claims import EdgeClaim, Standing
 from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.requests import Answer, Request, Resend
 from servotwin.messages.responses import LearntResponse
@@ -36,7 +36,7 @@ ParameterMessage = (
     | LetterAcknowledge
     | LearntResponse
     | Resend
-    | Claim
+    | EdgeClaim
     | Standing
 )
 Message = WindowMessage | ParameterMessage

@@ -9,7 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 from servotwin.link.claim import held_of
-from servotwin.messages import PROTOCOL, Claim, Refusal, Standing
+from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
 from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import Store
@@ -86,7 +86,7 @@ class EdgeClaims:
         if (held.run, held.number) != newest:
             raise RequestRejected(Refusal.SUPERSEDED, _SUPERSEDED)
 
-    async def answer(self, servo: str, claim: Claim) -> Standing:
+    async def answer(self, servo: str, claim: EdgeClaim) -> Standing:
         """Answer a question or a claim; raises RequestRejected as `check` does."""
         if claim.servo != servo:
             raise RequestRejected(Refusal.OTHER_NAME, f"the claim is of servo {claim.servo!r}, not of {servo!r}")
@@ -107,7 +107,7 @@ class EdgeClaims:
             self._evict(servo)
         return newest
 
-    async def _report(self, servo: str, claim: Claim, newest: StoredClaim) -> None:
+    async def _report(self, servo: str, claim: EdgeClaim, newest: StoredClaim) -> None:
         """Report that an edge runs which was superseded: at each of its questions, and once in the evidence."""
         self._metrics.rejected.add(Refusal.SUPERSEDED.value)
         log.warning("conflict", extra={"servo": servo, "run": claim.run, "newer": newest.run})

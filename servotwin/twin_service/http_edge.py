@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 
 from servotwin import __version__
 from servotwin.link.seal import TO_EDGE, key_of, seal
-from servotwin.messages import PROTOCOL, Claim, Refusal, encode
+from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, encode
 from servotwin.store.records import OutgoingMessage, PutResult
 from servotwin.twin_service.auth import EdgeGate
 from servotwin.twin_service.claims import EdgeClaims
@@ -286,7 +286,7 @@ class EdgeApi:
         self._gate.admit(servo, request.token)
         body = await self._bodies.read(request.content_length, request.receive)
         claim = self._ingest.decode(servo, body, request.content_encoding)
-        if not isinstance(claim, Claim):
+        if not isinstance(claim, EdgeClaim):
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, "a claim is expected here")
         return HttpResponse(200, encode(await self._claims.answer(servo, claim)), MSGPACK)
 

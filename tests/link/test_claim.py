@@ -4,7 +4,7 @@ import pytest
 
 from servotwin.link.claim import ExclusiveTransport, Held, held_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import PROTOCOL, Claim, Refusal, Standing
+from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
 
 
 class Twin:
@@ -12,10 +12,10 @@ class Twin:
 
     def __init__(self) -> None:
         self.newest = Standing("axis")
-        self.claims: list[Claim] = []
+        self.claims: list[EdgeClaim] = []
         self.has_claims = self.there = True
 
-    def ask(self, claim: Claim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> Standing | None:
         self.claims.append(claim)
         if not self.there:
             raise Unreachable("away")
@@ -40,7 +40,7 @@ class Line:
     def __init__(self, twin: Twin) -> None:
         self.twin, self.claim, self.sent = twin, Held(), 0
 
-    def ask(self, claim: Claim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> Standing | None:
         return self.twin.ask(claim)
 
     def deliver(self, _parcel: Parcel) -> None:
@@ -91,7 +91,7 @@ def test_the_newer_run_takes_over_and_the_older_sends_nothing_more_for_ever() ->
     assert not newer.superseded
     assert (older._transport.sent, newer._transport.sent) == (1, 4)
     # It tells, at each try, that it still runs: by this the twin knows a conflict from a restart.
-    assert twin.claims[-1] == Claim("axis", "b1-aa", 1, 0, PROTOCOL, "1.2")
+    assert twin.claims[-1] == EdgeClaim("axis", "b1-aa", 1, 0, PROTOCOL, "1.2")
 
 
 def test_a_restarted_link_process_of_the_same_run_keeps_the_claim() -> None:

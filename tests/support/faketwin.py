@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import msgspec
 
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
-from servotwin.messages import Acknowledge, Claim, Message, Refusal, Standing, WindowMessage, decode, encode
+from servotwin.messages import Acknowledge, EdgeClaim, Message, Refusal, Standing, WindowMessage, decode, encode
 
 Fault = Callable[["Handler", bytes], bool]
 """Looks at a request; whether it has answered it (badly) itself."""
@@ -108,7 +108,7 @@ class Handler(BaseHTTPRequestHandler):
         if self.headers.get("Content-Encoding") == "deflate":
             body = zlib.decompress(body)
         message = decode(body)
-        if isinstance(message, Claim):
+        if isinstance(message, EdgeClaim):
             self._answer_claim(message)
             return
         if not isinstance(message, WindowMessage):
@@ -122,7 +122,7 @@ class Handler(BaseHTTPRequestHandler):
         self.twin.on_window(message)
         self.answer(status, msgspec.msgpack.encode([encode(Acknowledge(message.servo, *key))]))
 
-    def _answer_claim(self, claim: Claim) -> None:
+    def _answer_claim(self, claim: EdgeClaim) -> None:
         newest = self.twin.standing
         if newest is None:
             self.refuse(404, Refusal.NOT_UNDERSTOOD)
