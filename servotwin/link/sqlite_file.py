@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,15 +22,19 @@ CREATE TABLE IF NOT EXISTS letters (
     place INTEGER PRIMARY KEY AUTOINCREMENT, digest BLOB NOT NULL UNIQUE, body BLOB NOT NULL);
 CREATE TABLE IF NOT EXISTS notes (name TEXT PRIMARY KEY, value BLOB NOT NULL) WITHOUT ROWID;
 CREATE TABLE IF NOT EXISTS counts (what TEXT PRIMARY KEY, number INTEGER NOT NULL) WITHOUT ROWID;
+CREATE TABLE IF NOT EXISTS acknowledged (
+    boot TEXT NOT NULL, sequence INTEGER NOT NULL, at REAL NOT NULL, PRIMARY KEY (boot, sequence)) WITHOUT ROWID;
 """
 INSERT = "INSERT OR IGNORE INTO windows (boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?)"
 DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
+ACKNOWLEDGE = "INSERT OR REPLACE INTO acknowledged (boot, sequence, at) VALUES (?, ?, ?)"
+ASKED_FOR = "DELETE FROM acknowledged WHERE boot = ? AND sequence = ?"
 POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
 TAKE = "DELETE FROM letters WHERE digest = ?"
 COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
 NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
 _BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
-_BESIDE = ("-wal", "-shm")
+BESIDE = ("-wal", "-shm")
 
 
 class Statement(NamedTuple):
@@ -56,6 +62,7 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
     sqlite3.Error
         The file cannot be opened, or is corrupt (`is_broken`).
     """
+    _make_private(path)
     # The outbox begins its transactions itself, and its lock guards the connection for all threads.
     connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
     try:
@@ -71,6 +78,15 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
     return connection
 
 
+def _make_private(path: Path) -> None:
+    """Make the file where there is none, and let its owner alone open it; SQLite gives its log the same mode."""
+    with suppress(OSError):
+        # With its mode from the start: between creation and a chmod others could open it.
+        os.close(os.open(path, os.O_CREAT | os.O_RDONLY, 0o600))
+        if path.stat().st_mode & 0o077:
+            path.chmod(0o600)
+
+
 def put_aside(path: Path) -> Path:
     """Rename a corrupt file, so that it can be examined; return its new path."""
     number = 1
@@ -78,7 +94,7 @@ def put_aside(path: Path) -> Path:
         number += 1
     path.rename(aside)
     # With its write-ahead log: SQLite would apply that to the new file of the same name.
-    for end in _BESIDE:
+    for end in BESIDE:
         beside = path.with_name(path.name + end)
         if beside.exists():
             beside.rename(aside.with_name(aside.name + end))

@@ -8,17 +8,22 @@ statement may be repeated, so that a transaction whose outcome is not known is s
 from __future__ import annotations
 
 import sqlite3
+import time
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from threading import RLock
-from typing import Any, NamedTuple
+from typing import Any
 
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import FULL, Dropped, Key, letter_digest
+from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows, Entry, excess, is_uninformative
+from servotwin.link.salvage import Salvage, Salvaged, salvage
 from servotwin.link.sqlite_file import (
+    ACKNOWLEDGE,
+    ASKED_FOR,
     COUNT,
     DELETE,
     INSERT,
@@ -39,17 +44,7 @@ BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters ful
 MOST_UNWRITTEN = 16_000_000
 """Bytes of windows held in memory while the disk cannot be written."""
 _MOST_LETTERS = 10_000
-_UNINFORMATIVE = ("periodic",)
-"""First words of the reasons of windows that are dropped first."""
-
 _DROPPED = "dropped: "
-
-
-class _Entry(NamedTuple):
-    """Entry of the index for a window: its size in bytes; True where its reason is one of `_UNINFORMATIVE`."""
-
-    size: int
-    uninformative: bool
 
 
 class SqliteOutbox:
@@ -64,16 +59,38 @@ class SqliteOutbox:
     servo : str
     windows, size : int
         Largest number of windows, and of their bytes.
+    kept : AcknowledgedLimits, optional
+        Limits of the windows that stay after their acknowledgement, for a twin that asks for them again; none by
+        default.
+    waiting : int
+        Windows that waited when the last process ended, as far as is known: those of a corrupt file that cannot be
+        found even by name are counted from it.
+
+    Attributes
+    ----------
+    salvages : list of Salvage
+        Corrupt files of this process.
     """
 
-    def __init__(self, path: Path, servo: str, windows: int = 5000, size: int = 256_000_000) -> None:
+    def __init__(
+        self,
+        path: Path,
+        servo: str,
+        windows: int = 5000,
+        size: int = 256_000_000,
+        kept: AcknowledgedLimits | None = None,
+        waiting: int = 0,
+    ) -> None:
         if windows < 1 or size < 1:
             raise InvalidInput(f"outbox of {windows!r} windows and {size!r} bytes: must be at least 1 of each")
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
+        self._kept = AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0))
+        self._waiting = waiting
+        self.salvages: list[Salvage] = []
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
         self._read_only = False
-        self._index: dict[Key, _Entry] = {}
+        self._index: dict[Key, Entry] = {}
         self._letters: dict[bytes, None] = {}
         self._counts: Counter[str] = Counter()
         self._notes: dict[str, bytes] = {}
@@ -100,11 +117,11 @@ class SqliteOutbox:
         body, encoding = deflated(encode(window))
         key = window.boot, window.sequence
         with self._lock:
-            if key in self._index:
+            if key in self._index or key in self._kept.entries:
                 return []
-            self._index[key] = _Entry(len(body), _is_uninformative(window.reason))
+            self._index[key] = Entry(len(body), is_uninformative(window.reason))
             self._unwritten["window", key] = Statement(INSERT, (*key, window.reason, encoding, body))
-            drops = [Dropped(each, FULL) for each in _excess(self._index, self._windows, self._size)]
+            drops = [Dropped(each, FULL) for each in excess(self._index, self._windows, self._size)]
             for drop in drops:
                 self._forget(drop.key, drop.reason)
             self.flush()
@@ -132,11 +149,21 @@ class SqliteOutbox:
     def remove(self, key: Key) -> bool:
         """Remove an acknowledged window; False when it was not there."""
         with self._lock:
-            known = key in self._index
-            if known:
-                self._forget(key)
+            entry = self._index.get(key)
+            if entry is not None:
+                self._keep(key, entry)
                 self.flush()
-            return known
+            return entry is not None
+
+    def resend(self, wanted: Callable[[str, int], bool]) -> int:
+        """Put back acknowledged windows for which `wanted(boot, sequence)` is true; return their number."""
+        with self._lock:
+            found = [key for key in self._kept.entries if wanted(*key)]
+            for key in found:
+                self._index[key] = Entry(self._kept.take(key), uninformative=False)
+                self._unwritten["acknowledged", key] = Statement(ASKED_FOR, key)
+            self.flush()
+            return len(found)
 
     def drop(self, key: Key, reason: str) -> None:
         """Drop a window and count it under a reason."""
@@ -261,9 +288,12 @@ class SqliteOutbox:
     def _load(self, connection: sqlite3.Connection) -> None:
         """Load the file's index; changes in memory, which are newer, take precedence."""
         windows = connection.execute("SELECT boot, sequence, reason, length(body) FROM windows ORDER BY place")
-        stored = {(boot, number): _Entry(size, _is_uninformative(reason)) for boot, number, reason, size in windows}
+        stored = {(boot, number): Entry(size, is_uninformative(reason)) for boot, number, reason, size in windows}
         letters = [digest for (digest,) in connection.execute("SELECT digest FROM letters ORDER BY place")]
         counts: dict[str, int] = dict(connection.execute("SELECT what, number FROM counts").fetchall())
+        acknowledged = connection.execute("SELECT boot, sequence, at FROM acknowledged").fetchall()
+        times = {(boot, number): at for boot, number, at in acknowledged if (boot, number) in stored}
+        self._kept.load((key, stored.pop(key).size, at) for key, at in times.items())
         # Windows of the file first: they are older, and the index is in the order of age.
         self._index = {
             **{key: entry for key, entry in stored.items() if ("window", key) not in self._unwritten},
@@ -297,23 +327,46 @@ class SqliteOutbox:
             self.close()
 
     def _begin_anew(self) -> None:
-        """Put the corrupt file aside and begin another; windows that are not in memory are lost, and counted."""
+        """Put the corrupt file aside and begin another, with all that can be read of it; count the rest as lost."""
         self.close()
         self.faults[BROKEN] += 1
+        found = salvage(self._path)
         in_memory = {key for kind, key in self._unwritten if kind == "window"}
-        for key in [key for key in self._index if key not in in_memory]:
-            del self._index[key]
-            self._count(_DROPPED + BROKEN)
-        self._letters = {digest: None for digest in self._letters if ("letter", digest) in self._unwritten}
+        rescued = {(row[0], row[1]): row for row in found.windows if (row[0], row[1]) not in in_memory}
+        # Known by name: from memory where the file was open before, and from what is left of the file.
+        lost = (self._index.keys() | found.lost) - in_memory - rescued.keys()
+        number = max(len(lost), self._waiting - len(rescued) if not self._index else 0)
+        self._restore(found, rescued, in_memory)
+        self._count(_DROPPED + BROKEN, number)
         self._count(BROKEN)
         self._unwritten |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
         self._unwritten |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
+        self._waiting = 0
         try:
-            put_aside(self._path)
+            aside = put_aside(self._path)
         except OSError as error:
             self.trouble = str(error)
             return
+        self.salvages.append(Salvage(aside, len(rescued), number))
         self.flush()
+
+    def _restore(self, found: Salvaged, rescued: Mapping[Key, tuple[Any, ...]], in_memory: set[Key]) -> None:
+        """Take over what was read of a corrupt file; what is in memory is newer."""
+        unwritten: dict[tuple[Any, ...], Statement] = {
+            ("window", key): Statement(INSERT, row) for key, row in rescued.items()
+        }
+        letters = {digest: body for digest, body in found.letters if ("letter", digest) not in self._unwritten}
+        unwritten |= {("letter", digest): Statement(POST, (digest, body)) for digest, body in letters.items()}
+        self._index = {
+            **{key: Entry(len(row[4]), is_uninformative(row[2])) for key, row in rescued.items()},
+            **{key: entry for key, entry in self._index.items() if key in in_memory},
+        }
+        known = {digest for digest in self._letters if ("letter", digest) in self._unwritten}
+        self._letters = dict.fromkeys([*letters, *(digest for digest in self._letters if digest in known)])
+        self._unwritten = unwritten | self._unwritten
+        self._counts = Counter(found.counts) | self._counts
+        self._notes = found.notes | self._notes
+        self._kept.load(())
 
     def _read(self, text: str, values: tuple[Any, ...]) -> list[Any]:
         try:
@@ -328,22 +381,20 @@ class SqliteOutbox:
         if reason is not None:
             self._count(_DROPPED + reason)
 
-    def _count(self, what: str) -> None:
-        self._counts[what] += 1
+    def _keep(self, key: Key, entry: Entry) -> None:
+        """Keep an acknowledged window for a while; one that is not on the disk yet is forgotten."""
+        if ("window", key) in self._unwritten or not self._kept.limits.bytes:
+            self._forget(key)
+            return
+        del self._index[key]
+        now = time.time()
+        self._unwritten["acknowledged", key] = Statement(ACKNOWLEDGE, (*key, now))
+        for old in self._kept.add(key, entry.size, now):
+            self._unwritten["window", old] = Statement(DELETE, old)
+            self._unwritten["acknowledged", old] = Statement(ASKED_FOR, old)
+
+    def _count(self, what: str, number: int = 1) -> None:
+        if number < 1:
+            return
+        self._counts[what] += number
         self._unwritten["count", what] = Statement(COUNT, (what, self._counts[what]))
-
-
-def _is_uninformative(reason: str) -> bool:
-    return reason.partition(" ")[0].rstrip(",:;") in _UNINFORMATIVE
-
-
-def _excess(index: Mapping[Key, _Entry], windows: int, size: int) -> list[Key]:
-    """Choose keys to drop until at most `windows` windows and `size` bytes are left; `index` is in order of age."""
-    over, heavy = len(index) - windows, sum(entry.size for entry in index.values()) - size
-    dropped: list[Key] = []
-    for key, entry in sorted(index.items(), key=lambda item: not item[1].uninformative):  # stable: by age within each
-        if over <= 0 and heavy <= 0:
-            break
-        dropped.append(key)
-        over, heavy = over - 1, heavy - entry.size
-    return dropped

@@ -1,0 +1,96 @@
+"""Index of an outbox on disk: which windows are dropped first, and which stay after their acknowledgement.
+
+A twin restored from a backup asks for acknowledged windows again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from servotwin.link.outbox import Key
+
+
+class AcknowledgedLimits(NamedTuple):
+    """Limits of the acknowledged windows: bytes of all, and s since the acknowledgement; 0 bytes: none stay."""
+
+    bytes: int
+    seconds: float
+
+
+class _Kept(NamedTuple):
+    """An acknowledged window: its size in bytes, and when it was acknowledged, s since the epoch."""
+
+    size: int
+    at: float
+
+
+@dataclass(slots=True)
+class AcknowledgedWindows:
+    """Index of acknowledged windows, the oldest acknowledgement first.
+
+    Parameters
+    ----------
+    limits : AcknowledgedLimits
+    """
+
+    limits: AcknowledgedLimits
+    entries: dict[Key, _Kept] = field(default_factory=dict)
+    _bytes: int = 0
+
+    def load(self, stored: Iterable[tuple[Key, int, float]]) -> None:
+        """Load the index of a file: keys, sizes and times."""
+        rows = sorted(stored, key=lambda row: row[2])
+        self.entries = {key: _Kept(size, at) for key, size, at in rows}
+        self._bytes = sum(size for _, size, _ in rows)
+
+    def take(self, key: Key) -> int:
+        """Forget a window; return its size."""
+        size = self.entries.pop(key).size
+        self._bytes -= size
+        return size
+
+    def add(self, key: Key, size: int, now: float) -> list[Key]:
+        """Add a window; return those that are over the limits now, which are forgotten.
+
+        A clock that was set back leaves windows for longer, one that was set forward for less; the bytes bound both.
+        """
+        self.entries[key] = _Kept(size, now)
+        self._bytes += size
+        gone = list[Key]()
+        while self.entries:
+            oldest, entry = next(iter(self.entries.items()))
+            if self._bytes <= self.limits.bytes and now - entry.at <= self.limits.seconds:
+                break
+            self.take(oldest)
+            gone.append(oldest)
+        return gone
+
+
+_UNINFORMATIVE = ("periodic",)
+"""First words of the reasons of windows that are dropped first."""
+
+
+class Entry(NamedTuple):
+    """Entry of the index for a window: its size in bytes; True where its reason is one of `_UNINFORMATIVE`."""
+
+    size: int
+    uninformative: bool
+
+
+def is_uninformative(reason: str) -> bool:
+    """True where a window with this reason is dropped before others."""
+    return reason.partition(" ")[0].rstrip(",:;") in _UNINFORMATIVE
+
+
+def excess(index: Mapping[Key, Entry], windows: int, size: int) -> list[Key]:
+    """Choose keys to drop until at most `windows` windows and `size` bytes are left; `index` is in order of age."""
+    over, heavy = len(index) - windows, sum(entry.size for entry in index.values()) - size
+    dropped: list[Key] = []
+    for key, entry in sorted(index.items(), key=lambda item: not item[1].uninformative):  # stable: by age within each
+        if over <= 0 and heavy <= 0:
+            break
+        dropped.append(key)
+        over, heavy = over - 1, heavy - entry.size
+    return dropped

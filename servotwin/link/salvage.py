@@ -1,0 +1,161 @@
+"""Windows, letters and values that can still be read from a corrupt outbox, row by row around its damaged pages.
+
+SQLite finds a row by its place through the table's tree: a damaged page hides the rows on it and below it, and no
+others. The keys of all windows are in an index too, on other pages; so what is lost is known where that can be read.
+Only a copy is opened. Where the first page is damaged, that of an empty outbox replaces it there.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+import zlib
+from collections.abc import Iterator
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from servotwin.link.outbox import Key
+from servotwin.link.sqlite_file import BESIDE, connect
+from servotwin.messages import InvalidMessage, WindowMessage, decode
+from servotwin.messages.codec import DEFLATE, MAX_BYTES, decompress
+
+_MOST_PROBED = 20_000
+"""Places that are looked up one by one between two damaged pages: four times as many as an outbox usually holds."""
+_MOST_COPIED = 2_000_000_000
+_WINDOWS = "SELECT place, boot, sequence, reason, encoding, body FROM windows"
+_LETTERS = "SELECT place, digest, body FROM letters"
+
+
+class Salvage(NamedTuple):
+    """A corrupt file that was put aside.
+
+    Attributes
+    ----------
+    file : path
+        Its new name.
+    rescued, lost : int
+        Windows that were read from it, and those known to be lost.
+    """
+
+    file: Path
+    rescued: int
+    lost: int
+
+
+@dataclass(slots=True)
+class Salvaged:
+    """Rows that were read from a corrupt outbox.
+
+    Attributes
+    ----------
+    windows : list of (str, int, str, str, bytes)
+        Boot, sequence, reason, encoding and body of windows that decode, oldest first.
+    letters : list of (bytes, bytes)
+        Digests and bodies.
+    counts, notes : dict
+        As in the tables.
+    lost : set of Key
+        Windows that waited and cannot be read. More may be lost where the index is damaged too.
+    """
+
+    windows: list[tuple[str, int, str, str, bytes]] = field(default_factory=list)
+    letters: list[tuple[bytes, bytes]] = field(default_factory=list)
+    counts: dict[str, int] = field(default_factory=dict)
+    notes: dict[str, bytes] = field(default_factory=dict)
+    lost: set[Key] = field(default_factory=set)
+
+
+def salvage(path: Path) -> Salvaged:
+    """Read what can be read of a corrupt outbox; nothing where not even a copy can be made."""
+    found = Salvaged()
+    with suppress(OSError), tempfile.TemporaryDirectory(dir=path.parent, prefix=".salvage-") as folder:
+        if path.stat().st_size > _MOST_COPIED:
+            return found
+        copy = Path(folder) / "copy.sqlite"
+        for end in ("", *BESIDE[:1]):  # not the shared memory, which SQLite makes again from the log
+            source = path.with_name(path.name + end)
+            if source.exists():
+                shutil.copyfile(source, copy.with_name(copy.name + end))
+        _read_into(found, copy)
+        if not found.windows and not found.lost:
+            _replace_first_page(copy)
+            _read_into(found, copy)
+    return found
+
+
+def _read_into(found: Salvaged, copy: Path) -> None:
+    with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as connection:
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # raises where the first page is damaged
+        acknowledged = set(_rows(connection, "SELECT boot, sequence FROM acknowledged"))
+        for place, *row in _by_place(connection, _WINDOWS):
+            boot, sequence, _, encoding, body = row
+            if (boot, sequence) in acknowledged:
+                continue
+            if _is_window(place, boot, sequence, encoding, body):
+                found.windows.append((boot, sequence, row[2], encoding, body))
+            elif isinstance(boot, str) and isinstance(sequence, int):
+                found.lost.add((boot, sequence))
+        # By the order of the index, which holds all that is asked for: the table's pages are not read.
+        keys = set(_rows(connection, "SELECT boot, sequence FROM windows ORDER BY boot, sequence"))
+        found.lost |= keys - acknowledged
+        found.lost -= {(boot, sequence) for boot, sequence, *_ in found.windows}
+        letters = [(digest, body) for _, digest, body in _by_place(connection, _LETTERS)]
+        found.letters = [each for each in letters if all(isinstance(part, bytes) for part in each)]
+        found.counts = {what: n for what, n in _rows(connection, "SELECT what, number FROM counts") if _is(n, int)}
+        found.notes = {name: v for name, v in _rows(connection, "SELECT name, value FROM notes") if _is(v, bytes)}
+
+
+def _is(value: object, kind: type) -> bool:
+    return isinstance(value, kind)
+
+
+def _rows(connection: sqlite3.Connection, text: str) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of a query up to the first damaged page."""
+    with suppress(sqlite3.Error):
+        yield from connection.execute(text)
+
+
+def _by_place(connection: sqlite3.Connection, text: str) -> list[tuple[Any, ...]]:
+    """Read a table from both ends up to a damaged page, and what is between by places one by one."""
+    rows = {row[0]: row for row in _rows(connection, f"{text} ORDER BY place")}
+    first = max(rows, default=0)
+    later = {row[0]: row for row in _rows(connection, f"{text} WHERE place > {first} ORDER BY place DESC")}
+    last = min(later, default=_last_place(connection, text))
+    for place in range(first + 1, min(last, first + 1 + _MOST_PROBED)):
+        rows |= {row[0]: row for row in _rows(connection, f"{text} WHERE place = {place}")}
+    return [row for _, row in sorted((rows | later).items())]
+
+
+def _last_place(connection: sqlite3.Connection, text: str) -> int:
+    """Largest place that was ever given in the table of a query, and one more."""
+    table = text.rpartition(" ")[2]
+    [(place,), *_] = [*_rows(connection, f"SELECT seq FROM sqlite_sequence WHERE name = '{table}'"), (_MOST_PROBED,)]
+    return int(place) + 1
+
+
+def _is_window(place: object, boot: object, sequence: object, encoding: object, body: object) -> bool:
+    """True where a body is the window that its row says; its own checksum covers the samples."""
+    if not (isinstance(place, int) and isinstance(encoding, str) and isinstance(body, bytes)):
+        return False
+    try:
+        window = decode(decompress(body, encoding, MAX_BYTES) if encoding == DEFLATE else body)
+    except (InvalidMessage, zlib.error):
+        return False
+    return isinstance(window, WindowMessage) and (window.boot, window.sequence) == (boot, sequence)
+
+
+def _replace_first_page(copy: Path) -> None:
+    """Replace the first page, with header and schema, by that of an empty outbox, whose tables begin alike."""
+    empty = copy.with_name("empty.sqlite")
+    with closing(connect(empty)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    page = bytearray(empty.read_bytes()[:4096])
+    size = int.from_bytes(page[16:18], "big")
+    with copy.open("r+b") as file:
+        pages = file.seek(0, 2) // size
+        page[28:32] = pages.to_bytes(4, "big")  # number of pages
+        file.seek(0)
+        file.write(page[:size])

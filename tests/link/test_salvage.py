@@ -1,0 +1,129 @@
+"""An outbox that was corrupted between two runs: what can be read is sent, the rest is counted, the file stays."""
+
+import os
+import sqlite3
+from pathlib import Path
+
+import pytest
+from outbox_cases import filled, window
+
+from servotwin.link.outbox_index import AcknowledgedLimits
+from servotwin.link.sqlite_outbox import BROKEN, SqliteOutbox
+
+WINDOWS = 80
+
+
+def overwrite(path: Path, pages: list[int], size: int = 4096) -> None:
+    with path.open("r+b") as file:
+        for page in pages:
+            file.seek(size * (page - 1))
+            file.write(os.urandom(size))
+
+
+def leaves(path: Path) -> list[int]:
+    """Pages on which rows of the windows begin."""
+    data = path.read_bytes()
+    return [k + 1 for k in range(1, len(data) // 4096) if data[4096 * k] == 13]
+
+
+def reopened(path: Path, waiting: int = 0) -> SqliteOutbox:
+    box = SqliteOutbox(path, "axis-1", waiting=waiting)
+    assert box.flushed
+    return box
+
+
+@pytest.mark.parametrize("number", [1, 3])
+def test_damaged_pages_lose_their_own_windows_which_are_counted(tmp_path: Path, number: int) -> None:
+    path = filled(tmp_path, WINDOWS)
+    overwrite(path, leaves(path)[3 : 3 + number])
+    box = reopened(path)
+    [found] = box.salvages
+    assert found.rescued == len(box.pending()) >= WINDOWS - 8 * number
+    assert found.lost == WINDOWS - found.rescued > 0
+    assert box.dropped == {BROKEN: found.lost}
+    assert found.file.name == "outbox.sqlite.broken-1"
+    assert found.file.exists()
+    for key in box.pending():
+        assert box.get(key) == window(key[1])
+    assert box.pending() == sorted(box.pending(), key=lambda key: key[1])
+    box.close()
+    again = reopened(path)
+    assert (len(again.pending()), again.salvages, again.dropped) == (found.rescued, [], {BROKEN: found.lost})
+    again.close()
+
+
+def test_a_damaged_first_page_loses_no_window(tmp_path: Path) -> None:
+    path = filled(tmp_path, WINDOWS)
+    overwrite(path, [1])
+    box = reopened(path)
+    assert [sequence for _, sequence in box.pending()] == list(range(WINDOWS))
+    assert box.number("cursor") == 7
+    assert len(box.letters()) == 1
+    assert box.dropped == {}
+    box.close()
+
+
+def test_where_nothing_can_be_read_the_last_status_tells_how_many_windows_are_lost(tmp_path: Path) -> None:
+    path = filled(tmp_path, WINDOWS)
+    path.write_bytes(os.urandom(path.stat().st_size))
+    box = reopened(path, waiting=WINDOWS)
+    assert box.pending() == []
+    assert box.dropped == {BROKEN: WINDOWS}
+    box.close()
+
+
+def test_a_window_that_was_changed_on_the_disk_is_lost_and_not_sent(tmp_path: Path) -> None:
+    path = filled(tmp_path, 5)
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE windows SET body = zeroblob(200) WHERE sequence = 2")
+    connection.close()
+    overwrite(path, [1])
+    box = reopened(path)
+    assert [sequence for _, sequence in box.pending()] == [0, 1, 3, 4]
+    assert box.dropped == {BROKEN: 1}
+    box.close()
+
+
+def test_an_acknowledged_window_is_kept_and_sent_again_when_the_twin_asks(tmp_path: Path) -> None:
+    path = tmp_path / "outbox.sqlite"
+    size = 0
+    for run in range(2):
+        box = SqliteOutbox(path, "axis-1", kept=AcknowledgedLimits(10**6, 3600.0))
+        if run == 0:
+            for k in range(6):
+                box.put(window(k))
+            size = len(box.parcel(("b0", 0)).body)
+            for k in range(5):
+                assert box.remove(("b0", k))
+                assert not box.remove(("b0", k))
+            box.put(window(3))
+        assert box.pending() == [("b0", 5)]
+        if run == 1:
+            assert box.resend(lambda boot, sequence: boot == "b0" and 2 <= sequence <= 3) == 2
+            assert sorted(box.pending()) == [("b0", 2), ("b0", 3), ("b0", 5)]
+            assert box.get(("b0", 2)) == window(2)
+            box.remove(("b0", 2))
+            assert box.resend(lambda *_: True) == 4
+        box.close()
+    few = SqliteOutbox(path, "axis-1", kept=AcknowledgedLimits(int(2.5 * size), 3600.0))
+    for key in few.pending():
+        few.remove(key)
+    assert few.resend(lambda *_: True) == 2
+    few.close()
+
+
+def test_the_time_of_acknowledged_windows_is_bounded(tmp_path: Path) -> None:
+    box = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1", kept=AcknowledgedLimits(10**6, 0.0))
+    for k in range(3):
+        box.put(window(k))
+        box.remove(("b0", k))
+    assert box.resend(lambda *_: True) <= 1
+    box.close()
+
+
+def test_only_its_owner_may_open_an_outbox(tmp_path: Path) -> None:
+    path = filled(tmp_path, 1)
+    assert path.stat().st_mode & 0o777 == 0o600
+    path.chmod(0o644)
+    reopened(path).close()
+    assert path.stat().st_mode & 0o777 == 0o600
