@@ -84,6 +84,18 @@ class StoredFiles:
     boots: Annotated[str, key(help="Number of starts of this edge.")] = "boots"
     windows: Annotated[int, key(minimum=1, help="Largest number of windows in the outbox.")] = 5000
     bytes: Annotated[int, key("megabytes", minimum=MB, help="Largest size of the outbox.")] = 256 * MB
+    acknowledged_bytes: Annotated[
+        int,
+        key(
+            "acknowledged_megabytes",
+            minimum=0,
+            help="Largest size of the acknowledged windows that stay, for a twin that was restored from a backup and "
+            "asks for them; 0: none.",
+        ),
+    ] = 128 * MB
+    acknowledged_s: Annotated[
+        float, key(minimum=0.0, help="Time for which they stay; it should reach back to the twin's last backup.")
+    ] = 172_800.0
 
     def __post_init__(self) -> None:
         check(self)

@@ -2,7 +2,7 @@
 
 `python -m servotwin.edge_process.link_process edge.toml FD RUN`; it ends when the other end of the socket FD is closed.
 
-A frame of the control process is confirmed when its content is on the disk, or when nothing of it has to be stored.
+`frame_handler` takes the control process's frames.
 """
 
 from __future__ import annotations
@@ -18,133 +18,21 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from threading import Event, Thread
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgspec
-
-from servotwin.edge.outlet import FILTERED, WindowWriter
-from servotwin.edge.store import FileParameterStore
+from servotwin.edge.outlet import FILTERED
 from servotwin.edge_process import frames
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import load
-from servotwin.edge_process.frames import LetterFrame, ProcessedFrame, SaveFrame, StatusFrame, ToLink, WindowFrame
-from servotwin.edge_process.monitoring import TroubleLog, log, summarise, write_status
+from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
+from servotwin.edge_process.monitoring import TroubleLog, log, overwrite_status, read_status, summarise, write_status
 from servotwin.edge_process.transports import exclusive_transport, link_token
 from servotwin.errors import InvalidInput
-from servotwin.link.outbox import Key
+from servotwin.link.outbox_index import AcknowledgedLimits
 from servotwin.link.session import Receiver, Sender, Session
-from servotwin.link.sqlite_outbox import MOST_UNWRITTEN, SqliteOutbox
-from servotwin.messages import Acknowledge, InvalidMessage, LearntResponse, decode, encode
+from servotwin.link.sqlite_outbox import SqliteOutbox
+from servotwin.messages import Acknowledge, InvalidMessage, Resend, decode, encode
 from servotwin.runtime.frames import FrameSocket
-
-CURSOR = "cursor"
-"""Name under which the outbox keeps the serial of the twin's last message that was processed."""
-
-_LAST_CUT = "last cut"
-
-
-class _Unconfirmed(NamedTuple):
-    """A frame whose content is not on the disk yet: the key of its window (None: a letter), and its bytes."""
-
-    window: Key | None
-    size: int
-
-
-class FrameHandler:
-    """Handles frames of the control process; returns the serials that are confirmed.
-
-    Parameters
-    ----------
-    config : EdgeConfig
-    outbox : SqliteOutbox
-    """
-
-    def __init__(self, config: EdgeConfig, outbox: SqliteOutbox) -> None:
-        self._config, self._outbox = config, outbox
-        self._store = FileParameterStore(config.path(config.files.parameters))
-        self._unsaved: SaveFrame | None = None
-        self._writer: WindowWriter | None = None
-        self._boot = ""
-        self._unconfirmed: dict[int, _Unconfirmed] = {}
-        self.faults: Counter[str] = Counter()
-
-    def handle(self, frame: ToLink) -> list[int]:
-        """Handle one frame; return the serials confirmed by it."""
-        if isinstance(frame, WindowFrame):
-            with self._outbox.transaction():
-                self._write(frame)
-            size = sum(map(len, frame.signals.values()))
-            self._unconfirmed[frame.serial] = _Unconfirmed((frame.boot, frame.sequence), size)
-            return self._confirmed()
-        if isinstance(frame, LetterFrame):
-            self._outbox.put_letter(frame.body)
-            self._unconfirmed[frame.serial] = _Unconfirmed(None, len(frame.body))
-            return self._confirmed()
-        if isinstance(frame, frames.ResponseFrame):
-            with self._outbox.transaction():
-                self._adopt(frame)
-            self._unconfirmed[frame.serial] = _Unconfirmed(None, len(frame.body))
-            return self._confirmed()
-        if isinstance(frame, SaveFrame):
-            # Newer parameters replace unwritten ones, whose frame is confirmed because nobody needs it any more.
-            before, self._unsaved = self._unsaved, frame
-            return ([] if before is None else [before.serial]) + self._save()
-        if isinstance(frame, ProcessedFrame):
-            self._outbox.set_number(CURSOR, max(frame.serial, self._outbox.number(CURSOR)))
-        assert not isinstance(frame, StatusFrame)
-        return []
-
-    def retry(self) -> list[int]:
-        """Write again what could not be written; return the serials confirmed by it."""
-        self._outbox.flush()
-        return self._confirmed() + self._save()
-
-    def _confirmed(self) -> list[int]:
-        """Serials of frames that are on the disk, were dropped, or are beyond the limit of unwritten bytes."""
-        flushed, pending = self._outbox.flushed, set(self._outbox.pending())
-        over = sum(each.size for each in self._unconfirmed.values()) - MOST_UNWRITTEN
-        confirmed = []
-        for serial, each in self._unconfirmed.items():
-            if flushed or over > 0 or (each.window is not None and each.window not in pending):
-                confirmed.append(serial)
-                over -= each.size
-        for serial in confirmed:
-            del self._unconfirmed[serial]
-        return confirmed
-
-    def _write(self, frame: WindowFrame) -> None:
-        """Write a window once: a repeated one is recognised by its sequence in its boot."""
-        last = self._outbox.value(_LAST_CUT)
-        boot, sequence = ("", -1) if last is None else msgspec.msgpack.decode(last, type=tuple[str, int])
-        if boot == frame.boot and frame.sequence <= sequence:
-            return
-        # In the transaction of the window itself: after a crash both are on the disk, or neither.
-        self._outbox.set_value(_LAST_CUT, msgspec.msgpack.encode((frame.boot, frame.sequence)))
-        self._writer_of(frame.boot).write(frame.cut)
-
-    def _adopt(self, frame: frames.ResponseFrame) -> None:
-        """Have the window filter use a response; a repeated one is not newer, and changes nothing."""
-        response = decode(frame.body)
-        assert isinstance(response, LearntResponse)
-        self._writer_of(frame.boot).adopt(response)
-
-    def _writer_of(self, boot: str) -> WindowWriter:
-        if self._writer is None or boot != self._boot:
-            self._boot = boot
-            self._writer = WindowWriter(self._config.settings(boot), self._outbox, self.faults)
-        return self._writer
-
-    def _save(self) -> list[int]:
-        if self._unsaved is None:
-            return []
-        try:
-            self._store.save(self._unsaved.parameters.parameters())
-        except OSError:
-            self.faults["parameters not written"] += 1
-            return []
-        serial, self._unsaved = self._unsaved.serial, None
-        return [serial]
-
 
 _NICE = 10
 STATUS_PERIOD_S = 1.0
@@ -166,8 +54,7 @@ class LinkProcess:
 
     def __init__(self, config: EdgeConfig, end: socket.socket, run: str) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
-        files = config.files
-        self.outbox = SqliteOutbox(config.path(files.outbox), config.agent.servo, files.windows, files.bytes)
+        self.outbox = _outbox(config)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
         self._token, self._token_replaced = link_token(config), False
@@ -187,7 +74,7 @@ class LinkProcess:
         self._pending = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
         self._troubles, self._dropped = TroubleLog(), dict[str, int]()
-        self._conflict = False
+        self._conflict, self._status_trouble = False, ""
 
     def run(self) -> None:
         """Run until the control process is gone."""
@@ -249,10 +136,19 @@ class LinkProcess:
         self._log_troubles()
         self._report_conflict()
         self._check_token()
+        self._write_status()
+
+    def _write_status(self) -> None:
+        """Write the status; on a full disk into the old file's place, so that it does not go on saying "safe"."""
+        path = self._config.path(self._config.files.status)
         try:
-            write_status(self._config.path(self._config.files.status), self._status())
-        except OSError:
+            write_status(path, self._status())
+            self._status_trouble = ""
+        except OSError as error:
             self._faults["status not written"] += 1
+            self._status_trouble = str(error)
+            with suppress(OSError):
+                overwrite_status(path, self._status())
 
     def _check_token(self) -> None:
         """End where the token was replaced: the next link process reads the new one."""
@@ -267,7 +163,10 @@ class LinkProcess:
         """Log new troubles, and those that are over."""
         if self._stopping.is_set():
             return
-        self._troubles.update("disk", "" if self.outbox.flushed else self.outbox.trouble)
+        self._troubles.update("disk", self._disk_trouble)
+        while self.outbox.salvages:
+            found = self.outbox.salvages.pop(0)
+            log("outbox broken", file=found.file.name, rescued=found.rescued, lost=found.lost)
         if self._receiver is not None:
             self._troubles.update("to the twin", self._session.trouble)
             self._troubles.update("from the twin", self._receiver.trouble)
@@ -310,8 +209,16 @@ class LinkProcess:
         while not self._stopping.is_set():
             received = self._receiver.step()
             for serial, body in received.messages:
+                self._resend(body)
                 self._emit(frames.encode(frames.MessageFrame(serial, body)))
             self._stopping.wait(received.wait_s if received.messages else max(received.wait_s, _SHORTEST_POLL_S))
+
+    def _resend(self, body: bytes) -> None:
+        """Send acknowledged windows again where the twin asks for them; the agent ignores that message."""
+        message = decode(body)
+        if isinstance(message, Resend) and message.servo == self._config.agent.servo:
+            log("windows asked for again", number=self.outbox.resend(message.asks_for), why=message.reason)
+            self._outbox_changed.set()
 
     def _emit(self, frame: bytes) -> None:
         """Have the main thread send a frame; called from another."""
@@ -334,6 +241,11 @@ class LinkProcess:
             end.close()
         self._pipe.close()
 
+    @property
+    def _disk_trouble(self) -> str:
+        """Reason for which something is not on the disk; empty: all is."""
+        return self._status_trouble if self.outbox.flushed else self.outbox.trouble or "not written yet"
+
     def _status(self) -> dict[str, Any]:
         control, box = self._control, self.outbox
         status: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
@@ -347,8 +259,8 @@ class LinkProcess:
             "dropped": {**(control.dropped if control is not None else {}), **box.dropped},
         }
         status["disk"] = {
-            "safe": box.flushed,
-            "trouble": box.trouble,
+            "safe": not self._disk_trouble,
+            "trouble": self._disk_trouble,
             "faults": dict(box.faults + self._faults + self._handler.faults),
         }
         if self._receiver is not None:
@@ -356,6 +268,16 @@ class LinkProcess:
             status["conflict"] = self._conflict
             status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
+
+
+def _outbox(config: EdgeConfig) -> SqliteOutbox:
+    """Open the outbox; the last status tells how many windows waited in it."""
+    files = config.files
+    last = read_status(config.path(files.status)) or {}
+    waiting = last.get("windows", {}).get("waiting", 0) if isinstance(last.get("windows"), dict) else 0
+    kept = AcknowledgedLimits(files.acknowledged_bytes, files.acknowledged_s)
+    path = config.path(files.outbox)
+    return SqliteOutbox(path, config.agent.servo, files.windows, files.bytes, kept, int(waiting))
 
 
 def main(arguments: list[str]) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import select
 import sys
@@ -62,7 +63,25 @@ def _is_writable(stream: TextIO) -> bool:
 def write_status(path: Path, status: Mapping[str, Any]) -> None:
     """Replace the status file; raises OSError."""
     # Not durable: a status is outdated in a second, and a flush to a slow disk may take as long.
-    replace_file(path, msgspec.json.format(msgspec.json.encode({"schema": _STATUS_SCHEMA, **status})) + b"\n")
+    text = msgspec.json.format(msgspec.json.encode({"schema": _STATUS_SCHEMA, **status}))
+    replace_file(path, text + b"\n", mode=0o600)
+
+
+def overwrite_status(path: Path, status: Mapping[str, Any]) -> None:
+    """Write the status over the present file, without a byte of new space; raises OSError.
+
+    A reader may meanwhile find half of it, which `read_status` takes for none.
+    """
+    data = msgspec.json.encode({"schema": _STATUS_SCHEMA, **status})
+    with path.open("r+b", buffering=0) as file:
+        room = file.seek(0, os.SEEK_END)
+        if len(data) > room:
+            few = {name: status[name] for name in ("servo", "disk", "written") if name in status}
+            data = msgspec.json.encode({"schema": _STATUS_SCHEMA, **few})
+        if len(data) > room:
+            raise OSError(errno.ENOSPC, "the status is longer than its file")
+        file.seek(0)
+        file.write(data.ljust(room))
 
 
 def read_status(path: str | os.PathLike[str]) -> dict[str, Any] | None:

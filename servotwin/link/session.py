@@ -14,9 +14,21 @@ from typing import NamedTuple
 from servotwin.link.outbox import Key, Outbox
 from servotwin.link.seal import TO_EDGE, Sealed, key_of, opened, verifier_of
 from servotwin.link.transport import Refused, Transport, Unreachable
-from servotwin.messages import MAX_BYTES, Acknowledge, InvalidMessage, Refusal, Request, Update, decode
+from servotwin.messages import (
+    MAX_BYTES,
+    Acknowledge,
+    InvalidMessage,
+    LearntResponse,
+    Refusal,
+    Request,
+    Resend,
+    Update,
+    decode,
+)
 from servotwin.runtime.retry import Backoff, Retry
 
+_TO_EDGES = Update | Request | Acknowledge | LearntResponse | Resend
+"""Messages that a twin sends to an edge."""
 Item = Key | bytes
 """A window's key, or a letter's digest."""
 
@@ -259,7 +271,7 @@ class Receiver:
 
     def _decoded(self, sealed: Sealed) -> tuple[int, bytes] | None:
         try:
-            known = isinstance(decode(sealed.body), Update | Request | Acknowledge)
+            known = isinstance(decode(sealed.body), _TO_EDGES)
         except InvalidMessage:
             known = False
         self.counts["received" if known else "not understood"] += 1

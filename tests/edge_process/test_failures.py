@@ -20,7 +20,7 @@ from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process import frames, link_process, monitoring
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
-from servotwin.edge_process.link_process import FrameHandler
+from servotwin.edge_process.frame_handler import FrameHandler
 from servotwin.edge_process.monitoring import TickHistogram
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.run import StopSignal, run_role

@@ -14,8 +14,15 @@ from hypothesis import strategies as st
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import FileParameterStore, StoredParameters
 from servotwin.edge_process import frames
-from servotwin.edge_process.link_process import FrameHandler
-from servotwin.edge_process.monitoring import TickHistogram, TroubleLog, summarise
+from servotwin.edge_process.frame_handler import FrameHandler
+from servotwin.edge_process.monitoring import (
+    TickHistogram,
+    TroubleLog,
+    overwrite_status,
+    read_status,
+    summarise,
+    write_status,
+)
 from servotwin.edge_process.startup import next_boot, stored_parameters
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Setting
@@ -102,3 +109,21 @@ def test_a_trouble_is_logged_when_it_begins_changes_and_ends(capfd: pytest.Captu
     assert [(line["event"], line["where"], line.get("why")) for line in lines] == [
         ("trouble", "to the twin", "refused"), ("trouble", "to the twin", "away"), ("trouble over", "to the twin", None)
     ]  # fmt: skip
+
+
+def test_a_status_that_cannot_be_replaced_is_written_over_the_old_one(tmp_path: Path) -> None:
+    """As on a full disk, where a new file finds no room: the old one must not go on saying that all is safe."""
+    file = tmp_path / "status.json"
+    write_status(file, {"servo": "axis-1", "disk": {"safe": True}, "written": 1.0, "more": "x" * 300})
+    assert file.stat().st_mode & 0o777 == 0o600
+    size = file.stat().st_size
+    for length in (10, 10_000):  # the second is longer than the file: only what matters is written
+        status = {"servo": "axis-1", "disk": {"safe": False}, "written": 2.0, "more": "x" * length}
+        overwrite_status(file, status)
+        found = read_status(file)
+        assert found is not None
+        assert (found["disk"], found["written"]) == ({"safe": False}, 2.0)
+        assert file.stat().st_size == size
+    file.write_text("{}")
+    with pytest.raises(OSError, match="longer than its file"):
+        overwrite_status(file, {"servo": "axis-1"})

@@ -25,7 +25,7 @@ from servotwin.edge.outlet import FILTERED
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process import frames
-from servotwin.edge_process.link_process import FrameHandler
+from servotwin.edge_process.frame_handler import FrameHandler
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.learning.machine import LearningSettings

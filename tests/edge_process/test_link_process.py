@@ -1,4 +1,4 @@
-"""Another edge of the same servo: the link process sends nothing more, says so, and the edge falls back."""
+"""Link process: another edge of its servo, a corrupt outbox, a full disk, a twin that asks for windows again."""
 
 import socket
 import time
@@ -18,9 +18,9 @@ from servotwin.edge.settings import Supervision
 from servotwin.edge_process import frames
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.link_process import LinkProcess
-from servotwin.edge_process.monitoring import read_status
+from servotwin.edge_process.monitoring import read_status, write_status
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.messages import Cause, Fallback, Setting, Standing
+from servotwin.messages import Cause, Fallback, Resend, Setting, Standing
 from servotwin.runtime.frames import FrameSocket
 
 PATIENCE = 60.0
@@ -118,3 +118,39 @@ def test_an_agent_that_was_superseded_falls_back_once_and_says_why() -> None:
     assert (sent.message.cause, sent.message.replaced) == (Cause.CONFLICT, 3)
     assert agent.parameters.fallback
     assert agent.superseded() == []
+
+
+def test_a_twin_gets_windows_again_a_full_disk_is_said_and_a_corrupt_outbox_is_logged(
+    tmp_path: Path, twin: FakeTwin, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A link process with a corrupt outbox; then a twin that lost its windows; then a disk without room."""
+    (tmp_path / "edge.toml").write_text(EDGE.format(url=twin.url))
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    (tmp_path / "outbox.sqlite").write_bytes(b"rubbish" * 1000)
+    write_status(tmp_path / "status.json", {"windows": {"waiting": 80}, "room": " " * 2000})
+    ours, theirs = socket.socketpair()
+    pipe = FrameSocket(ours)
+    running = Thread(target=LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa").run)
+    running.start()
+    try:
+        for k in range(3):
+            send(pipe, k)
+        until(lambda: len(twin.windows) == 3)
+        acknowledged = {"waiting": 0, "letters_waiting": 0, "dropped": {"outbox broken": 80}}
+        until(lambda: (read_status(tmp_path / "status.json") or {}).get("windows") == acknowledged)
+        twin.windows.clear()
+        twin.say(Resend("ax-1", "b1-aa", 1, reason="restored"))
+        until(lambda: sorted(twin.windows) == [("b1-aa", 1), ("b1-aa", 2)])
+        (tmp_path / "status.json.new").mkdir()
+        until(lambda: (read_status(tmp_path / "status.json") or {}).get("disk", {}).get("safe") is False)
+        (tmp_path / "status.json.new").rmdir()
+        until(lambda: (read_status(tmp_path / "status.json") or {}).get("disk", {}).get("safe") is True)
+    finally:
+        pipe.close()
+        running.join(PATIENCE)
+    status = read_status(tmp_path / "status.json") or {}
+    assert status["windows"]["dropped"] == {"outbox broken": 80}
+    log = capfd.readouterr().err
+    assert '"event":"outbox broken","file":"outbox.sqlite.broken-1","rescued":0,"lost":80' in log
+    assert '"event":"windows asked for again","number":2,"why":"restored"' in log
