@@ -18,7 +18,7 @@ from msgspec.structs import replace
 from servotwin.config.keys import check, key, settings
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains, Reason, Receipt, Update
+from servotwin.messages import KNOWN_FIELDS, Gains, Reason, Receipt, Update
 
 _SCALED = ("Kp", "Ki", "Kd", "Tf")
 
@@ -234,6 +234,7 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
         (update.servo == here.servo, Reason.WRONG_SERVO),
         (update.window[0] == here.boot, Reason.OTHER_BOOT),
         (update.version > current.version, Reason.OLD_VERSION),
+        (KNOWN_FIELDS.issuperset(update.needs), Reason.NOT_KNOWN),
         (update.data_time > current.data_time, Reason.OLD_DATA),
         (update.base_version == current.version, Reason.BASE_MISMATCH),
         (update.data_time <= here.time, Reason.FUTURE_DATA),

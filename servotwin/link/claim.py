@@ -112,6 +112,9 @@ class ExclusiveTransport:
             self._transport.deliver(parcel)
         except (Refused, Unreachable) as error:
             self._failed(error)
+            if isinstance(error, Refused) and error.reason is Refusal.NOT_UNDERSTOOD and self._twin_is_older:
+                # To that twin a field or a reason that came later is an error. It will know it once it is upgraded.
+                raise Refused(Refusal.UNKNOWN_SCHEMA, str(error), error.after_s) from None
             raise
 
     def listen(self, after: int) -> list[bytes]:
@@ -126,6 +129,10 @@ class ExclusiveTransport:
     def close(self) -> None:
         """Close the connections at once."""
         self._transport.close()
+
+    @property
+    def _twin_is_older(self) -> bool:
+        return self.twin is None or self.twin.protocol < PROTOCOL
 
     def _failed(self, error: Refused | Unreachable) -> None:
         """Ask again: the claim may not count any more, or the twin may be of another version when it is back."""

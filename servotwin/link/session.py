@@ -27,6 +27,8 @@ from servotwin.messages import (
 )
 from servotwin.runtime.retry import Backoff, Retry
 
+_OLDER_TWIN_S = 600.0
+"""s between two tries of a message that the twin's version does not know."""
 _TO_EDGES = Update | Request | Acknowledge | LearntResponse | Resend
 """Messages that a twin sends to an edge."""
 Item = Key | bytes
@@ -112,6 +114,8 @@ class Session:
                 self.outbox.drop(item, reason.value)
         elif reason is Refusal.FUTURE:  # concerns this message only: the others go on
             self.retry_later(item, now, after_s)
+        elif reason is Refusal.UNKNOWN_SCHEMA:  # so does this; it lasts until the twin is upgraded
+            self.retry_later(item, now, max(after_s, _OLDER_TWIN_S))
         else:
             self._pause(now, "refused", detail, after_s)
 

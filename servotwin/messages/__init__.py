@@ -12,7 +12,16 @@ from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decod
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
 from servotwin.messages.setting import Band, Gains, Setting
-from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
+from servotwin.messages.updates import (
+    KNOWN_FIELDS,
+    Cause,
+    Fallback,
+    Reason,
+    Receipt,
+    Update,
+    Verification,
+    needed_fields,
+)
 from servotwin.messages.windows import (
     FINE,
     Acknowledge,
@@ -28,6 +37,7 @@ from servotwin.messages.windows import (
 
 __all__ = [
     "FINE",
+    "KNOWN_FIELDS",
     "MAX_BYTES",
     "NAME_PATTERN",
     "PROTOCOL",
@@ -65,6 +75,7 @@ __all__ = [
     "encode",
     "encode_json",
     "finite",
+    "needed_fields",
     "pack_channel",
     "pack_finely",
     "unpack_channel",

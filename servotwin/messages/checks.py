@@ -38,6 +38,7 @@ class Refusal(StrEnum):
             Refusal.TOO_MANY,
             Refusal.UNAVAILABLE,
             Refusal.SUPERSEDED,
+            Refusal.UNKNOWN_SCHEMA,
             Refusal.UNKNOWN_SERVO,
         )
 

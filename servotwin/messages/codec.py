@@ -13,7 +13,7 @@ from servotwin.messages.claims import EdgeClaim, Standing
 from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.requests import Answer, Request, Resend
 from servotwin.messages.responses import LearntResponse
-from servotwin.messages.updates import Fallback, Receipt, Update
+from servotwin.messages.updates import Fallback, Receipt, Update, UpdateWithNeeds
 from servotwin.messages.windows import Acknowledge, Hello, LetterAcknowledge, WindowMessage, checksum
 
 MAX_BYTES = 4 * 1024 * 1024
@@ -27,6 +27,7 @@ _ZSTD_WINDOW = 8 * 1024 * 1024
 
 ParameterMessage = (
     Update
+    | UpdateWithNeeds
     | Receipt
     | Fallback
     | Request
@@ -59,7 +60,7 @@ _json_decoder: msgspec.json.Decoder[ParameterMessage] = msgspec.json.Decoder(Par
 
 def encode(message: Message) -> bytes:
     """Encode a message as it is sent (MessagePack)."""
-    return _encoder.encode(message)
+    return _encoder.encode(_as_sent(message))
 
 
 def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
@@ -70,7 +71,7 @@ def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
     InvalidMessage
         Too large (seen before anything is parsed), not MessagePack, unknown tag, bad field, wrong checksum.
     """
-    message = _guarded(_decoder, data, limit)
+    message = _as_read(_guarded(_decoder, data, limit))
     if isinstance(message, WindowMessage):
         whole = message.crc == checksum(message.channels)
         require(whole, "window checksum does not match its channels", Refusal.BAD_CHECKSUM)
@@ -79,12 +80,27 @@ def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
 
 def encode_json(message: ParameterMessage) -> bytes:
     """Encode a parameter message as JSON."""
-    return _json_encoder.encode(message)
+    return _json_encoder.encode(_as_sent(message))
 
 
 def decode_json(data: bytes, limit: int = MAX_BYTES) -> ParameterMessage:
     """Decode a parameter message from JSON; raises InvalidMessage as `decode` does."""
-    return _guarded(_json_decoder, data, limit)
+    message = _as_read(_guarded(_json_decoder, data, limit))
+    assert not isinstance(message, WindowMessage)
+    return message
+
+
+def _as_sent(message: Message) -> Message:
+    """Give an update that has needs the tag that edges which do not read them take for unknown."""
+    if type(message) is Update and message.needs:
+        return UpdateWithNeeds(**{name: getattr(message, name) for name in message.__struct_fields__})
+    return message
+
+
+def _as_read(message: Message) -> Message:
+    if isinstance(message, UpdateWithNeeds):
+        return Update(**{name: getattr(message, name) for name in message.__struct_fields__})
+    return message
 
 
 def _guarded(

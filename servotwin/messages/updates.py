@@ -7,7 +7,7 @@ from typing import Annotated
 from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text, all_finite, require
-from servotwin.messages.setting import Setting
+from servotwin.messages.setting import Gains, Setting
 
 
 class Reason(StrEnum):
@@ -29,6 +29,7 @@ class Reason(StrEnum):
     NO_GAINS = "this edge changes no gains"
     SUPERSEDED = "a newer update came before it could be applied"
     AFTER_FALLBACK = "too soon after a fallback"
+    NOT_KNOWN = "needs what this edge does not know"
 
 
 class Cause(StrEnum):
@@ -106,6 +107,9 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
         Sample time of the edge, s, from which on the update must not be applied.
     verification : Verification, optional
         Result of simulating the setting; None: it was not verified.
+    needs : tuple of str
+        Fields of the gains that an edge has to know to apply them: `needed_fields` of the setting. An update with some
+        travels as update/3, which edges that do not read this list take for a message that they do not know.
     """
 
     servo: Name
@@ -120,6 +124,7 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
     setting: Setting
     not_after: float
     verification: Verification | None = None
+    needs: Annotated[tuple[Annotated[str, Meta(max_length=64)], ...], Meta(max_length=64)] = ()
 
     def __post_init__(self) -> None:
         require(isfinite(self.data_time), f"update data_time {self.data_time} s is not finite")
@@ -128,6 +133,27 @@ class Update(Struct, frozen=True, omit_defaults=True, tag="update/2"):
         require(self.setting.has_valid_tolerance(), f"update tolerance {tolerance} m is not allowed")
         known = (x for x in (self.gap, self.std, *self.interval) if x is not None)
         require(all_finite(known), "update gap, std and interval must be finite, or None where unknown or unbounded")
+
+
+class UpdateWithNeeds(Update, frozen=True, omit_defaults=True, tag="update/3"):
+    """An update whose `needs` are not empty, as it travels; `servotwin.messages.codec` alone makes and reads it."""
+
+
+_EVERY_VERSION = frozenset(("Kp", "Ki", "Kd", "Tf", "enter", "leave", "feedforward"))
+"""Fields of the gains that edges of every version know."""
+KNOWN_FIELDS = frozenset(Gains.__struct_fields__)
+"""Fields of the gains that this version knows."""
+
+
+def needed_fields(setting: Setting) -> tuple[str, ...]:
+    """Fields without which the gains of a setting would be others: all that not every version knows, and that count."""
+    gains = setting.gains
+    if not isinstance(gains, Gains):  # None, or gains of a law with a tag of its own, which no other version mistakes
+        return ()
+    first = len(gains.__struct_fields__) - len(gains.__struct_defaults__)
+    defaults = dict(zip(gains.__struct_fields__[first:], gains.__struct_defaults__, strict=True))
+    later = (name for name in gains.__struct_fields__ if name not in _EVERY_VERSION)
+    return tuple(name for name in later if getattr(gains, name) != defaults.get(name))
 
 
 class Receipt(Struct, frozen=True, tag="receipt/1"):

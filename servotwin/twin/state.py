@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.learning.wear import Wear
-from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite
+from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite, needed_fields
 from servotwin.messages.legacy import upgrade
 from servotwin.redesign.certified.certificate import verification_of
 from servotwin.redesign.policy import Evidence, Redesign
@@ -172,6 +172,7 @@ def draft_update(message: WindowMessage, evidence: Evidence, redesign: Redesign,
         setting=redesign.setting,
         not_after=message.start + validity,
         verification=None if redesign.certificate is None else verification_of(redesign.certificate),
+        needs=needed_fields(redesign.setting),
     )
 
 

@@ -3,6 +3,8 @@
 import pytest
 
 from servotwin.link.claim import ExclusiveTransport, Held, held_of
+from servotwin.link.outbox import MemoryOutbox
+from servotwin.link.session import Sender, Session
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
 
@@ -22,7 +24,7 @@ class Twin:
         if not self.has_claims:
             return None
         if claim.takes == self.newest.number + 1:
-            self.newest = Standing("axis", claim.run, claim.takes)
+            self.newest = Standing("axis", claim.run, claim.takes, self.newest.protocol)
         return self.newest
 
     def admit(self, held: Held) -> None:
@@ -39,12 +41,15 @@ class Line:
 
     def __init__(self, twin: Twin) -> None:
         self.twin, self.claim, self.sent = twin, Held(), 0
+        self.refusal: Refused | None = None
 
     def ask(self, claim: EdgeClaim) -> Standing | None:
         return self.twin.ask(claim)
 
     def deliver(self, _parcel: Parcel) -> None:
         self.twin.admit(self.claim)
+        if self.refusal is not None:
+            raise self.refusal
         self.sent += 1
 
     def listen(self, _after: int) -> list[bytes]:
@@ -154,6 +159,26 @@ def test_a_twin_without_claims_gets_messages_and_is_asked_again_after_it_was_awa
     twin.there = twin.has_claims = True
     one.deliver(PARCEL)
     assert stored == [Held("b1-aa", 1)]
+
+
+@pytest.mark.parametrize(("protocol", "kept"), [(None, True), (1, True), (PROTOCOL, False)])
+def test_what_an_older_twin_does_not_understand_is_kept(protocol: int | None, kept: bool) -> None:
+    twin = Twin()
+    twin.has_claims = protocol is not None
+    twin.newest = Standing("axis", protocol=protocol or 1)
+    outbox = MemoryOutbox()
+    outbox.put_letter(b"letter")
+    session = Session(outbox)
+    one, _ = edge(twin, "b1-aa")
+    one._transport.refusal = Refused(Refusal.NOT_UNDERSTOOD, "Invalid enum value")
+    sender = Sender(session, one)
+    sender.step(0.0)
+    assert bool(outbox.letters()) is kept
+    assert not list(session.due(599.0))
+    one._transport.refusal = None
+    sender.step(601.0)
+    assert outbox.letters() == []
+    assert one._transport.sent == (1 if kept else 0)
 
 
 @pytest.mark.parametrize("text", ["", "7", "x b1", "-1 b1", "1 ", "99999999999999999999 b1"])

@@ -303,7 +303,7 @@ def test_gains_and_bands_are_in_range_or_refused(part: str, changes: dict[str, f
 
 def test_an_update_without_gains_band_and_verification_does_not_mention_them() -> None:
     raw = msgspec.msgpack.decode(encode(UPDATE))
-    assert set(raw) == {"type", *UPDATE.__struct_fields__} - {"verification"}
+    assert set(raw) == {"type", *UPDATE.__struct_fields__} - {"verification", "needs"}
     assert raw["setting"] == {"tolerance": 1e-4}
 
 

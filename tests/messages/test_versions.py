@@ -1,0 +1,72 @@
+"""Versions speak to each other: an update names what it needs, and no edge applies a part of one that it half knows."""
+
+import msgspec
+import pytest
+
+from servotwin.edge.guard import Instant, Limits, judge
+from servotwin.edge.parameters import Parameters
+from servotwin.messages import (
+    KNOWN_FIELDS,
+    Gains,
+    Hello,
+    InvalidMessage,
+    Reason,
+    Refusal,
+    Setting,
+    Update,
+    decode,
+    decode_json,
+    encode,
+    encode_json,
+    needed_fields,
+)
+
+GAINS = Gains(200.0, 0.0, -10.0, 0.1)
+HERE = Instant("axis", "b1", 100, 10.0)
+
+
+def update(gains: Gains | None = GAINS, **changes: object) -> Update:
+    setting = Setting(1e-5, gains)
+    made = Update("axis", 1, 0, ("b1", 0), 1.0, 0.1, 0.01, (0.08, 0.12), "ok", setting, 20.0)
+    return msgspec.structs.replace(made, **{"needs": needed_fields(setting), **changes})
+
+
+NOTCH = msgspec.structs.replace(GAINS, notch_hz=80.0, friction_feedforward=0.1)
+
+
+def test_an_update_names_the_fields_that_not_every_edge_knows() -> None:
+    assert update().needs == update(None).needs == ()
+    assert update(NOTCH).needs == ("friction_feedforward", "notch_hz")
+
+
+@pytest.mark.parametrize(("sent", "tag"), [(update(), "update/2"), (update(NOTCH), "update/3")])
+def test_an_edge_that_reads_no_needs_does_not_know_an_update_that_has_some(sent: Update, tag: str) -> None:
+    assert msgspec.msgpack.decode(encode(sent))["type"] == msgspec.json.decode(encode_json(sent))["type"] == tag
+    assert decode(encode(sent)) == decode_json(encode_json(sent)) == sent
+    assert type(decode(encode(sent))) is Update
+
+
+def test_an_edge_refuses_an_update_that_needs_what_it_does_not_know() -> None:
+    limits = Limits(notch_max_hz=200.0)
+    known = judge(update(NOTCH), Parameters(), limits, HERE, GAINS)
+    assert known is Reason.APPLIED
+    later = update(NOTCH, needs=("notch_hz", "second_notch_hz"))
+    # As it arrives from a newer twin: with a field of the gains that this version drops when it reads it.
+    document = msgspec.msgpack.decode(encode(later))
+    document["setting"]["gains"]["second_notch_hz"] = 120.0
+    read = decode(msgspec.msgpack.encode(document))
+    assert isinstance(read, Update)
+    assert judge(read, Parameters(), limits, HERE, GAINS) is Reason.NOT_KNOWN
+    assert set(KNOWN_FIELDS) >= set(update(NOTCH).needs)
+
+
+def test_a_hello_without_a_protocol_is_of_version_1_and_one_with_more_fields_is_read() -> None:
+    hello = Hello("axis", "b1", 0.0, 10.0, 0, Setting(0.0), "model", 2)
+    document = msgspec.msgpack.decode(encode(hello))
+    assert document.pop("protocol") == 2
+    read = decode(msgspec.msgpack.encode({**document, "colour": "red"}))
+    assert isinstance(read, Hello)
+    assert read.protocol == 1
+    with pytest.raises(InvalidMessage) as error:
+        decode(msgspec.msgpack.encode({"type": "hello/9"}))
+    assert error.value.refusal is Refusal.UNKNOWN_SCHEMA
