@@ -18,7 +18,7 @@ from servotwin.edge.outlet import CHANNELS, NOT_ADOPTED, UNFILTERED
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge_process import frames, link_process, monitoring
+from servotwin.edge_process import frames, monitoring
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.frame_handler import FrameHandler
 from servotwin.edge_process.monitoring import TickHistogram
@@ -87,7 +87,7 @@ def test_a_window_that_the_twin_has_is_confirmed_without_the_disk(handler: Frame
 
 
 def test_unwritten_frames_are_bounded(handler: FrameHandler, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_process, "MOST_UNWRITTEN", 3 * 64)
+    monkeypatch.setattr(frame_handler, "MOST_UNWRITTEN", 3 * 64)
     assert [handler.handle(cut(k)) for k in range(5)] == [[], [], [], [10], [11]]
 
 
