@@ -93,14 +93,14 @@ class Cascade:
     leave: Annotated[
         float, key("leave_tolerances", minimum=0.0, help="Error above which it is left; at least enter_tolerances.")
     ] = 1.0
-    opens: Annotated[
+    integral_only: Annotated[
         bool,
         key(
-            help="Inside the dead zone the command is zero and the integral stops; otherwise the integral stops and "
-            "nothing else."
+            help="Inside the dead zone only the integral stops; otherwise the command is zero there too, and the loop "
+            "opens."
         ),
-    ] = False
-    limit: Annotated[
+    ] = True
+    voltage_limit: Annotated[
         float | None, key("voltage_limit_v", above=0.0, help="Largest command, either sign; no limit where absent.")
     ] = None
     rate_limit: Annotated[
@@ -180,8 +180,8 @@ class Cascade:
             enter=self.enter,
             leave=self.leave,
             holds=("integral",) if "integral" in names else (),
-            opens=self.opens,
-            limit=self.limit,
+            integral_only=self.integral_only,
+            voltage_limit=self.voltage_limit,
             rate_limit=self.rate_limit,
             windup=tuple(back if name == "integral" else 0.0 for name in names),
             feedforward=self.feedforward,

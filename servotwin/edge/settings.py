@@ -6,14 +6,14 @@ from math import inf, isfinite
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
-from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge.window_filter import WindowFilterSettings
 from servotwin.errors import InvalidInput
-from servotwin.messages import NAME_PATTERN, Gains
+from servotwin.messages import NAME_PATTERN, AnyGains
 from servotwin.runtime.retry import Retry
 
 
@@ -61,10 +61,10 @@ class AgentSettings:
         Name of the boot; a new one for each start of the edge.
     parameters : Parameters
         In force at the start.
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         As configured: what updates start from, and the limits and filters that they do not change. None: updates set
         the tolerance only.
-    own : Gains, optional
+    own : gains, optional
         The servo's own gains, in the middle of the box that updates must stay in; None: the controller's.
     supervision : Supervision
     window_filter : WindowFilterSettings, optional
@@ -100,8 +100,8 @@ class AgentSettings:
         ),
     ] = 0.0
     model_version: Annotated[str, key(help="Version of the servo's model, as `Servo.version`.")] = ""
-    controller: Controller | None = None
-    own: Gains | None = None
+    controller: AnyController | None = None
+    own: AnyGains | None = None
     supervision: Supervision = field(default_factory=Supervision)
     longest_window_s: Annotated[
         float | None,

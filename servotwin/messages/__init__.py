@@ -10,7 +10,7 @@ from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, fin
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
-from servotwin.messages.setting import Band, Gains, Setting
+from servotwin.messages.setting import AnyGains, Band, CascadeGains, Gains, LinearGains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
 from servotwin.messages.windows import (
     FINE,
@@ -31,8 +31,10 @@ __all__ = [
     "NAME_PATTERN",
     "Acknowledge",
     "Answer",
+    "AnyGains",
     "Ask",
     "Band",
+    "CascadeGains",
     "Cause",
     "Channel",
     "Fallback",
@@ -41,6 +43,7 @@ __all__ = [
     "InvalidMessage",
     "LearntResponse",
     "LetterAcknowledge",
+    "LinearGains",
     "LongerWindow",
     "Message",
     "ParameterMessage",

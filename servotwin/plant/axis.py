@@ -370,12 +370,15 @@ class Axis:
         shaft = self.actuator.polynomials()
         return loop.axis_system(self.shaft(), shaft, self._structure, self.p, self.at_motor)
 
-    def _law_loop(self, law: LinearLaw) -> LawLoop:
-        check_encoders(self, law)
+    def plants(self) -> tuple[LinearSystem, LinearSystem]:
+        """Command to the motor's angle and to the load's position, without a gap, with the same states."""
         shaft, polynomials = self.shaft(), self.actuator.polynomials()
         load = loop.axis_system(shaft, polynomials, self._structure, self.p, at_motor=False)
-        motor = replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1])
-        return LawLoop(motor, load, law)
+        return replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1]), load
+
+    def _law_loop(self, law: LinearLaw) -> LawLoop:
+        check_encoders(self, law)
+        return LawLoop(*self.plants(), law)
 
     def loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""

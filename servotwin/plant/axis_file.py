@@ -13,6 +13,7 @@ from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
 from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
+from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
 from servotwin.plant.load import LINEAR, ROTARY, Load
@@ -105,8 +106,6 @@ def rotary_load(
     return Load(m, k, c, ROTARY, friction, force)
 
 
-FILTERED_PID, CASCADE = "filtered_pid", "cascade"
-CONTROLLERS: dict[str, type] = {FILTERED_PID: Controller, CASCADE: Cascade}
 TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
 LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}

@@ -147,7 +147,7 @@ def noted_setting(known: Settings, version: int, setting: Setting, base: int, in
     """
     before = known.get(base)
     if setting.gains is None and before is not None:
-        setting = replace(setting, gains=before.gains)
+        setting = setting.with_gains(before.gains)
     after = {**known, version: setting}
     # The edge starts with version 0: later updates without gains go back to its gains.
     keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}

@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.control.law import start, tick
+from servotwin.control.running_law import RunningLaw
 from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
@@ -48,23 +49,23 @@ POSITIONS = st.sampled_from([0.0, 1e-3, -1e-3, math.nan, math.inf, -math.inf, 1e
 @given(st.lists(st.tuples(POSITIONS, POSITIONS), max_size=30), st.booleans())
 def test_the_law_never_gives_a_voltage_that_is_not_finite(samples: list[tuple[float, float]], limited: bool) -> None:
     controller = LAW if limited else LAW.replace(voltage_limit=None, Ki=1e3, Kd=10.0)
-    guarded = GuardedLaw(controller.law(1e-5), 2, 0.0)
+    guarded = GuardedLaw(RunningLaw(controller, 1e-5), 2, 0.0)
     for reference, position in samples:
-        assert math.isfinite(guarded.tick(reference, position))
+        assert math.isfinite(guarded.tick(reference, 0.0, position))
     for _ in range(4):
-        guarded.tick(0.0, math.nan)
-    assert guarded.tick(1e-3, 0.0) == tick(controller.law(1e-5), start(0.0), 1e-3, 0.0).voltage
+        guarded.tick(0.0, 0.0, math.nan)
+    assert guarded.tick(1e-3, math.nan, 0.0) == tick(controller.law(1e-5), start(0.0), 1e-3, 0.0).voltage
 
 
 def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
     law = LAW.replace(Ki=500.0).law()
-    guarded, plain = GuardedLaw(law, 2, 0.5), start(0.0)
+    guarded, plain = GuardedLaw(RunningLaw(LAW.replace(Ki=500.0)), 2, 0.5), start(0.0)
     for k in range(5):
         plain = tick(law, plain, 1e-3, 1e-4 * k)
-        assert guarded.tick(1e-3, 1e-4 * k) == plain.voltage
-    assert [guarded.tick(1e-3, math.nan) for _ in range(2)] == [plain.voltage] * 2
-    assert guarded.tick(1e-3, 6e-4) == tick(law, plain, 1e-3, 6e-4).voltage
-    assert [guarded.tick(1e-3, math.nan) for _ in range(3)][-1] == 0.5
+        assert guarded.tick(1e-3, 0.0, 1e-4 * k) == plain.voltage
+    assert [guarded.tick(1e-3, 0.0, math.nan) for _ in range(2)] == [plain.voltage] * 2
+    assert guarded.tick(1e-3, 0.0, 6e-4) == tick(law, plain, 1e-3, 6e-4).voltage
+    assert [guarded.tick(1e-3, 0.0, math.nan) for _ in range(3)][-1] == 0.5
 
 
 class ScriptedDrive:
