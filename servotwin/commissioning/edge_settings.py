@@ -15,6 +15,7 @@ from typing import Annotated, NamedTuple
 import msgspec
 
 from servotwin.config.keys import key, settings
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
@@ -56,6 +57,7 @@ _MOST_SAMPLES = 1e8  # some 10 GB of signals
 _ROUNDING = 1.0 + 1e-9
 # Factor by which the resonance of a learnt machine may be off the model's, either way.
 _NOTCH_MOVES = 2.0
+_BELOW_HALF = 0.49
 
 
 @settings("recording")
@@ -191,11 +193,18 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, AnyGains]:
         feedforward=policy.feedforward_limit * _ROUNDING,
         # The centre follows the learnt machine.
         notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,
-        notch_max_hz=max(notches, default=0.0) * _NOTCH_MOVES,
+        notch_max_hz=min(max(notches, default=0.0) * _NOTCH_MOVES, _highest_notch(own)),
         notch_damping=max(dampings, default=0.5 if isinstance(own, LinearLaw) else own.notch_damping),
         patience_s=PATIENCE * scales(policy.servo).time,
     )
     return limits, _centre_of(centre, middle, max(leave, own.leave) / factor)
+
+
+def _highest_notch(own: AnyController) -> float:
+    """Hz: a cascade has no notch at half of its rate or above."""
+    if not isinstance(own, Cascade) or own.sample_rate is None:
+        return math.inf
+    return _BELOW_HALF * own.sample_rate
 
 
 def _kick(laws: list[AnyController]) -> float:

@@ -47,7 +47,11 @@ class Cascade:
     ] = None
     integral_time: Annotated[
         float | None,
-        key("integral_time_s", above=0.0, help="Reset time of the velocity loop; no integral action where absent."),
+        key(
+            "integral_time_s",
+            minimum=0.0,
+            help="Reset time of the velocity loop; 0 or absent: no integral action.",
+        ),
     ] = None
     speed_filter: Annotated[
         float,
@@ -77,7 +81,7 @@ class Cascade:
         ),
     ] = 5e-3
     notch_hz: Annotated[
-        float | None, key("notch_hz", above=0.0, help="Centre of a notch on the command; none where absent.")
+        float | None, key("notch_hz", minimum=0.0, help="Centre of a notch on the command; 0 or absent: none.")
     ] = None
     notch_damping: Annotated[
         float, key("notch_damping", above=0.0, maximum=1.0, help="Damping ratio of its poles.")
@@ -126,8 +130,14 @@ class Cascade:
 
     def __post_init__(self) -> None:
         check(self)
+        for name in ("integral_time", "notch_hz"):
+            if getattr(self, name) == 0.0:
+                object.__setattr__(self, name, None)
         if self.leave < self.enter:
             raise InvalidInput(f"cascade leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
+        if self.notch_hz is not None and self.sample_rate is not None and not self.notch_hz < 0.5 * self.sample_rate:
+            allowed = f"must be below half of sample_rate = {self.sample_rate!r} Hz, or 0 for none"
+            raise InvalidInput(f"cascade notch_hz = {self.notch_hz!r} Hz: {allowed}")
         if self.velocity_gain is None:
             for name, given in (
                 ("integral_time", self.integral_time),

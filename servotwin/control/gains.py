@@ -79,7 +79,10 @@ def written_gains(gains: AnyGains, running: AnyController | None = None) -> Valu
     else:
         assert running is not None
         written = with_gains(running, gains)
-    return values_of(written, only=settable(type(written)))
+    values = values_of(written, only=settable(type(written)))
+    # Where nothing is said of them, a reader takes those of the running law.
+    lacking = {"integral_time_s": 0.0, "notch_hz": 0.0} if isinstance(written, Cascade) else {}
+    return {**lacking, **values}
 
 
 def settable(kind: type) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """The kinds of controllers."""
 
+from abc import ABC
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from servotwin.control.cascade import Cascade
@@ -17,8 +18,11 @@ if TYPE_CHECKING:
     StoredController: TypeAlias = AnyController
 else:
 
-    class StoredController:
-        """`AnyController` as a field of what files store: `kind_of_stored` tells a decoder which it is."""
+    class StoredController(ABC):  # noqa: B024 - it has nothing of its own
+        """`AnyController` as a field of what files store; `kind_of_stored` tells a decoder which it is."""
+
+    for _kind in (Controller, Cascade, LinearLaw):
+        StoredController.register(_kind)
 
 
 FILTERED_PID, CASCADE = "filtered_pid", "cascade"

@@ -16,6 +16,8 @@ INPUTS = ("reference", "y_motor", "y_load")
 MOTOR, LOAD = "motor", "load"
 # Numba compiles the tick once for each number of states: a few numbers serve all laws.
 _MULTIPLE = 4
+# Relative: rates that differ by no more are one rate, given as a rate and as a time.
+_SAME_RATE = 1e-9
 
 
 @dataclass(frozen=True, repr=False)
@@ -167,6 +169,9 @@ class LinearLaw:
 
         B = [mapped(row) for row in B]
         rate = None if step is None else 1.0 / step
+        given = values.get("sample_rate", rate)
+        if rate is not None and (given is None or abs(given - rate) > _SAME_RATE * rate):
+            raise InvalidInput(f"law sample_rate = {given!r} Hz: the system is sampled at {rate!r} Hz; leave it out")
         values = {"sample_rate": rate, "discrete": rate is not None, **values}
         return cls(A, B, C[0], mapped(D[0]), on=on, ratio=ratio, **values)  # type: ignore[arg-type]
 

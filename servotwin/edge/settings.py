@@ -6,6 +6,7 @@ from math import inf, isfinite
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
+from servotwin.control.cascade import Cascade
 from servotwin.control.laws import AnyController
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
@@ -130,11 +131,21 @@ class AgentSettings:
             allowed = f"must be below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
+        self._check_notch()
         if self.window_filter is not None:
             self.window_filter.check(self.sample_rate)
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.setting.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
+
+    def _check_notch(self) -> None:
+        """Check that no update may set a notch that the controller cannot have."""
+        law = self.controller
+        if not isinstance(law, Cascade) or law.sample_rate is None:
+            return
+        if not self.limits.notch_max_hz < 0.5 * law.sample_rate:
+            allowed = f"must be below half of the controller's {law.sample_rate!r} Hz"
+            raise InvalidInput(f"limits notch_max_hz = {self.limits.notch_max_hz!r} Hz: {allowed}")
 
     def _check_longest(self) -> None:
         """Check that the longest window and pre-trigger are at least the configured ones, and fit together."""

@@ -23,7 +23,7 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
-from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
+from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
 from servotwin.plant.basis import Guide, Play
 from servotwin.plant.fit import check_fit
 from servotwin.plant.law_loop import LawLoop, check_encoders
@@ -407,7 +407,9 @@ class Axis:
         """
         law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
-            self._law_loop(law).check("axis")
+            self._law_loop(law).check(
+                described_law(controller or self.controller, self.actuator.unit, self.load.motion)
+            )
         else:
             if self.rigid and self.at_motor and self.n > 1 and not np.linalg.eigvals(self.chain().A).real.max() < 0.0:
                 raise InvalidInput(

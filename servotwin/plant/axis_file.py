@@ -13,7 +13,8 @@ from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
 from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID
+from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, AnyController
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
 from servotwin.plant.load import LINEAR, ROTARY, Load
@@ -180,6 +181,17 @@ def controller_keys(unit: str, motion: str, described: type = Controller) -> Map
         units = "_".join(renamed.get(each, each) for each in suffix.split("_"))
         names[name.removesuffix(suffix).replace("voltage", word) + units] = name
     return names
+
+
+def described_law(controller: AnyController, unit: str, motion: str) -> str:
+    """Kind, keys and values of a controller, as the file of an axis has them."""
+    if isinstance(controller, LinearLaw):
+        return repr(controller)
+    kind = type(controller)
+    shown = {name: key for key, name in controller_keys(unit, motion, kind).items()}
+    usual = {item.exact_name: item.default for item in items_of(kind)}
+    given = {name: value for name, value in values_of(controller).items() if value != usual.get(name)}
+    return f"{CASCADE if kind is Cascade else FILTERED_PID} ({', '.join(f'{shown.get(name, name)} = {value!r}' for name, value in given.items())})"
 
 
 def _keys_with_units(described: type) -> list[str]:

@@ -192,7 +192,7 @@ class LawLoop:
         )
 
     def check(self, described: str) -> None:
-        """Refuse a law that does not stabilise the plant, at its sample rate if it has one.
+        """Refuse a law, as described, that does not stabilise the plant, at its sample rate if it has one.
 
         Raises
         ------
@@ -202,7 +202,7 @@ class LawLoop:
         worst = self.slowest_pole()
         if not worst.real < 0.0:
             raise InvalidInput(
-                f"the controller {self.law!r} is unstable on this {described} even without a gap: its closed loop has "
+                f"the controller {described} is unstable on this axis even without a gap: its closed loop has "
                 f"a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
             )
 

@@ -19,6 +19,7 @@ from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite
 from servotwin.messages.legacy import upgrade
 from servotwin.redesign.certified.certificate import verification_of
+from servotwin.redesign.design import decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.requests import Attempts, RequestState
@@ -215,7 +216,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(TwinState)
+_decoder = msgspec.msgpack.Decoder(TwinState, dec_hook=decoded_part)
 
 
 def encode_state(state: TwinState) -> bytes:
@@ -238,7 +239,7 @@ def decode_state(servo: str, data: bytes) -> TwinState:
             document = msgspec.msgpack.decode(data)
             if not isinstance(document, dict) or document.get("type") != "twin-state/1":
                 raise
-            state = msgspec.convert(_upgraded(document), TwinState)
+            state = msgspec.convert(_upgraded(document), TwinState, dec_hook=decoded_part)
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError, LookupError, TypeError) as error:
         raise InvalidInput(f"the state of servo {servo!r} is not understood: {error}") from None
     if state.servo != servo:

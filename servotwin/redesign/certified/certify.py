@@ -257,11 +257,8 @@ def _zones_in_gap(servo: Plant, laws: tuple[AnyController, ...], zone: float, de
     if isinstance(servo.controller, Controller) or not 0.0 < zone <= demands.tolerance:
         return []
     stopped = [law.replace(integral_only=True, enter=1.0, leave=_LEAVES) for law in laws if integrates(law)]
-    opened = [
-        law.replace(integral_only=False, enter=enter, leave=leave)
-        for law in laws
-        for enter, leave in demands.hysteresis
-    ]
+    opening = [law.replace(integral_only=False) for law in laws]
+    opened = [law.replace(enter=enter, leave=leave) for law in opening for enter, leave in demands.hysteresis]
     return [Design(law, zone) for law in (*stopped, *opened)]
 
 
