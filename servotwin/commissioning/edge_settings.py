@@ -197,7 +197,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, AnyGains]:
         notch_damping=max(dampings, default=0.5 if isinstance(own, LinearLaw) else own.notch_damping),
         patience_s=PATIENCE * scales(policy.servo).time,
     )
-    return limits, _centre_of(centre, middle, max(leave, own.leave) / factor)
+    return limits, _centre_of(centre, middle, _ROUNDING * max(leave, own.leave) / factor)
 
 
 def _highest_notch(own: AnyController) -> float:

@@ -374,7 +374,8 @@ class Axis:
         """Command to the motor's angle and to the load's position, without a gap, with the same states."""
         shaft, polynomials = self.shaft(), self.actuator.polynomials()
         load = loop.axis_system(shaft, polynomials, self._structure, self.p, at_motor=False)
-        return replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1]), load
+        row, unknown = np.eye(load.B.size)[len(shaft.names) - 1], np.array([math.nan])
+        return replace(load, C=row, numerator=unknown, denominator=unknown), load
 
     def _law_loop(self, law: LinearLaw) -> LawLoop:
         check_encoders(self, law)
