@@ -22,7 +22,9 @@ def units(strokes: int) -> Array:
 def least_gap(grid: Array, squares: Array) -> Array:
     """Gap of the least sum of squares along the last axis, by a parabola through the three lowest points."""
     place = np.clip(np.argmin(squares, axis=-1), 1, grid.size - 2)
-    three = np.stack([np.take_along_axis(squares, (place + k)[..., None], axis=-1)[..., 0] for k in (-1, 0, 1)], axis=-1)
+    three = np.stack(
+        [np.take_along_axis(squares, (place + k)[..., None], axis=-1)[..., 0] for k in (-1, 0, 1)], axis=-1
+    )
     low, mid, high = grid[place - 1], grid[place], grid[place + 1]
     first, second = (three[..., 1] - three[..., 0]) / (mid - low), (three[..., 2] - three[..., 1]) / (high - mid)
     curvature = (second - first) / (high - low)
@@ -64,5 +66,7 @@ def bootstrap(grid: Array, tensor: Array, by_travel: Array, used: list[int]) -> 
     member = units(tensor.shape[1])
     drawn = np.random.default_rng(_SEED).multinomial(len(member), np.full(len(member), 1.0 / len(member)), DRAWS)
     counts = drawn @ member
-    every = [solved(np.einsum("rm,gmij->rgij", counts, each, optimize=True), used).squares for each in (tensor, by_travel)]
+    every = [
+        solved(np.einsum("rm,gmij->rgij", counts, each, optimize=True), used).squares for each in (tensor, by_travel)
+    ]
     return Spread(least_gap(grid, every[0]), least_gap(grid, every[1]), len(member))

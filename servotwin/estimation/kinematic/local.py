@@ -29,7 +29,9 @@ class LocalGap(NamedTuple):
     gap: float
 
 
-def local_gaps(time: Array, load: Array, side: Array, residual: Array, gap: float, ratio: float) -> tuple[LocalGap, ...]:
+def local_gaps(
+    time: Array, load: Array, side: Array, residual: Array, gap: float, ratio: float
+) -> tuple[LocalGap, ...]:
     """Gap of each change of the flank, from what the fit with one gap leaves on either side of it.
 
     Parameters
@@ -44,7 +46,9 @@ def local_gaps(time: Array, load: Array, side: Array, residual: Array, gap: floa
     """
     changes = np.flatnonzero(np.diff(side)) + 1
     edges = np.concatenate([[0], changes, [side.size]])
-    means = np.array([residual[a:b].mean() if b - a >= _LEAST_ROWS else np.nan for a, b in zip(edges, edges[1:], strict=False)])
+    means = np.array(
+        [residual[a:b].mean() if b - a >= _LEAST_ROWS else np.nan for a, b in zip(edges, edges[1:], strict=False)]
+    )
     result = []
     for place, change in enumerate(changes):
         before, after = means[place], means[place + 1]

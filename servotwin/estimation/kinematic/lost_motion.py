@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
+from servotwin.estimation.estimate import GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
-from servotwin.estimation.kinematic.models import Comparison, Model, chosen, compared, models
+from servotwin.estimation.kinematic.models import Comparison, Model, chosen, compared
 from servotwin.estimation.kinematic.recording import Recording
 from servotwin.estimation.kinematic.regression import LAG, RATIO, Design, columns, design, products, solved
 from servotwin.estimation.kinematic.strokes import play_and_side, resolution, strokes_of
@@ -219,7 +219,9 @@ def _answer(
     half = quantile * float(np.hypot(spread.std, 0.25 * count))
     reasons, status, low, high = _judged(recording, gap, by_travel, spread, half, best, comparisons, count)
     rows = prepared.rows
-    lag = prepared.lag + (float(fit.coefficients[places.index(prepared.names.index(LAG))]) / ratio if LAG in best.model.used else 0.0)
+    lag = prepared.lag + (
+        float(fit.coefficients[places.index(prepared.names.index(LAG))]) / ratio if LAG in best.model.used else 0.0
+    )
     return LostMotion(
         gap_motor=gap,
         std_motor=half / quantile,
@@ -265,7 +267,11 @@ def _judged(
     if abs(by_travel - gap) <= _DISAGREE * float(np.hypot(spread.std_of_difference, count)):
         return (), GapStatus.OK, low, high
     others = {each.model.name: each.gap for each in comparisons[:-1]}
-    lagless = others[best.model.name.replace("lag and wind-up by acceleration", "rigid").replace("lag and wind-up", "wind-up").replace("lag", "rigid")]
+    lagless = others[
+        best.model.name.replace("lag and wind-up by acceleration", "rigid")
+        .replace("lag and wind-up", "wind-up")
+        .replace("lag", "rigid")
+    ]
     ends = [low, high, by_travel - half, by_travel + half, lagless]
     reasons = [
         f"the gap is {gap:.4g} {unit} if every moment counts alike and {by_travel:.4g} {unit} if the motor's way does: the "

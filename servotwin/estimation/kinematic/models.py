@@ -93,12 +93,23 @@ def compared(design: Design, grid: Array, tensor: Array, counts: Array) -> tuple
     for model in models(design):
         places = model.places(design)
         result.append(_comparison(model, places, grid, tensor, counts, folds))
-    bare = [_comparison(Model(f"no gap, {each.model.name}", each.model.used), each.model.places(design), grid[:1], tensor[:1], counts, folds)
-            for each in result]
+    bare = [
+        _comparison(
+            Model(f"no gap, {each.model.name}", each.model.used),
+            each.model.places(design),
+            grid[:1],
+            tensor[:1],
+            counts,
+            folds,
+        )
+        for each in result
+    ]
     return (*result, min(bare, key=lambda each: each.rms))
 
 
-def _comparison(model: Model, places: Sequence[int], grid: Array, tensor: Array, counts: Array, folds: Sequence[Array]) -> Comparison:
+def _comparison(
+    model: Model, places: Sequence[int], grid: Array, tensor: Array, counts: Array, folds: Sequence[Array]
+) -> Comparison:
     total = tensor.sum(axis=1)
     squares, sizes = [], []
     for fold in folds:

@@ -52,7 +52,9 @@ class Design(NamedTuple):
         return (LOAD, RATIO, OFFSET, LAG, INERTIA, *command, *cyclic)
 
 
-def design(recording: Recording, strokes: Strokes, first: int, cycles: Sequence[float] = (), lag: float = 0.0) -> Design:
+def design(
+    recording: Recording, strokes: Strokes, first: int, cycles: Sequence[float] = (), lag: float = 0.0
+) -> Design:
     """Choose the rows from sample `first` on."""
     begin = max(first, int(strokes.begin[0]))
     rows = np.unique(np.linspace(begin, recording.motor.size - 1, min(ROWS, recording.motor.size - begin)).astype(int))
