@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool) -> None
         return
     for log, found in answers:
         _print(console, log, found)
-    for before, after in zip(answers, answers[1:], strict=False):
+    for before, after in pairwise(answers):
         console.print(_change(before, after), highlight=False)
 
 
@@ -89,7 +90,7 @@ def _print(console: Console, log: RecordedLog, found: LostMotion) -> None:
     recording, unit = log.recording, log.recording.load_unit
     span = float(recording.time[-1] - recording.time[0])
     parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
-    console.print(f"{recording.source.removeprefix('log ')}: {recording.time.size} samples in {span:.4g} s ({parts})")
+    console.print(f"{recording.source.removeprefix('log ')}: {recording.time.size} samples in {span:.4g} s ({parts})", markup=False)
     for defect, count in log.found.items():
         console.print(f"  {count} {defect}", style="dim", highlight=False)
     console.print(_headline(found, unit, recording.motor_unit), highlight=False)
@@ -100,8 +101,8 @@ def _print(console: Console, log: RecordedLog, found: LostMotion) -> None:
     cyclic = "".join(f", cyclic error every {period:.4g} {recording.motor_unit}" for period in found.cycles)
     shown = cyclic if "cyclic" in found.model else ""
     console.print(
-        f"model: {found.model}; {abs(found.ratio):.6g} {unit} per {recording.motor_unit}, lag {1e3 * found.lag:.3g} ms{shown}, "
-        f"rms left {found.rms:.3g} {unit}",
+        f"model: {found.model}; {abs(found.ratio):.6g} {unit} per {recording.motor_unit}, "
+        f"lag {1e3 * found.lag:.3g} ms{shown}, rms left {found.rms:.3g} {unit}",
         highlight=False,
     )
     console.print(_models(found, unit), highlight=False)
@@ -158,8 +159,8 @@ def _change(before: tuple[RecordedLog, LostMotion], after: tuple[RecordedLog, Lo
         return "no change can be told: a gap of the two logs is only bounded"
     if first.recording.load_unit != second.recording.load_unit:
         raise InvalidInput(
-            f"{second.recording.source}: its load is in {second.recording.load_unit}, that of {first.recording.source} in "
-            f"{first.recording.load_unit}: give --load-unit"
+            f"{second.recording.source}: its load is in {second.recording.load_unit}, that of {first.recording.source} "
+            f"in {first.recording.load_unit}: give --load-unit"
         )
     change, std = new.gap_load - old.gap_load, math.hypot(_half(old), _half(new)) / 1.96
     times = abs(change) / std if std else math.inf

@@ -88,7 +88,7 @@ def identify(
     gap_limit_deg: Annotated[float | None, typer.Option(help="Predict when the gap reaches this limit, deg.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
-    """Estimate the gap from recordings: of two encoders alone, or with a model of the machine (--servo, or the log's own)."""
+    """Estimate the gap from recordings of two encoders, or with a model of the machine (--servo, or the log's own)."""
     from servotwin.cli.identify import IdentifyOptions, show
     from servotwin.cli.lost_motion import describes_its_machine
     from servotwin.cli.lost_motion import show as show_lost_motion

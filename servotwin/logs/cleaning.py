@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from servotwin.plant.signals import Array
+
+_Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 _STALE = 50.0  # times the usual interval: a first sample so far before the others is an old one
 _DROPOUT = 5.0  # times the usual interval
@@ -49,18 +51,20 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     names = list(channels)
     table = np.column_stack([time, *channels.values()])
 
-    def keep(kept: Array, defect: str) -> None:
+    def keep(kept: _Mask, defect: str) -> None:
         nonlocal table
         if not kept.all():
             found[defect] = int(np.sum(~kept))
             table = table[kept]
 
-    keep(np.isfinite(table).all(axis=1), "without a number in some column")
+    keep(np.isfinite(table.sum(axis=1)), "without a number in some column")
     if len(table) > 2:
         intervals = np.diff(table[:, 0])
         usual = float(np.median(np.abs(intervals)))
         stale = int(intervals[0] > _STALE * usual) if usual > 0.0 else 0
-        keep(np.arange(len(table)) >= stale, "stale, long before all others")
+        kept = np.ones(len(table), dtype=np.bool_)
+        kept[:stale] = False
+        keep(kept, "stale, long before all others")
     latest = np.maximum.accumulate(table[:, 0]) if len(table) else table[:, 0]
     repeated = np.concatenate([[False], np.diff(latest) == 0.0])
     back = table[:, 0] < latest
@@ -89,7 +93,7 @@ def _unwrapped(angle: Array, turn: float) -> tuple[Array, int]:
     return np.unwrap(angle, period=turn), int(np.sum(jumps))
 
 
-def _spikes(values: Array) -> Array:
+def _spikes(values: Array) -> _Mask:
     """Single samples that jump away and back by far more than the samples around them move."""
     if values.size < 5:
         return np.zeros(values.size, dtype=bool)

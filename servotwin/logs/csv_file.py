@@ -1,4 +1,4 @@
-"""Text tables: any separator, decimal comma, comment lines, units in the header; cells that are no numbers are reported."""
+"""Text tables: any separator, decimal comma, comment lines, units in the header; cells without a number are told."""
 
 from __future__ import annotations
 
@@ -65,8 +65,8 @@ def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
             metadata = _first_metadata(path, layout)
         if not wanted and requested and not layout.named:
             raise InvalidInput(
-                f"log {path}: line 1 must name the columns ({next(iter(requested))}, ...); without names they are called "
-                f"{', '.join(layout.names[:8])}"
+                f"log {path}: line 1 must name the columns ({next(iter(requested))}, ...); without names they are "
+                f"called {', '.join(layout.names[:8])}"
             )
         if not wanted:
             return LogColumns({}, layout.names, metadata)
@@ -108,7 +108,8 @@ def _layout(path: Path) -> _Layout:
 
 def _separator(lines: Sequence[str]) -> str | None:
     """The separator with which most lines have the same number of cells, more than one."""
-    best, score = ",", 0
+    best: str | None = ","
+    score = 0
     for separator in ("\t", ";", ",", "|", None):
         counts = [len(_cells(line, separator)) for line in lines]
         usual = max(set(counts), key=counts.count)

@@ -12,7 +12,7 @@ import numpy as np
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import Recording
-from servotwin.logs.cleaning import cleaned
+from servotwin.logs.cleaning import Cleaned, cleaned
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.log import read_columns
 from servotwin.plant.signals import Array
@@ -35,7 +35,7 @@ _GUESSES = {
 
 @dataclass(frozen=True)
 class RecordingColumns:
-    """Columns of a log by their parts, as the user names them; None: found by their names, command and time may be absent.
+    """Columns of a log as the user names them; None: found by their names, or absent (command, time).
 
     Attributes
     ----------
@@ -82,35 +82,21 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
     Raises
     ------
     InvalidInput
-        A file that cannot be read, columns that are missing or hold no numbers, no times and no rate, or too few samples.
+        A file that cannot be read, columns that are missing or hold no numbers, neither times nor a rate, or too few
+        samples.
     """
     names = tuple(read_columns(path, ()).names)
     chosen = _chosen(path, names, wanted)
     columns = read_columns(path, tuple(chosen.values()))
-    arrays = {part: _numbers(path, name, columns) for part, name in chosen.items()}
+    arrays = _arrays(path, chosen, columns)
     size = len(arrays["motor"])
-    for part, values in arrays.items():
-        if len(values) != size:
-            raise InvalidInput(
-                f"log {path}: column {chosen[part]!r} has {len(values)} values and {chosen['motor']!r} has {size}: they "
-                "must be of one table"
-            )
     units = {part: _unit(name) for part, name in chosen.items()}
     motor_unit = wanted.motor_unit or units["motor"] or "motor unit"
     load_unit = wanted.load_unit or units["load"] or "load unit"
     time = _times(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size)
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
     clean = cleaned(time, arrays, turns)
-    left = clean.time.size
-    if left < _LEAST or left < _MOST_LOST * size:
-        what = (
-            "; ".join(f"{count} samples {defect}" for defect, count in clean.found.items()) or "nothing else is wrong"
-        )
-        first = next(iter(columns.damaged.items()), None)
-        where = f"; column {first[0]!r}, {first[1]}" if first else ""
-        raise InvalidInput(
-            f"log {path}: {left} of {size} samples can be used, at least {_LEAST} are needed ({what}{where})"
-        )
+    _check_left(path, clean, size, columns)
     recording = Recording(
         time=clean.time,
         motor=clean.channels["motor"],
@@ -121,6 +107,31 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
         source=f"log {path}",
     )
     return RecordedLog(recording, chosen, size, clean.found)
+
+
+def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
+    """Columns by their parts, of one length."""
+    arrays = {part: _numbers(path, name, columns) for part, name in chosen.items()}
+    size = len(arrays["motor"])
+    for part, values in arrays.items():
+        if len(values) != size:
+            raise InvalidInput(
+                f"log {path}: column {chosen[part]!r} has {len(values)} values and {chosen['motor']!r} has {size}: "
+                "they must be of one table"
+            )
+    return arrays
+
+
+def _check_left(path: Path, clean: Cleaned, size: int, columns: LogColumns) -> None:
+    left = clean.time.size
+    if left >= max(_LEAST, _MOST_LOST * size):
+        return
+    what = "; ".join(f"{count} {defect}" for defect, count in clean.found.items()) or "the log is short"
+    first = next(iter(columns.damaged.items()), None)
+    where = f"; column {first[0]!r}, {first[1]}" if first else ""
+    raise InvalidInput(
+        f"log {path}: {left} of {size} samples can be used, of at least {_LEAST} and half of all ({what}{where})"
+    )
 
 
 def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[str, str]:

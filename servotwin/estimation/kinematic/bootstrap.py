@@ -1,4 +1,4 @@
-"""Block bootstrap of the gap: whole cycles of motion are drawn again, so that nothing is assumed of the errors within one."""
+"""Block bootstrap of the gap: cycles of motion are drawn again whole, whatever the errors within one are."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servotwin.estimation.kinematic.profile import least_gap
 from servotwin.estimation.kinematic.regression import solved
 from servotwin.plant.signals import Array
 
@@ -17,21 +18,6 @@ def units(strokes: int) -> Array:
     """(u, m) memberships: pairs of consecutive strokes, there and back; single strokes where there are few."""
     size = 2 if strokes >= 8 else 1
     return np.array([np.arange(strokes) // size == unit for unit in range(-(-strokes // size))], dtype=float)
-
-
-def least_gap(grid: Array, squares: Array) -> Array:
-    """Gap of the least sum of squares along the last axis, by a parabola through the three lowest points."""
-    place = np.clip(np.argmin(squares, axis=-1), 1, grid.size - 2)
-    three = np.stack(
-        [np.take_along_axis(squares, (place + k)[..., None], axis=-1)[..., 0] for k in (-1, 0, 1)], axis=-1
-    )
-    low, mid, high = grid[place - 1], grid[place], grid[place + 1]
-    first, second = (three[..., 1] - three[..., 0]) / (mid - low), (three[..., 2] - three[..., 1]) / (high - mid)
-    curvature = (second - first) / (high - low)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        found = 0.5 * (low + mid) - first / (2.0 * curvature)
-    # At an edge of the grid, or on a flat profile, the lowest point itself.
-    return np.where(curvature > 0.0, np.clip(found, low, high), grid[np.argmin(squares, axis=-1)])
 
 
 class Spread(NamedTuple):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.plant.signals import Array
 
-_LEAST_ROWS = 8
+_SHARE = 0.25  # of a stroke, next to the reversal
 
 
 class LocalGap(NamedTuple):
@@ -46,14 +47,20 @@ def local_gaps(
     """
     changes = np.flatnonzero(np.diff(side)) + 1
     edges = np.concatenate([[0], changes, [side.size]])
-    means = np.array(
-        [residual[a:b].mean() if b - a >= _LEAST_ROWS else np.nan for a, b in zip(edges, edges[1:], strict=False)]
-    )
+    strokes = list(pairwise(edges))
     result = []
     for place, change in enumerate(changes):
-        before, after = means[place], means[place + 1]
-        # On the flank + the load is half a gap behind the motor: with a larger gap it lies lower there, and higher on -.
+        before, after = (residual[part].mean() for part in _beside(strokes[place], strokes[place + 1]))
+        # On the flank + the load is half a gap behind the motor: a larger gap puts it lower there, and higher on -.
         larger = -side[change] * (after - before) / ratio
         if np.isfinite(larger) and side[change] != 0 and side[change - 1] != 0:
             result.append(LocalGap(float(time[change]), float(load[change]), float(max(gap + larger, 0.0))))
     return tuple(result)
+
+
+def _beside(before: tuple[int, int], after: tuple[int, int]) -> tuple[slice, slice]:
+    """The rows of the strokes before and after a reversal that are near it."""
+    length, other = before[1] - before[0], after[1] - after[0]
+    return slice(before[1] - max(1, int(_SHARE * length)), before[1]), slice(
+        after[0], after[0] + max(1, int(_SHARE * other))
+    )

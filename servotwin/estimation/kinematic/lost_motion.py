@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import t as student
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapStatus, Interval
+from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
 from servotwin.estimation.kinematic.models import Comparison, Model, chosen, compared
+from servotwin.estimation.kinematic.profile import least_gap
 from servotwin.estimation.kinematic.recording import Recording
 from servotwin.estimation.kinematic.regression import LAG, RATIO, Design, columns, design, products, solved
 from servotwin.estimation.kinematic.strokes import play_and_side, resolution, strokes_of
+from servotwin.estimation.kinematic.verdict import Fit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
 _GAPS = 32  # of the coarse search, geometric from a count to the whole travel
@@ -24,7 +27,6 @@ _ROUNDS = 4
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
 _CHANCE = 0.025  # on either side of a 95 % interval
-_DISAGREE = 2.0  # standard deviations between two weightings of the samples that a right model does not show
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,10 @@ class LostMotion:
 def estimate_lost_motion(recording: Recording) -> LostMotion:
     """Fit load = ratio x play(motor) + offset, with lag, wind-up and cyclic errors where the log shows them.
 
-    The model is chosen by its errors on strokes that it was not fitted to; the interval is a block bootstrap over cycles
-    of motion. Two weightings of the samples, by time and by travel, have one answer where the model is right: where they
-    differ, or where models differ that the log cannot tell apart, the interval covers all of them and the status is not OK.
+    The model is chosen by its errors on strokes that it was not fitted to; the interval is a block bootstrap over
+    cycles of motion. Two weightings of the samples, by time and by travel, have one answer where the model is right:
+    where they differ, or models that the log cannot tell apart, the interval covers all of them and the status is not
+    OK.
 
     Raises
     ------
@@ -110,7 +113,7 @@ def estimate_lost_motion(recording: Recording) -> LostMotion:
         return _bound(recording)
     prepared = design(recording, strokes, first)
     prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
-    grid, tensor = _tensor(prepared, coarse)
+    grid, tensor = _tensor(prepared, coarse, least)
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
     comparisons = compared(prepared, grid, tensor, counts)
     best = chosen(comparisons[:-1])
@@ -130,13 +133,13 @@ def _check(recording: Recording, least: float, reversals: int) -> None:
     reach = float(np.ptp(recording.motor))
     if not reach > 2.0 * least:
         raise InvalidInput(
-            f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and noise explain: record a motion "
-            "to and fro that takes up the gap on both sides"
+            f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and noise explain: record a "
+            "motion to and fro that takes up the gap on both sides"
         )
     if reversals < _LEAST_REVERSALS:
         raise InvalidInput(
-            f"{source}: the motor reverses {max(reversals, 0)} times in {np.ptp(recording.time):.4g} s: the gap shows at "
-            f"reversals only; record at least {_LEAST_REVERSALS}, better ten"
+            f"{source}: the motor reverses {max(reversals, 0)} times in {np.ptp(recording.time):.4g} s: the gap shows "
+            f"at reversals only; record at least {_LEAST_REVERSALS}, better ten"
         )
 
 
@@ -168,9 +171,9 @@ def _cycles(prepared: Design, gap: float) -> tuple[float, ...]:
     return periods(values[1], values[0] - fit.coefficients @ values[used])
 
 
-def _tensor(prepared: Design, coarse: float) -> tuple[Array, Array]:
+def _tensor(prepared: Design, coarse: float, least: float) -> tuple[Array, Array]:
     """Sums of products on a grid from 0 to twice the coarse gap."""
-    grid = np.linspace(0.0, 2.0 * coarse, 2 * _FINE + 1)
+    grid = np.linspace(0.0, 2.0 * max(coarse, least), 2 * _FINE + 1)
     return grid, np.array([products(prepared, gap) for gap in grid])
 
 
@@ -183,9 +186,7 @@ def _fitted(prepared: Design, model: Model, gap: float, width: float) -> tuple[f
         by_time = np.array([products(prepared, each) for each in grid])
         by_travel = np.array([products(prepared, each, travel) for each in grid])
         spread = draws.bootstrap(grid, by_time, by_travel, places)
-        gap, other = (
-            float(draws.least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel)
-        )
+        gap, other = (float(least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel))
         wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), 1e-3 * gap)
         if 0.4 * width <= wanted <= 1.5 * width:
             break
@@ -205,36 +206,46 @@ def _travel(prepared: Design) -> Array:
 def _answer(
     recording: Recording, prepared: Design, best: Comparison, comparisons: tuple[Comparison, ...], least: float
 ) -> LostMotion:
-    """Interval, status and reasons of the chosen model."""
+    """Fit the chosen model closely and judge it."""
     if LAG in best.model.used:
         prepared = _with_lag(prepared, best)
     gap, by_travel, spread = _fitted(prepared, best.model, best.gap, max(0.5 * best.gap, least))
     values, side = columns(prepared, gap)
     places = best.model.places(prepared)
     fit = solved(values @ values.T, places)
-    residual = values[0] - fit.coefficients @ values[places]
-    ratio = float(fit.coefficients[0])
-    count = np.hypot(resolution(recording.motor), resolution(recording.load) / abs(ratio)) / np.sqrt(12.0)
-    quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
-    half = quantile * float(np.hypot(spread.std, 0.25 * count))
-    reasons, status, low, high = _judged(recording, gap, by_travel, spread, half, best, comparisons, count)
-    rows = prepared.rows
-    lag = prepared.lag + (
-        float(fit.coefficients[places.index(prepared.names.index(LAG))]) / ratio if LAG in best.model.used else 0.0
+    residual, ratio = values[0] - fit.coefficients @ values[places], float(fit.coefficients[0])
+    quantisation = float(np.hypot(resolution(recording.motor), resolution(recording.load) / abs(ratio))) / math.sqrt(
+        12.0
     )
+    quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
+    half = quantile * math.hypot(spread.std, 0.25 * quantisation)
+    judged = verdict(
+        Fit(
+            gap=gap,
+            by_travel=by_travel,
+            simpler=simpler(best, comparisons),
+            spread=spread,
+            half=half,
+            quantisation=quantisation,
+            left=structured(prepared, residual) / abs(ratio),
+            better_than_none=best.rms < comparisons[-1].rms,
+        ),
+        recording.motor_unit,
+    )
+    rows, known = prepared.rows, judged.interval != NOTHING_KNOWN
     return LostMotion(
-        gap_motor=gap,
-        std_motor=half / quantile,
-        interval_motor=(max(low, 0.0), high),
+        gap_motor=gap if known else math.nan,
+        std_motor=half / quantile if known else math.inf,
+        interval_motor=judged.interval,
         ratio=ratio,
-        lag=lag,
-        status=status,
-        reasons=reasons,
+        lag=prepared.lag,
+        status=judged.status,
+        reasons=judged.reasons,
         model=best.model.name,
         comparisons=comparisons,
         cycles=tuple(map(float, prepared.cycles)),
         rms=float(np.sqrt(np.mean(residual**2))),
-        local=local_gaps(recording.time[rows], recording.load[rows], side, residual, gap, ratio),
+        local=local_gaps(recording.time[rows], recording.load[rows], side, residual, gap, ratio) if known else (),
     )
 
 
@@ -247,42 +258,6 @@ def _with_lag(prepared: Design, best: Comparison) -> Design:
         fit = solved(values @ values.T, places)
         prepared = prepared._replace(lag=prepared.lag + float(fit.coefficients[lag] / fit.coefficients[0]))
     return prepared
-
-
-def _judged(
-    recording: Recording,
-    gap: float,
-    by_travel: float,
-    spread: draws.Spread,
-    half: float,
-    best: Comparison,
-    comparisons: tuple[Comparison, ...],
-    count: float,
-) -> tuple[tuple[str, ...], GapStatus, float, float]:
-    """Reasons, status and interval."""
-    low, high, unit = gap - half, gap + half, recording.motor_unit
-    bare = comparisons[-1]
-    if low <= 0.0 or bare.rms <= best.rms:
-        return (f"no gap can be told from none: at most {high:.3g} {unit}",), GapStatus.UNIDENTIFIABLE, 0.0, high
-    if abs(by_travel - gap) <= _DISAGREE * float(np.hypot(spread.std_of_difference, count)):
-        return (), GapStatus.OK, low, high
-    others = {each.model.name: each.gap for each in comparisons[:-1]}
-    lagless = others[
-        best.model.name.replace("lag and wind-up by acceleration", "rigid")
-        .replace("lag and wind-up", "wind-up")
-        .replace("lag", "rigid")
-    ]
-    ends = [low, high, by_travel - half, by_travel + half, lagless]
-    reasons = [
-        f"the gap is {gap:.4g} {unit} if every moment counts alike and {by_travel:.4g} {unit} if the motor's way does: the "
-        "model leaves out something that is not noise"
-    ]
-    if LAG in best.model.used and abs(lagless - gap) > half:
-        reasons.append(
-            f"gap and lag look alike here: {gap:.4g} {unit} with a lag of the load, {lagless:.4g} {unit} without; record "
-            "the same motion at half and at a tenth of the speed"
-        )
-    return tuple(reasons), GapStatus.MODEL_MISMATCH, min(ends), max(ends)
 
 
 def _bound(recording: Recording) -> LostMotion:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from servotwin.estimation.kinematic.profile import interpolated, least_gap
 from servotwin.estimation.kinematic.regression import (
     INERTIA,
     LAG,
@@ -22,6 +23,7 @@ from servotwin.plant.signals import Array
 _FOLDS = 5
 # A richer model must predict unseen strokes better by this many standard errors of the difference.
 _EVIDENCE = 2.0
+_WORTH = 0.02  # and by this share
 
 
 class Model(NamedTuple):
@@ -108,18 +110,18 @@ def compared(design: Design, grid: Array, tensor: Array, counts: Array) -> tuple
 
 
 def _comparison(
-    model: Model, places: Sequence[int], grid: Array, tensor: Array, counts: Array, folds: Sequence[Array]
+    model: Model, places: Sequence[int], grid: Array, tensor: Array, counts: Array, folds: Sequence[Any]
 ) -> Comparison:
     total = tensor.sum(axis=1)
     squares, sizes = [], []
     for fold in folds:
         left = tensor[:, fold].sum(axis=1)
         fit = solved(total - left, places)
-        best = int(np.argmin(fit.squares))
-        squares.append(squares_of(left[best], places, fit.coefficients[best]))
+        unseen = squares_of(left, places, fit.coefficients)
+        squares.append(max(interpolated(grid, unseen, float(least_gap(grid, fit.squares))), 0.0))
         sizes.append(counts[fold].sum())
-    gap = float(grid[int(np.argmin(solved(total, places).squares))])
-    rms = float(np.sqrt(max(np.sum(squares), 0.0) / max(np.sum(sizes), 1)))
+    gap = float(least_gap(grid, solved(total, places).squares))
+    rms = float(np.sqrt(np.sum(squares) / max(np.sum(sizes), 1)))
     return Comparison(model, gap, np.array(squares) / np.maximum(sizes, 1), rms)
 
 
@@ -129,6 +131,6 @@ def chosen(comparisons: Sequence[Comparison]) -> Comparison:
     for each in comparisons[1:]:
         gain = best.squares - each.squares
         error = gain.std(ddof=1) / np.sqrt(gain.size) if gain.size > 1 else np.inf
-        if gain.mean() > _EVIDENCE * error and gain.mean() > 1e-3 * best.squares.mean():
+        if gain.mean() > _EVIDENCE * error and gain.mean() > _WORTH * best.squares.mean():
             best = each
     return best

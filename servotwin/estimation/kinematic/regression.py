@@ -1,13 +1,13 @@
 """Least squares of load = ratio x play(motor) + offset + nuisances, as normal matrices of every stroke for every gap.
 
-For a given gap the model is linear in everything else. Sums of products by stroke are all that fits, comparisons out of sample
-and bootstrap need: the samples are passed once for each gap of a grid.
+For a given gap the model is linear in everything else. Sums of products by stroke are all that fits, comparisons on
+unseen strokes and bootstrap need: the samples are passed once for each gap of a grid.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -39,8 +39,8 @@ class Design(NamedTuple):
 
     recording: Recording
     strokes: Strokes
-    rows: Array
-    bounds: Array
+    rows: Any
+    bounds: Any
     cycles: Array
     lag: float
 

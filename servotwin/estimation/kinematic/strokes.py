@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from servotwin.plant.signals import Array
 
 
 @compiled
-def play_and_side(motor: Array, gap: float, side: Array) -> Array:
+def play_and_side(motor: Array, gap: float, side: Any) -> Array:
     """Play of the motor's angle; `side` (n,) int8 becomes the flank that was touched last, 0 before the first contact.
 
     Before the first contact the output is not known: it is taken as the middle of the gap.
