@@ -90,7 +90,8 @@ def _print(console: Console, log: RecordedLog, found: LostMotion) -> None:
     recording, unit = log.recording, log.recording.load_unit
     span = float(recording.time[-1] - recording.time[0])
     parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
-    console.print(f"{recording.source.removeprefix('log ')}: {recording.time.size} samples in {span:.4g} s ({parts})", markup=False)
+    name = recording.source.removeprefix("log ")
+    console.print(f"{name}: {recording.time.size} samples in {span:.4g} s ({parts})", markup=False)
     for defect, count in log.found.items():
         console.print(f"  {count} {defect}", style="dim", highlight=False)
     console.print(_headline(found, unit, recording.motor_unit), highlight=False)

@@ -18,7 +18,7 @@ from servotwin.estimation.kinematic.profile import least_gap
 from servotwin.estimation.kinematic.recording import Recording
 from servotwin.estimation.kinematic.regression import LAG, RATIO, Design, columns, design, products, solved
 from servotwin.estimation.kinematic.strokes import play_and_side, resolution, strokes_of
-from servotwin.estimation.kinematic.verdict import Fit, simpler, structured, verdict
+from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
 _GAPS = 32  # of the coarse search, geometric from a count to the whole travel
@@ -220,7 +220,7 @@ def _answer(
     quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
     half = quantile * math.hypot(spread.std, 0.25 * quantisation)
     judged = verdict(
-        Fit(
+        KinematicFit(
             gap=gap,
             by_travel=by_travel,
             simpler=simpler(best, comparisons),

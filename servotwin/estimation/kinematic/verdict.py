@@ -23,7 +23,7 @@ _COUNTS = 4.0
 _SAID = {LAG: "a lag of the load", WIND_UP: "wind-up by the command", INERTIA: "wind-up by acceleration"}
 
 
-class Fit(NamedTuple):
+class KinematicFit(NamedTuple):
     """A fitted model; gaps and counts in the motor's unit.
 
     Attributes
@@ -61,7 +61,7 @@ class Verdict(NamedTuple):
     reasons: tuple[str, ...] = ()
 
 
-def verdict(fit: Fit, unit: str) -> Verdict:
+def verdict(fit: KinematicFit, unit: str) -> Verdict:
     """Judge a fit; `unit` is the motor's."""
     low, high = fit.gap - fit.half, fit.gap + fit.half
     none = low <= 0.0 or not fit.better_than_none
@@ -83,7 +83,7 @@ def verdict(fit: Fit, unit: str) -> Verdict:
     return Verdict(GapStatus.MODEL_MISMATCH, (max(min(ends), 0.0), max(ends)), reasons)
 
 
-def _doubts(fit: Fit, unit: str) -> tuple[str, ...]:
+def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
     """Reasons not to believe the interval."""
     reasons = []
     if abs(fit.by_travel - fit.gap) > _DISAGREE * math.hypot(fit.spread.std_of_difference, fit.quantisation):
