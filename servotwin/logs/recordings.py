@@ -11,7 +11,7 @@ import numpy as np
 
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
-from servotwin.estimation.kinematic.recording import Recording
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.logs.cleaning import Cleaned, cleaned
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.log import read_columns
@@ -61,7 +61,7 @@ class RecordedLog:
 
     Attributes
     ----------
-    recording : Recording
+    recording : EncoderRecording
     columns : mapping
         Name of each part's column.
     samples : int
@@ -70,7 +70,7 @@ class RecordedLog:
         Number of samples by defect, in words.
     """
 
-    recording: Recording
+    recording: EncoderRecording
     columns: Mapping[str, str]
     samples: int
     found: Mapping[str, int]
@@ -97,7 +97,7 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
     clean = cleaned(time, arrays, turns)
     _check_left(path, clean, size, columns)
-    recording = Recording(
+    recording = EncoderRecording(
         time=clean.time,
         motor=clean.channels["motor"],
         load=clean.channels["load"],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from servotwin.estimation.kinematic.recording import Recording
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.plant.backlash import play
 
 
@@ -21,4 +21,4 @@ def recording(gap=0.05, ratio=0.1, lag=0.0, noise=2e-5, count=1e-3, error=None, 
     load = ratio * output + 0.03 + noise * np.random.default_rng(seed).standard_normal(time.size)
     if error is not None:
         load = load + error(output)
-    return Recording(time, np.round(motor / count) * count, load)
+    return EncoderRecording(time, np.round(motor / count) * count, load)

@@ -13,10 +13,10 @@ from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
-from servotwin.estimation.kinematic.models import Comparison, Model, chosen, compared
+from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
 from servotwin.estimation.kinematic.profile import least_gap
-from servotwin.estimation.kinematic.recording import Recording
-from servotwin.estimation.kinematic.regression import LAG, RATIO, Design, columns, design, products, solved
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.regression import LAG, RATIO, Regression, columns, products, regression, solved
 from servotwin.estimation.kinematic.strokes import play_and_side, resolution, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
@@ -48,7 +48,7 @@ class LostMotion:
     reasons : tuple of str
     model : str
         The model that the evidence chose.
-    comparisons : tuple of Comparison
+    comparisons : tuple of ModelScore
         All models out of sample, from simple to rich.
     cycles : tuple of float
         Periods of cyclic errors, the motor's unit.
@@ -66,7 +66,7 @@ class LostMotion:
     status: GapStatus
     reasons: tuple[str, ...] = ()
     model: str = ""
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[ModelScore, ...] = ()
     cycles: tuple[float, ...] = ()
     rms: float = np.nan
     local: tuple[LocalGap, ...] = ()
@@ -89,7 +89,7 @@ class LostMotion:
         return self.status is GapStatus.OK
 
 
-def estimate_lost_motion(recording: Recording) -> LostMotion:
+def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     """Fit load = ratio x play(motor) + offset, with lag, wind-up and cyclic errors where the log shows them.
 
     The model is chosen by its errors on strokes that it was not fitted to; the interval is a block bootstrap over
@@ -105,13 +105,13 @@ def estimate_lost_motion(recording: Recording) -> LostMotion:
     least = _least_motion(recording)
     strokes = strokes_of(recording, least)
     _check(recording, least, strokes.reversals)
-    prepared = design(recording, strokes, 0)
+    prepared = regression(recording, strokes, 0)
     coarse = _coarse(prepared, least)
     # Until the gap has been taken up once nobody knows where the load is within it.
     first = _settled(recording, 1.1 * coarse)
     if first is None:
         return _bound(recording)
-    prepared = design(recording, strokes, first)
+    prepared = regression(recording, strokes, first)
     prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
     grid, tensor = _tensor(prepared, coarse, least)
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
@@ -120,7 +120,7 @@ def estimate_lost_motion(recording: Recording) -> LostMotion:
     return _answer(recording, prepared, best, comparisons, least)
 
 
-def _least_motion(recording: Recording) -> float:
+def _least_motion(recording: EncoderRecording) -> float:
     """Motion of the motor that is more than its encoder's counts and noise."""
     motor = recording.motor
     second = np.diff(motor, 2)
@@ -128,7 +128,7 @@ def _least_motion(recording: Recording) -> float:
     return max(_COUNTS * resolution(motor), 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(motor)))
 
 
-def _check(recording: Recording, least: float, reversals: int) -> None:
+def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
     unit, source = recording.motor_unit, recording.source
     reach = float(np.ptp(recording.motor))
     if not reach > 2.0 * least:
@@ -143,7 +143,7 @@ def _check(recording: Recording, least: float, reversals: int) -> None:
         )
 
 
-def _settled(recording: Recording, gap: float) -> int | None:
+def _settled(recording: EncoderRecording, gap: float) -> int | None:
     """First sample by which the motor has moved by `gap`."""
     motor = recording.motor
     reach = np.maximum.accumulate(motor) - np.minimum.accumulate(motor)
@@ -151,7 +151,7 @@ def _settled(recording: Recording, gap: float) -> int | None:
     return None if place > motor.size // 2 else place
 
 
-def _coarse(prepared: Design, least: float) -> float:
+def _coarse(prepared: Regression, least: float) -> float:
     """Gap of the least mean square on a geometric grid, everything else free but the lag."""
     reach = float(np.ptp(prepared.recording.motor))
     grid = np.concatenate([[0.0], np.geomspace(0.1 * least, 0.95 * reach, _GAPS)])
@@ -164,20 +164,20 @@ def _coarse(prepared: Design, least: float) -> float:
     return float(grid[int(np.argmin(squares))])
 
 
-def _cycles(prepared: Design, gap: float) -> tuple[float, ...]:
+def _cycles(prepared: Regression, gap: float) -> tuple[float, ...]:
     values, _ = columns(prepared, gap)
     used = Model("", (RATIO, "offset", LAG)).places(prepared)
     fit = solved(values @ values.T, used)
     return periods(values[1], values[0] - fit.coefficients @ values[used])
 
 
-def _tensor(prepared: Design, coarse: float, least: float) -> tuple[Array, Array]:
+def _tensor(prepared: Regression, coarse: float, least: float) -> tuple[Array, Array]:
     """Sums of products on a grid from 0 to twice the coarse gap."""
     grid = np.linspace(0.0, 2.0 * max(coarse, least), 2 * _FINE + 1)
     return grid, np.array([products(prepared, gap) for gap in grid])
 
 
-def _fitted(prepared: Design, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
+def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
     """Gap by time and by travel, and their bootstrap, on grids that are narrowed to the spread."""
     places = model.places(prepared)
     travel = _travel(prepared)
@@ -194,7 +194,7 @@ def _fitted(prepared: Design, model: Model, gap: float, width: float) -> tuple[f
     return gap, other, spread
 
 
-def _travel(prepared: Design) -> Array:
+def _travel(prepared: Regression) -> Array:
     """Way of the motor from one row to the next, its counts and noise left out, relative to the mean."""
     motor = prepared.recording.motor
     side = np.zeros(motor.size, dtype=np.int8)
@@ -204,7 +204,11 @@ def _travel(prepared: Design) -> Array:
 
 
 def _answer(
-    recording: Recording, prepared: Design, best: Comparison, comparisons: tuple[Comparison, ...], least: float
+    recording: EncoderRecording,
+    prepared: Regression,
+    best: ModelScore,
+    comparisons: tuple[ModelScore, ...],
+    least: float,
 ) -> LostMotion:
     """Fit the chosen model closely and judge it."""
     if LAG in best.model.used:
@@ -249,7 +253,7 @@ def _answer(
     )
 
 
-def _with_lag(prepared: Design, best: Comparison) -> Design:
+def _with_lag(prepared: Regression, best: ModelScore) -> Regression:
     """The design with the lag moved from its column, which is right to first order, into the time."""
     places = best.model.places(prepared)
     lag = places.index(prepared.names.index(LAG))
@@ -260,7 +264,7 @@ def _with_lag(prepared: Design, best: Comparison) -> Design:
     return prepared
 
 
-def _bound(recording: Recording) -> LostMotion:
+def _bound(recording: EncoderRecording) -> LostMotion:
     reach = float(np.ptp(recording.motor))
     reason = f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the gap is larger"
     return LostMotion(reach, np.inf, (reach, np.inf), np.nan, 0.0, GapStatus.LOWER_BOUND, (reason,))

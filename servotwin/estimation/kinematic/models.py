@@ -14,7 +14,7 @@ from servotwin.estimation.kinematic.regression import (
     OFFSET,
     RATIO,
     WIND_UP,
-    Design,
+    Regression,
     solved,
     squares_of,
 )
@@ -39,12 +39,12 @@ class Model(NamedTuple):
     name: str
     used: tuple[str, ...]
 
-    def places(self, design: Design) -> list[int]:
+    def places(self, design: Regression) -> list[int]:
         """Places of its columns."""
         return [design.names.index(name) for name in self.used]
 
 
-def models(design: Design) -> tuple[Model, ...]:
+def models(design: Regression) -> tuple[Model, ...]:
     """From simple to rich, as far as the design has the columns."""
     cyclic = tuple(name for name in design.names if name.startswith("cycle"))
     parts = [((), "rigid"), ((LAG,), "lag")]
@@ -58,7 +58,7 @@ def models(design: Design) -> tuple[Model, ...]:
     return tuple(found)
 
 
-class Comparison(NamedTuple):
+class ModelScore(NamedTuple):
     """How well a model predicts strokes that it was not fitted to.
 
     Attributes
@@ -78,7 +78,7 @@ class Comparison(NamedTuple):
     rms: float
 
 
-def compared(design: Design, grid: Array, tensor: Array, counts: Array) -> tuple[Comparison, ...]:
+def compared(design: Regression, grid: Array, tensor: Array, counts: Array) -> tuple[ModelScore, ...]:
     """Compare all models, and the best without a gap, out of sample.
 
     Parameters
@@ -111,7 +111,7 @@ def compared(design: Design, grid: Array, tensor: Array, counts: Array) -> tuple
 
 def _comparison(
     model: Model, places: Sequence[int], grid: Array, tensor: Array, counts: Array, folds: Sequence[Any]
-) -> Comparison:
+) -> ModelScore:
     total = tensor.sum(axis=1)
     squares, sizes = [], []
     for fold in folds:
@@ -122,10 +122,10 @@ def _comparison(
         sizes.append(counts[fold].sum())
     gap = float(least_gap(grid, solved(total, places).squares))
     rms = float(np.sqrt(np.sum(squares) / max(np.sum(sizes), 1)))
-    return Comparison(model, gap, np.array(squares) / np.maximum(sizes, 1), rms)
+    return ModelScore(model, gap, np.array(squares) / np.maximum(sizes, 1), rms)
 
 
-def chosen(comparisons: Sequence[Comparison]) -> Comparison:
+def chosen(comparisons: Sequence[ModelScore]) -> ModelScore:
     """The simplest model that no richer one beats by two standard errors."""
     best = comparisons[0]
     for each in comparisons[1:]:

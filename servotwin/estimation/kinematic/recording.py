@@ -8,7 +8,7 @@ from servotwin.plant.signals import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class EncoderRecording:
     """Samples of one machine, in increasing time, not necessarily uniform.
 
     Attributes

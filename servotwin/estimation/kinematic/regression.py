@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.kinematic.recording import Recording
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import Strokes, play_and_side
 from servotwin.plant.signals import Array
 
@@ -20,12 +20,12 @@ _SPAN = 5  # samples on either side of a difference quotient
 LOAD, RATIO, OFFSET, LAG, WIND_UP, INERTIA = "load", "ratio", "offset", "lag", "wind-up", "acceleration"
 
 
-class Design(NamedTuple):
+class Regression(NamedTuple):
     """A recording prepared for the regression.
 
     Attributes
     ----------
-    recording : Recording
+    recording : EncoderRecording
     strokes : Strokes
     rows : (k,) int array
         Samples that count.
@@ -37,7 +37,7 @@ class Design(NamedTuple):
         s, by which the load follows the motor; the lag's column is the rest, to first order.
     """
 
-    recording: Recording
+    recording: EncoderRecording
     strokes: Strokes
     rows: Any
     bounds: Any
@@ -52,19 +52,19 @@ class Design(NamedTuple):
         return (LOAD, RATIO, OFFSET, LAG, INERTIA, *command, *cyclic)
 
 
-def design(
-    recording: Recording, strokes: Strokes, first: int, cycles: Sequence[float] = (), lag: float = 0.0
-) -> Design:
+def regression(
+    recording: EncoderRecording, strokes: Strokes, first: int, cycles: Sequence[float] = (), lag: float = 0.0
+) -> Regression:
     """Choose the rows from sample `first` on."""
     begin = max(first, int(strokes.begin[0]))
     rows = np.unique(np.linspace(begin, recording.motor.size - 1, min(ROWS, recording.motor.size - begin)).astype(int))
     bounds = np.searchsorted(rows, np.maximum(strokes.begin, begin))
     kept = np.diff(bounds, append=rows.size) > 0
     strokes = Strokes(strokes.begin[kept], strokes.side[kept])
-    return Design(recording, strokes, rows, bounds[kept], np.asarray(cycles, dtype=float), lag)
+    return Regression(recording, strokes, rows, bounds[kept], np.asarray(cycles, dtype=float), lag)
 
 
-def columns(design: Design, gap: float) -> tuple[Array, Array]:
+def columns(design: Regression, gap: float) -> tuple[Array, Array]:
     """Columns of the regression, (p, k), and the side of the flank that was touched last, (k,)."""
     recording = design.recording
     side = np.zeros(recording.motor.size, dtype=np.int8)
@@ -91,7 +91,7 @@ def _rate(time: Array, values: Array) -> Array:
     return result
 
 
-def products(design: Design, gap: float, weights: Array | None = None) -> Array:
+def products(design: Regression, gap: float, weights: Array | None = None) -> Array:
     """Sums of products of the columns, (m strokes, p, p)."""
     values, _ = columns(design, gap)
     weighted = values if weights is None else values * weights

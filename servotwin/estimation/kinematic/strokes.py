@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.kinematic.recording import Recording
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.hybrid.compiled import compiled
 from servotwin.plant.signals import Array
 
@@ -63,7 +63,7 @@ def resolution(values: Array) -> float:
     return float(np.quantile(steps, 0.01)) if steps.size else 0.0
 
 
-def strokes_of(recording: Recording, least: float) -> Strokes:
+def strokes_of(recording: EncoderRecording, least: float) -> Strokes:
     """Cut at reversals of the motor by more than `least` (the motor's unit)."""
     side = np.zeros(recording.motor.size, dtype=np.int8)
     play_and_side(recording.motor, least, side)

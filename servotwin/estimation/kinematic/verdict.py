@@ -10,8 +10,8 @@ import numpy as np
 
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic.bootstrap import Spread
-from servotwin.estimation.kinematic.models import Comparison
-from servotwin.estimation.kinematic.regression import INERTIA, LAG, WIND_UP, Design
+from servotwin.estimation.kinematic.models import ModelScore
+from servotwin.estimation.kinematic.regression import INERTIA, LAG, WIND_UP, Regression
 from servotwin.plant.signals import Array
 
 _DISAGREE = 2.0  # standard deviations between two weightings of the samples that a right model does not show
@@ -53,7 +53,7 @@ class KinematicFit(NamedTuple):
     better_than_none: bool
 
 
-class Verdict(NamedTuple):
+class KinematicVerdict(NamedTuple):
     """Status, 95 % interval and reasons."""
 
     status: GapStatus
@@ -61,7 +61,7 @@ class Verdict(NamedTuple):
     reasons: tuple[str, ...] = ()
 
 
-def verdict(fit: KinematicFit, unit: str) -> Verdict:
+def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
     """Judge a fit; `unit` is the motor's."""
     low, high = fit.gap - fit.half, fit.gap + fit.half
     none = low <= 0.0 or not fit.better_than_none
@@ -70,17 +70,17 @@ def verdict(fit: KinematicFit, unit: str) -> Verdict:
             f"the load deviates by {fit.left:.3g} {unit} (rms, at the motor) from following the motor through a gap of "
             f"{fit.gap:.3g} {unit}: it swings or winds up; record a slow motion, or give the machine (--servo)"
         )
-        return Verdict(GapStatus.MODEL_MISMATCH, NOTHING_KNOWN, (reason,))
+        return KinematicVerdict(GapStatus.MODEL_MISMATCH, NOTHING_KNOWN, (reason,))
     if none:
         high = max(high, 3.0 * fit.left, *(gap + fit.half for gap in fit.simpler.values()))
-        return Verdict(
+        return KinematicVerdict(
             GapStatus.UNIDENTIFIABLE, (0.0, high), (f"no gap can be told from none: at most {high:.3g} {unit}",)
         )
     reasons = _doubts(fit, unit)
     if not reasons:
-        return Verdict(GapStatus.OK, (max(low, 0.0), high))
+        return KinematicVerdict(GapStatus.OK, (max(low, 0.0), high))
     ends = (low, high, fit.by_travel - fit.half, fit.by_travel + fit.half, *fit.simpler.values())
-    return Verdict(GapStatus.MODEL_MISMATCH, (max(min(ends), 0.0), max(ends)), reasons)
+    return KinematicVerdict(GapStatus.MODEL_MISMATCH, (max(min(ends), 0.0), max(ends)), reasons)
 
 
 def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
@@ -103,7 +103,7 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
     return tuple(reasons)
 
 
-def simpler(best: Comparison, comparisons: tuple[Comparison, ...]) -> Mapping[str, float]:
+def simpler(best: ModelScore, comparisons: tuple[ModelScore, ...]) -> Mapping[str, float]:
     """Gaps of the models that leave out the chosen one's lag, or its wind-up."""
     result = {}
     for name in (LAG, WIND_UP, INERTIA):
@@ -114,7 +114,7 @@ def simpler(best: Comparison, comparisons: tuple[Comparison, ...]) -> Mapping[st
     return result
 
 
-def structured(design: Design, residual: Array) -> float:
+def structured(design: Regression, residual: Array) -> float:
     """Root mean square of the residual's means over pieces of the strokes, white noise taken off."""
     edges = np.unique(
         np.concatenate([np.linspace(a, b, _PIECES + 1).astype(int) for a, b in _pairs(design.bounds, residual.size)])

@@ -9,7 +9,7 @@ from recordings import recording, swings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
-from servotwin.estimation.kinematic.recording import Recording
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import play_and_side
 from servotwin.plant.backlash import play
 
@@ -49,7 +49,7 @@ def test_without_a_gap_none_is_claimed():
 
 def test_a_load_that_never_follows_is_a_bound():
     time, motor = swings()
-    found = estimate_lost_motion(Recording(time, motor, np.full(time.size, 0.3)))
+    found = estimate_lost_motion(EncoderRecording(time, motor, np.full(time.size, 0.3)))
     assert found.status is not GapStatus.OK
     assert not math.isfinite(found.interval_motor[1])
 
@@ -63,7 +63,7 @@ def test_a_swinging_load_is_no_gap():
         state[1] += step * (omega**2 * (0.1 * motor[i] - state[0]) - 2.0 * omega * 0.05 * state[1])
         state[0] += step * state[1]
         load[i] = state[0]
-    found = estimate_lost_motion(Recording(time, motor, load))
+    found = estimate_lost_motion(EncoderRecording(time, motor, load))
     assert found.status is GapStatus.MODEL_MISMATCH
     assert math.isnan(found.gap_motor)
 
@@ -72,7 +72,7 @@ def test_each_reversal_shows_where_the_gap_is_worn():
     time, motor = swings()
     # Twice the gap in the upper half of the travel.
     gap = 0.05 * (1.0 + 1.0 / (1.0 + np.exp(-4.0 * motor)))
-    found = estimate_lost_motion(Recording(time, motor, 0.1 * play(motor, gap)))
+    found = estimate_lost_motion(EncoderRecording(time, motor, 0.1 * play(motor, gap)))
     upper = np.median([each.gap for each in found.local if each.position > 0.15])
     lower = np.median([each.gap for each in found.local if each.position < -0.15])
     assert 0.05 < lower < 0.065
@@ -84,7 +84,7 @@ def test_two_weightings_disagree_where_the_model_is_wrong():
     time, motor = swings()
     rate = np.gradient(motor, time)
     load = 0.1 * play(motor, 0.05) - 3e-3 * np.tanh(0.3 * rate) ** 3
-    found = estimate_lost_motion(Recording(time, motor, load))
+    found = estimate_lost_motion(EncoderRecording(time, motor, load))
     assert found.status is GapStatus.MODEL_MISMATCH
     assert "if the motor's way does" in found.reasons[0]
 
@@ -97,7 +97,7 @@ def test_two_weightings_disagree_where_the_model_is_wrong():
 def test_motions_that_show_nothing_are_refused(motor, message):
     time, _ = swings()
     with pytest.raises(InvalidInput, match=message):
-        estimate_lost_motion(Recording(time, motor(time), 0.1 * motor(time)))
+        estimate_lost_motion(EncoderRecording(time, motor(time), 0.1 * motor(time)))
 
 
 def test_play_is_the_play_operator_from_the_first_contact_on():
@@ -118,7 +118,7 @@ def test_intervals_cover():
             gap=0.08, noise=0.0, seconds=12.0, rate=100.0, seed=seed, error=lambda angle: 3e-4 * np.sin(7.0 * angle)
         )
         drift = np.cumsum(generator.standard_normal(made.time.size)) * 1e-5
-        found = estimate_lost_motion(Recording(made.time, made.motor, made.load + drift))
+        found = estimate_lost_motion(EncoderRecording(made.time, made.motor, made.load + drift))
         accepted += found.ok
         inside += found.interval_motor[0] <= 0.08 <= found.interval_motor[1]
     assert inside >= 11
