@@ -76,9 +76,9 @@ def _html(log: RecordedLog, found: LostMotion, headline: str, vector: bytes) -> 
         page.figure(
             vector,
             "Lost motion.",
-            "(a) By how much the motor leads the load, lag included, and half the gap on either side. (b) The gap that each "
-            "reversal shows. (c) What the model leaves of the load's position. (d) The model's error for other gaps; "
-            "shaded: 95 % interval.",
+            "(a) By how much the motor leads the load, lag included, and half the gap on either side. (b) The gap that "
+            "each reversal shows. (c) What the model leaves of the load's position. (d) The model's error for other "
+            "gaps; shaded: 95 % interval.",
         ),
         "<h2>Models</h2>",
         page.table(["model", f"gap, {unit}", f"error on unseen strokes, {unit}"], models),
