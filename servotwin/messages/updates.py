@@ -141,15 +141,17 @@ class UpdateWithNeeds(Update, frozen=True, omit_defaults=True, tag="update/3"):
 
 _EVERY_VERSION = frozenset(("Kp", "Ki", "Kd", "Tf", "enter", "leave", "feedforward"))
 """Fields of the gains that edges of every version know."""
-KNOWN_FIELDS = frozenset(Gains.__struct_fields__)
-"""Fields of the gains that this version knows."""
+_LAW = "law"
+"""Gains of a law other than the filtered PID: edges of versions before would set the dead zone alone."""
+KNOWN_FIELDS = frozenset((*Gains.__struct_fields__, _LAW))
+"""Fields of a setting that this version knows."""
 
 
 def needed_fields(setting: Setting) -> tuple[str, ...]:
     """Fields without which the gains of a setting would be others: all that not every version knows, and that count."""
     gains = setting.gains
-    if not isinstance(gains, Gains):  # None, or gains of a law with a tag of its own, which no other version mistakes
-        return ()
+    if not isinstance(gains, Gains):
+        return () if gains is None else (_LAW,)
     first = len(gains.__struct_fields__) - len(gains.__struct_defaults__)
     defaults = dict(zip(gains.__struct_fields__[first:], gains.__struct_defaults__, strict=True))
     later = (name for name in gains.__struct_fields__ if name not in _EVERY_VERSION)

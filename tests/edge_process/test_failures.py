@@ -18,7 +18,7 @@ from servotwin.edge.outlet import CHANNELS, NOT_ADOPTED, UNFILTERED
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge_process import frames, monitoring
+from servotwin.edge_process import frame_handler, frames, monitoring
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.frame_handler import FrameHandler
 from servotwin.edge_process.monitoring import TickHistogram

@@ -7,6 +7,7 @@ from servotwin.edge.guard import Instant, Limits, judge
 from servotwin.edge.parameters import Parameters
 from servotwin.messages import (
     KNOWN_FIELDS,
+    CascadeGains,
     Gains,
     Hello,
     InvalidMessage,
@@ -70,3 +71,9 @@ def test_a_hello_without_a_protocol_is_of_version_1_and_one_with_more_fields_is_
     with pytest.raises(InvalidMessage) as error:
         decode(msgspec.msgpack.encode({"type": "hello/9"}))
     assert error.value.refusal is Refusal.UNKNOWN_SCHEMA
+
+
+def test_gains_of_another_law_are_needed_as_a_whole() -> None:
+    cascade = Setting.of(1e-5, CascadeGains(20.0, 0.5))
+    assert needed_fields(cascade) == ("law",)
+    assert "law" in KNOWN_FIELDS
