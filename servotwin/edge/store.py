@@ -70,7 +70,7 @@ class FileParameterStore:
 
     def save(self, parameters: Parameters) -> None:
         """Replace the file; return when it is on the disk. Raises OSError."""
-        replace_file(self._path, msgspec.json.encode(StoredParameters.of(parameters)), durable=True)
+        replace_file(self._path, msgspec.json.encode(StoredParameters.of(parameters)), durable=True, mode=0o600)
 
     def load(self) -> Parameters | None:
         """Return the parameters in the file, in the form of this version or of the one before; None: there is no file.

@@ -217,8 +217,10 @@ class LinkProcess:
         """Send acknowledged windows again where the twin asks for them; the agent ignores that message."""
         message = decode(body)
         if isinstance(message, Resend) and message.servo == self._config.agent.servo:
-            log("windows asked for again", number=self.outbox.resend(message.asks_for), why=message.reason)
-            self._outbox_changed.set()
+            number = self.outbox.resend(message.asks_for)
+            if number:  # it may ask for windows that the filter kept back, again and again
+                log("windows asked for again", number=number, why=message.reason)
+                self._outbox_changed.set()
 
     def _emit(self, frame: bytes) -> None:
         """Have the main thread send a frame; called from another."""

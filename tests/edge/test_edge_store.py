@@ -45,6 +45,11 @@ def test_version_setting_and_fallback_outlive_a_boot(store: ParameterStore) -> N
     assert store.load() == Parameters(7, GOOD.setting, fallback=True)
 
 
+def test_only_its_owner_may_read_it(tmp_path: Path) -> None:
+    FileParameterStore(tmp_path / "kept.json").save(GOOD)
+    assert (tmp_path / "kept.json").stat().st_mode & 0o777 == 0o600
+
+
 def test_a_crash_while_writing_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     store = FileParameterStore(tmp_path / "kept.json")
     store.save(Parameters(3, Setting(2e-4)))
