@@ -109,8 +109,13 @@ def laws_within(
     Raises
     ------
     InvalidInput
-        There is none.
+        There is none, or the servo's controller has no proportional action.
     """
+    if servo.pidf.Kp == 0.0:
+        raise InvalidInput(
+            "controller kp = 0: verified settings have scaled proportional gains, and this controller has none; give "
+            'one, or another policy than "certified"'
+        )
     plants = plant_set(servo, uncertainty, servo.pidf.sample_rate)
     delays = delays_of(servo.pidf, uncertainty)
     own = servo.pidf
