@@ -237,8 +237,8 @@ def measured(machine: ShelfMachine) -> dict[str, Any]:
         "statuses": [each.status.value for each in loop.estimates],
         "reasons": ["; ".join(each.reasons) for each in loop.estimates],
         "estimates": [
-            judged(each, *gaps, machine.count)
-            for each, gaps in zip(loop.estimates, true.tolist(), strict=True)
+            judged(each, (first, gap, last), machine.count)
+            for each, (first, gap, last) in zip(loop.estimates, true.tolist(), strict=True)
             if each.ok
         ],
         "sent": len(loop.updates),
@@ -247,13 +247,14 @@ def measured(machine: ShelfMachine) -> dict[str, Any]:
     }
 
 
-def judged(estimate: GapEstimate, first: float, gap: float, last: float, count: float) -> dict[str, float]:
+def judged(estimate: GapEstimate, gaps: tuple[float, float, float], count: float) -> dict[str, float]:
     """An accepted estimate: gap (rad) in the middle of its window, error, and 1.0 where the interval contains that gap.
 
     It is near where it is off by at most 1 % or two counts from a gap that the machine had within the window, from the
-    first to the last: here a gap that wears in years grows by up to a tenth in one window.
+    first to the last of `gaps`: here a gap that wears in years grows by up to a tenth in one window.
     """
-    error, (low, high) = max(first - estimate.gap, estimate.gap - last, 0.0), estimate.interval
+    (first, gap, last), (low, high) = gaps, estimate.interval
+    error = max(first - estimate.gap, estimate.gap - last, 0.0)
     near = error <= max(_EXACT * gap, _COUNTS * count)
     return {"gap": gap, "error": error, "inside": float(low <= gap <= high), "near": float(near)}
 

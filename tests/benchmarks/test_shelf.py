@@ -49,7 +49,7 @@ def test_a_preset_without_a_load_encoder_is_refused() -> None:
 def test_an_estimate_is_judged_by_gap_interval_and_counts() -> None:
     def at(gap: float, half: float) -> dict[str, float]:
         estimate = GapEstimate(gap, 0.1 * half, half, (gap - half, gap + half), GapStatus.OK, 1.0)
-        return judged(estimate, 0.9, 1.0, 1.1, 1e-3)
+        return judged(estimate, (0.9, 1.0, 1.1), 1e-3)
 
     assert at(1.0, 0.1) == {"gap": 1.0, "error": 0.0, "inside": 1.0, "near": 1.0}
     assert at(1.109, 0.05)["near"] == 1.0
