@@ -73,13 +73,13 @@ class SampledGroup:
 
 
 def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
-    """True for members that advance in blocks: an ideal sensor, and ticks at every sample of the output; with a
-    friction feedforward a reference that is constant in every piece."""
+    """True for members that advance in blocks: ticks at every sample of the output; with a friction feedforward a
+    reference that is constant in every piece."""
     if members.controllers[member].friction_feedforward != 0.0 and degree(span.shape) > 0:
         return False
     ratio = (members.controllers[member].sample_rate or 0.0) / span.rate
     whole = round(ratio)
-    return members.constants["resolution"][member] == 0.0 and whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
+    return whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
 
 
 def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
@@ -98,7 +98,8 @@ def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
     always = law.feedforward == 0.0 and law.friction_feedforward == 0.0
     feedforwards = always, law.velocity_feedforward == 0.0
     switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    return structure_of(servo), *limits, law.notch_hz == 0.0, *feedforwards, *switches
+    counts = here["resolution"] > 0.0
+    return structure_of(servo), *limits, law.notch_hz == 0.0, *feedforwards, *switches, counts
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:
@@ -116,10 +117,11 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
         ]
     )
     loops = sampled_plants([servo for servo, _ in plant_places], 0, bool(bias), bool(friction))
-    places = places_of(loops.first, laws[0], delay, degree(span.shape))
+    counts = bool(constants["resolution"][0] > 0.0)
+    places = places_of(loops.first, laws[0], delay, degree(span.shape), counts)
     states = np.zeros((len(which), places.states))
     states[:, : places.plant] = starts_of(loops, plant, constants)
-    for follower in (places.filtered, places.past):
+    for follower in (places.filtered, places.past, places.counted):
         if follower >= 0:
             states[:, follower] = states[:, places.position]
     if places.feedforward >= 0:
@@ -130,8 +132,10 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     enter, leave = np.array(thresholds).T.copy()
     order = np.lexsort((law, plant))
     limits = np.zeros((len(which), len(span.outputs)))
-    starts = SampledStarts(order, plant, law, states, constants["reference"], enter, leave, limits)
-    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone), family, starts)
+    starts = SampledStarts(
+        order, plant, law, states, constants["reference"], enter, leave, constants["resolution"], limits
+    )
+    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone, counts), family, starts)
 
 
 def _family(
@@ -238,7 +242,7 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         new_memory(group.places, family.modes, group.watches),
         new_scratch(tables, pending),
         np.zeros(n),
-        Place(np.zeros(7, dtype=np.int64), np.zeros(1)),
+        Place(np.zeros(8, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),
         np.zeros(4),
         np.zeros((outputs, slots), dtype=np.int8),
