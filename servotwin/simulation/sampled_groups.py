@@ -85,21 +85,28 @@ def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
 def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
     """Members that advance in blocks, by structure."""
     by_structure: dict[object, list[int]] = {}
-    for member in range(len(members.servos)):
+    for member, structure in enumerate(_structures(members)):
         if in_blocks(members, member, span):
-            by_structure.setdefault(_structure_of(members, member), []).append(member)
+            by_structure.setdefault(structure, []).append(member)
     return [_group(members, span, np.array(which)) for which in by_structure.values()]
 
 
-def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
-    servo, law = members.servos[member], members.controllers[member]
-    here = {name: float(values[member]) for name, values in members.constants.items()}
+def _structures(members: SampledMembers) -> Iterator[tuple[object, ...]]:
+    """The structure of each member."""
+    constants = members.constants
+    columns = [constants[name] != 0.0 for name in ("tolerance", "input_bias", "friction", "resolution")]
+    switches = zip(*(column.tolist() for column in [*columns, constants["delay"]]), strict=True)
+    # Members share laws, and many share a servo.
+    servos = {id(servo): structure_of(servo) for servo in {id(each): each for each in members.servos}.values()}
+    laws = {id(law): _law_structure(law) for law in {id(each): each for each in members.controllers}.values()}
+    for servo, law, switch in zip(members.servos, members.controllers, switches, strict=True):
+        yield servos[id(servo)], laws[id(law)], switch
+
+
+def _law_structure(law: Controller) -> tuple[bool, ...]:
     limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None
     always = law.feedforward == 0.0 and law.friction_feedforward == 0.0
-    feedforwards = always, law.velocity_feedforward == 0.0
-    switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    counts = here["resolution"] > 0.0
-    return structure_of(servo), *limits, law.notch_hz == 0.0, *feedforwards, *switches, counts
+    return *limits, law.notch_hz == 0.0, always, law.velocity_feedforward == 0.0
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:
