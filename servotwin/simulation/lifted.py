@@ -34,7 +34,7 @@ UNFILLED = 3
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
-# Ticks that a count must last before a block pays: as many again are likely to follow.
+# Ticks that a count must last before a block pays: the next ones are likely to last as long, this one as long again.
 _LASTS = 16
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
@@ -293,13 +293,13 @@ def run_lifted(
     FULL where a record must grow, and UNFILLED where `fill_here` is due."""
     at, x = place.at, z[: places.plant]
     room = len(record.event_step) - 2 * EVENTS_PER_STEP
-    least = _LASTS if places.counted >= 0 else 1
     while at[0] < end:
         if segments.size[0] + 8 > len(segments.tick) or segments.size[1] + 8 > len(segments.tick):
             return FULL
         if record.size[1] > room:
             return FULL
         set_reference(places, coefficients, at[0] / rate - origin, z)
+        least = _LASTS if places.counted >= 0 and at[8] < _LASTS else 1
         if at[5] >= least and end - at[0] >= 2:
             filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
             at[6] = 1 if deepens(place, end, filled) else 0
@@ -330,7 +330,8 @@ def run_lifted(
                 return ZENO
         # Another branch may hold for one tick only: blocks begin after two alike.
         alike = at[1] == mode and at[2] == active and at[4] == side and at[3] == kind and place.sign[0] == sign
-        alike = alike and (places.counted < 0 or at[7] == 1)
+        if places.counted >= 0 and at[7] == 0:
+            alike, at[8] = False, at[5]
         at[5] = at[5] + 1 if alike else 0
         at[0] += 1
     return DONE

@@ -171,12 +171,14 @@ class LiftedEngine:
         self.past, self.direction = float(start[self.places.position]), 0.0
         modes, law = len(self.plant.automaton.modes), self.controller.law(None)
         dead_zone = self.inputs.tolerance is not None and bool(np.any(self.inputs.tolerance.coeffs[:, 0] > 0.0))
-        self.loop = LiftedLoop(law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes, resolution)
+        self.loop = LiftedLoop(
+            law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes, resolution
+        )
         self.memory = new_memory(self.places, modes, watches_of(self.plant, self.controller, dead_zone, counts))
         self.segments = new_segments(self.places.states, _ROOM)
         self.record = new_record(self.places.plant)
         self.scratch = new_scratch(self.tables)
-        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
+        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
 
     def advance(self, index: int) -> None:
         """Run from the start to the last sample; `index` must be that one."""

@@ -80,8 +80,8 @@ class LiftedMemory(NamedTuple):
 class Place(NamedTuple):
     """Progress of a run.
 
-    ``at = [tick, mode, active, kind, side of the error, ticks since a switch, need of the vast scale, same count]``; `sign`
-    of the limit that acts.
+    ``at = [tick, mode, active, kind, side of the error, ticks since a switch or another count, need of the vast scale,
+    1: same count as before, ticks that the last count stayed]``; `sign` of the limit that acts.
     """
 
     at: NDArray[np.int64]

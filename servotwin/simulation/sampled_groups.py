@@ -249,7 +249,7 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         new_memory(group.places, family.modes, group.watches),
         new_scratch(tables, pending),
         np.zeros(n),
-        Place(np.zeros(8, dtype=np.int64), np.zeros(1)),
+        Place(np.zeros(9, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),
         np.zeros(4),
         np.zeros((outputs, slots), dtype=np.int8),
