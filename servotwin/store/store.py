@@ -100,6 +100,7 @@ class Store:
         kinds: Collection[MessageKind] = WORK_KINDS,
         per_servo: int = 16,
         servo: str | None = None,
+        newest_first: bool = False,
     ) -> list[Lease]:
         """Lease servos that have unprocessed messages of these kinds, or that are due to be woken.
 
@@ -116,12 +117,14 @@ class Store:
             s; s since the epoch.
         servo : str, optional
             Only this one.
+        newest_first : bool
+            Where not all windows of a servo are leased, the newest ones are; of other kinds always the oldest.
         """
         leased = self._write(lambda c: results.acquire(c, owner, limit, now + lease_s, now, kinds, servo))
         if not leased:
             return []
         with transaction(self.engines.reader) as connection:
-            loaded = results.load(connection, leased, kinds, per_servo)
+            loaded = results.load(connection, leased, kinds, per_servo, newest_first)
             due = results.due(connection, leased, now)
         idle = {lease.servo for lease in loaded if not lease.messages and lease.servo not in due}
         if idle:
@@ -131,6 +134,14 @@ class Store:
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
         """End leases without a result: all of an owner's, or those of some servos."""
         self._write(lambda connection: results.release(connection, owner, servos))
+
+    def renew(self, owner: str, servos: Collection[str], until: float) -> None:
+        """Extend an owner's leases of some servos until a time, s since the epoch; those that it has lost stay lost."""
+        self._write(lambda connection: results.renew(connection, owner, servos, until))
+
+    def hold(self, servo: str, until: float) -> None:
+        """Let nobody lease a servo until a time, s since the epoch; does nothing where somebody has it."""
+        self._write(lambda connection: results.hold(connection, servo, until))
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first.

@@ -160,6 +160,23 @@ class ServiceConfig:
         float, key(minimum=0.0, help="Largest lead of a window's sample time over that ratio.")
     ] = 60.0
     job_timeout_s: Annotated[float, key(above=0.0, help="Time for one servo after which a worker is replaced.")] = 300.0
+    worker_share: Annotated[
+        float,
+        key(
+            above=0.0,
+            maximum=1.0,
+            help="Largest share of one worker's time for one servo, while work waits for a worker.",
+        ),
+    ] = 0.5
+    lag_limit_s: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Time for which new messages of a servo may wait for their turn; beyond it the service reports itself "
+            "as degraded.",
+        ),
+    ] = 30.0
     log_level: Annotated[str, key(choices=_LOG_LEVELS, help="Level of the log.")] = "info"
     mqtt: MqttConfig | None = None
 

@@ -15,13 +15,13 @@ from uuid import uuid4
 from servotwin.messages import NAME_PATTERN
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
-from servotwin.store.records import OutgoingMessage
+from servotwin.store.records import Backlog, OutgoingMessage
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.config import SQLITE
-from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
+from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
@@ -37,7 +37,7 @@ from servotwin.twin_service.worker import WorkerPool
 
 log = logging.getLogger(__name__)
 
-_REFRESH_S, _RETENTION_S, _DAY = 1.0, 600.0, 86400.0
+_REFRESH_S, _WATCH_S, _RETENTION_S, _DAY = 1.0, 5.0, 600.0, 86400.0
 _UNHEALTHY_S = 60.0
 """s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
 _SOLE_OWNER = "twin"
@@ -95,6 +95,9 @@ class TwinService:
             clocks=self.clocks,
             owner=self._owner,
             quota=VerificationQuota(config.verifications_per_minute),
+            # In lock-step everything is worked on in order, however long it takes.
+            pace=WorkPace(1.0 if config.lockstep else config.worker_share),
+            speed=min(1.0, config.speed),
         )
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
@@ -125,6 +128,7 @@ class TwinService:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
             self._spawn(self.dispatcher.run())
+            self._spawn(self._watch_lag())
         if not math.isinf(self.config.retention_days):
             self._spawn(self._apply_retention())
         if self._mqtt is not None:
@@ -144,12 +148,19 @@ class TwinService:
         await asyncio.to_thread(self.commits.close)
         self.executor.close()
 
-    def health(self) -> dict[str, Any]:
-        """Health of each part, and "ok" for all."""
+    def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
+        """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
         store, workers = self._store_healthy(), self.pool.alive
         dispatching = all(not task.done() for task in self._tasks)
         ok = store and workers > 0 and dispatching
-        return {"ok": ok, "store": store, "workers": workers, "dispatching": dispatching}
+        degraded = [*self._lagging(backlog)]
+        return {"ok": ok, "degraded": degraded, "store": store, "workers": workers, "dispatching": dispatching}
+
+    def _lagging(self, backlog: Backlog | None) -> list[str]:
+        """The lag in a sentence, where it is above its limit."""
+        if backlog is None or backlog.lag <= self.config.lag_limit_s:
+            return []
+        return [f"new messages of a servo have waited for {backlog.lag:.0f} s, {backlog.messages} in all"]
 
     def _store_healthy(self) -> bool:
         """Last read and last write succeeded, or that write failed long ago: none may have been tried since."""
@@ -176,6 +187,20 @@ class TwinService:
             await asyncio.sleep(_REFRESH_S)
             with suppress(StoreUnavailable):
                 self.polls.notify_serials(await self.executor.run(partial(self.store.posted, self.polls.waiting)))
+
+    async def _watch_lag(self) -> None:
+        """Log when new messages begin to wait too long, and when they no longer do."""
+        lagging = False
+        while True:
+            await asyncio.sleep(_WATCH_S)
+            with suppress(StoreUnavailable):
+                backlog = await self.executor.run(lambda: self.store.backlog(self.clocks.wall()))
+                before, lagging = lagging, bool(self._lagging(backlog))
+                figures = {"lag": round(backlog.lag, 1), "waiting": backlog.messages}
+                if lagging and not before:
+                    log.warning("updates lag", extra=figures)
+                if before and not lagging:
+                    log.info("updates lag no longer", extra=figures)
 
     async def _apply_retention(self) -> None:
         """Delete the bodies of windows that are too old."""
