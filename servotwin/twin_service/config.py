@@ -143,8 +143,12 @@ class ServiceConfig:
         float,
         key(above=0.0, infinite=True, help="Time after which the body of a window that led to no update is deleted."),
     ] = 30.0
-    rate_limit_per_s: Annotated[float, key(above=0.0, help="Largest mean rate of messages from one servo.")] = 20.0
-    rate_burst: Annotated[float, key(above=0.0, help="Largest burst of messages from one servo.")] = 200.0
+    rate_limit_per_s: Annotated[
+        float, key(above=0.0, help="Largest mean rate of messages from one servo, and of its polls.")
+    ] = 20.0
+    rate_burst: Annotated[float, key(above=0.0, help="Largest burst of messages from one servo, and of its polls.")] = (
+        200.0
+    )
     max_body_bytes: Annotated[
         int, key(minimum=1024, maximum=MAX_BYTES, help="Largest size of a body, as sent and as decompressed.")
     ] = MAX_BYTES
@@ -152,6 +156,9 @@ class ServiceConfig:
     long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Largest number of long polls open at once.")] = (
         20_000
     )
+    polls_per_servo: Annotated[
+        int, key(minimum=1, maximum=_MOST, help="Largest number of long polls of one servo open at once.")
+    ] = 8
     queue: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of messages that wait for their commit.")
     ] = 2000

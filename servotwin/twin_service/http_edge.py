@@ -44,8 +44,8 @@ class LongPolls:
     ----------
     read : callable
         Reads the store without blocking the event loop.
-    limit : int
-        Polls that may wait at once.
+    limit, per_servo : int
+        Polls that may wait at once, in all and of one servo.
     shared : bool
         Other processes post messages too: the caller has to read from the store the newest serials of the servos in
         `waiting` and give them to `notify_serials`.
@@ -56,8 +56,9 @@ class LongPolls:
         Polls that are being served.
     """
 
-    def __init__(self, read: Read, limit: int, shared: bool = False) -> None:
+    def __init__(self, read: Read, limit: int, shared: bool = False, per_servo: int | None = None) -> None:
         self._read, self._limit, self._shared = read, limit, shared
+        self._per_servo, self._open_of = limit if per_servo is None else per_servo, Counter[str]()
         self._waiting: dict[str, dict[asyncio.Future[None], int]] = {}
         self._notifications: Counter[str] = Counter()
         self._empty_after: dict[str, int] = {}
@@ -99,11 +100,17 @@ class LongPolls:
         """
         if self.open >= self._limit:
             raise RequestRejected(Refusal.TOO_MANY, f"{self._limit} polls wait already")
+        if self._open_of[servo] >= self._per_servo:
+            raise RequestRejected(Refusal.TOO_MANY, f"{self._per_servo} polls of servo {servo!r} wait already")
         self.open += 1
+        self._open_of[servo] += 1
         try:
             return await self._poll(servo, after, wait)
         finally:
             self.open -= 1
+            self._open_of[servo] -= 1
+            if not self._open_of[servo]:
+                del self._open_of[servo]
 
     async def _poll(self, servo: str, after: int, wait: float) -> Sequence[OutgoingMessage]:
         loop = asyncio.get_running_loop()
@@ -236,7 +243,7 @@ class EdgeApi:
     async def _get_outgoing(self, request: HttpRequest) -> HttpResponse:
         """Sealed messages with serials above `after`, as soon as there are some; none after `wait` s."""
         servo = request.path["servo"]
-        self._gate.admit(servo, request.token, limited=False)
+        self._gate.admit_poll(servo, request.token)
         after, wait = request.integer("after", 0), request.seconds("wait", 0.0)
         if wait > MAX_WAIT_S:
             detail = f"wait = {wait:g} s: at most {MAX_WAIT_S:g} s are allowed"

@@ -91,7 +91,7 @@ class MqttRequestHandler:
     async def _handle(self, request: ReceivedRequest) -> MqttResponse:
         servo, question = request.servo, request.content
         if isinstance(question, PollRequest):
-            self._gate.admit_authenticated(servo, limited=False)
+            self._gate.admit_authenticated_poll(servo)
             messages = await self._polls.messages(servo, question.after, question.wait)
             return PollResponse(seal_messages(self._gate.verifier(servo), servo, messages))
         self._gate.admit_authenticated(servo)

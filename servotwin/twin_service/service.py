@@ -13,10 +13,11 @@ from typing import Any
 from uuid import uuid4
 
 from servotwin.messages import NAME_PATTERN
+from servotwin.store.clock_gaps import received_before
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
-from servotwin.store.records import Backlog, OutgoingMessage
-from servotwin.store.retention import delete_old_bodies
+from servotwin.store.records import Backlog, OutgoingMessage, PutResult
+from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
@@ -38,6 +39,9 @@ from servotwin.twin_service.worker import WorkerPool
 log = logging.getLogger(__name__)
 
 _REFRESH_S, _WATCH_S, _RETENTION_S, _DAY = 1.0, 5.0, 600.0, 86400.0
+_LEAST_DELETED = 4096
+"""Windows that one pass of retention may empty, beside twice those that came since the pass before: it keeps pace, and
+a mistake does not cost the past at once."""
 _UNHEALTHY_S = 60.0
 """s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
 _SOLE_OWNER = "twin"
@@ -69,7 +73,7 @@ class TwinService:
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
-        self.polls = LongPolls(self._read_outgoing, config.long_polls, shared=self._shared)
+        self.polls = LongPolls(self._read_outgoing, config.long_polls, self._shared, config.polls_per_servo)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
         has_servo = _servo_test(twin.servos)
@@ -82,9 +86,8 @@ class TwinService:
             limit=config.max_body_bytes,
             clocks=self.clocks,
         )
-        self.gate = EdgeGate(
-            self.access, has_servo, RateLimiter(config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
-        )
+        limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
+        self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
         self.dispatcher = Dispatcher(
             store=store,
             executor=self.executor,
@@ -203,14 +206,22 @@ class TwinService:
                     log.info("updates lag no longer", extra=figures)
 
     async def _apply_retention(self) -> None:
-        """Delete the bodies of windows that are too old."""
+        """Delete the bodies of windows that are too old: never at the start, where a wrong clock is set right."""
+        age, stored = self.config.retention_days * _DAY, 0
         while True:
-            before = self.clocks.wall() - self.config.retention_days * _DAY
+            await asyncio.sleep(_RETENTION_S)
+            before, stored = stored, self.metrics.stored.values["window", PutResult.NEW.value]
             with suppress(StoreUnavailable):
-                done = await self.executor.run(partial(delete_old_bodies, self.store, before))
+                done = await self.executor.run(partial(self._delete_old, age, _LEAST_DELETED + 2 * (stored - before)))
                 if done.emptied:
                     log.info("old window bodies deleted", extra=done._asdict())
-            await asyncio.sleep(_RETENTION_S)
+
+    def _delete_old(self, age: float, most: int) -> RetentionResult:
+        now = self.clocks.wall()
+        before = received_before(self.store, now, age)
+        if (left_out := now - age - before) > 0.0 and not math.isinf(left_out):
+            log.warning("retention leaves out a gap", extra={"days": round(left_out / _DAY, 3)})
+        return delete_old_bodies(self.store, before, most=most)
 
     def _add_gauges(self) -> None:
         add = self.metrics.add_gauge

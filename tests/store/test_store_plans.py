@@ -9,6 +9,7 @@ import pytest
 import sqlalchemy as sa
 from store_cases import letter, outcome, verification, window
 
+from servotwin.store.clock_gaps import received_before
 from servotwin.store.records import EvidenceRecord, MessageKind
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store, open_store
@@ -71,6 +72,7 @@ def exercise(store: Store) -> None:
     store.audit("a", window=("boot", 1))
     store.events("a")
     delete_old_bodies(store, 1e9)
+    received_before(store, 1e9, 1e3)
 
 
 def plan(path: str, statement: str, parameters: Any) -> list[str]:

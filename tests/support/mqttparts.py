@@ -71,7 +71,8 @@ class Twin:
         known = SERVOS.__contains__
         limits = SampleTimeLimiter(1.0, 1e9)
         ingest = Ingest(AwaitedCommits(self.commits).put, known, limits, self.metrics)
-        gate = EdgeGate(AccessControl(VERIFIERS), known, RateLimiter(1e6, 1e6, self._loop.time))
+        limiter = RateLimiter(1e6, 1e6, self._loop.time)
+        gate = EdgeGate(AccessControl(VERIFIERS), known, limiter, limiter)
         handler = MqttRequestHandler(gate, ingest, self.polls, lambda: None, self.metrics)
         server = MqttServer(self._broker, handler, "twins")
         await server.start()
