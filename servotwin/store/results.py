@@ -238,6 +238,16 @@ def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]
     return newest
 
 
+def post(connection: sa.Connection, sent: Mapping[str, bytes], now: float) -> None:
+    """Append a message to each edge's, outside of any result; unknown servos are left out."""
+    for servo, body in sorted(sent.items()):
+        newer = sa.update(twins).where(twins.c.servo == servo).values(posted=twins.c.posted + 1)
+        serial = connection.execute(newer.returning(twins.c.posted)).scalar()
+        if serial is not None:
+            row = {"servo": servo, "serial": serial, "body": body, "created": now}
+            connection.execute(sa.insert(outgoing), row)
+
+
 def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
     """Make the serial of the next message to the edge exceed `serial`."""
     behind = sa.update(twins).where(twins.c.servo == servo, twins.c.posted < serial)

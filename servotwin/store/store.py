@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeVar
 
 import sqlalchemy as sa
@@ -153,6 +153,10 @@ class Store:
         if not messages and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
             self._write(lambda connection: results.skip_to_serial(connection, servo, after))
         return messages
+
+    def post(self, sent: Mapping[str, bytes], now: float) -> None:
+        """Post a message to each of these edges; unknown servos are left out."""
+        self._write(lambda connection: results.post(connection, sent, now))
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""

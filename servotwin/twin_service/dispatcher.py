@@ -116,6 +116,8 @@ class Dispatcher:
         Of the leases.
     quota : VerificationQuota
     pace : WorkPace, optional
+    paused : callable
+        True while nothing new is to be begun.
     speed : float
         Least ratio of sample time to real time.
     """
@@ -133,11 +135,12 @@ class Dispatcher:
         quota: VerificationQuota,
         pace: WorkPace | None = None,
         speed: float = 1.0,
+        paused: Callable[[], bool] = lambda: False,
     ) -> None:
         self._store, self._executor, self._pool = store, executor, pool
         self._commit, self._notify, self._metrics, self._clocks = commit, notify, metrics, clocks
         self._owner, self._quota = owner, quota
-        self._pace, self._speed = pace or WorkPace(), speed
+        self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for = False, False
         self._tasks: set[asyncio.Task[None]] = set()
@@ -211,6 +214,9 @@ class Dispatcher:
         while not self._stopping:
             # Cleared before the store is read: a message that comes meanwhile ends the rest that follows.
             self._work_pending.clear()
+            if self._paused():
+                await self._rest(_RETRY_S)
+                continue
             try:
                 await self._release_failed()
                 leases = await self._lease_next()

@@ -225,7 +225,7 @@ class EdgeApi:
         incoming, window = self._ingest.read_window(servo, body, request.content_encoding)
         if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
             raise RequestRejected(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
-        new = await self._ingest.commit(incoming) is PutResult.NEW
+        new = await self._ingest.commit(incoming, window) is PutResult.NEW
         if new:
             self._wake()
         return msgpack_response([acknowledgement(window)], 201 if new else 200)
@@ -235,8 +235,8 @@ class EdgeApi:
         servo = request.path["servo"]
         self._gate.admit(servo, request.token)
         body = await self._bodies.read(request.content_length, request.receive)
-        incoming, _ = self._ingest.read_letter(servo, body, request.content_encoding)
-        if await self._ingest.commit(incoming) is PutResult.NEW:
+        incoming, letter = self._ingest.read_letter(servo, body, request.content_encoding)
+        if await self._ingest.commit(incoming, letter) is PutResult.NEW:
             self._wake()
         return HttpResponse(202)
 

@@ -95,8 +95,8 @@ class MqttRequestHandler:
             messages = await self._polls.messages(servo, question.after, question.wait)
             return PollResponse(seal_messages(self._gate.verifier(servo), servo, messages))
         self._gate.admit_authenticated(servo)
-        incoming, _ = self._ingest.read(servo, question.body, question.encoding)
-        if await self._ingest.commit(incoming) is PutResult.NEW:
+        incoming, message = self._ingest.read(servo, question.body, question.encoding)
+        if await self._ingest.commit(incoming, message) is PutResult.NEW:
             self._wake()
         return PutResponse()
 

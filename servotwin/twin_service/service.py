@@ -30,9 +30,11 @@ from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.worker import WorkerPool
 
@@ -76,15 +78,23 @@ class TwinService:
         self.polls = LongPolls(self._read_outgoing, config.long_polls, self._shared, config.polls_per_servo)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
+        self.watch = StoreWatch(
+            store, self.executor, self._writes.put, self._writes.commit, self.clocks.wall, self.clocks.monotonic
+        )
+        sequences = SequenceWatch(self.clocks.monotonic)
+        self._missing = MissingWindows(
+            store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall
+        )
         has_servo = _servo_test(twin.servos)
         slack = math.inf if config.lockstep else config.future_slack_s
         self.ingest = Ingest(
-            put=self._writes.put,
+            put=self.watch.put,
             has_servo=has_servo,
             sample_times=SampleTimeLimiter(config.speed, slack),
             metrics=self.metrics,
             limit=config.max_body_bytes,
             clocks=self.clocks,
+            note=sequences.note,
         )
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
@@ -92,7 +102,7 @@ class TwinService:
             store=store,
             executor=self.executor,
             pool=self.pool,
-            commit=self._writes.commit,
+            commit=self.watch.commit,
             notify=self.polls.notify,
             metrics=self.metrics,
             clocks=self.clocks,
@@ -101,6 +111,7 @@ class TwinService:
             # In lock-step everything is worked on in order, however long it takes.
             pace=WorkPace(1.0 if config.lockstep else config.worker_share),
             speed=min(1.0, config.speed),
+            paused=lambda: bool(self.watch.fault),
         )
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
@@ -122,7 +133,8 @@ class TwinService:
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""
-        if not self._shared:
+        await self.watch.start()
+        if not self._shared and not self.watch.fault:
             # The store is locked for this process, so that every lease is one of a process that has ended.
             await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
@@ -132,6 +144,9 @@ class TwinService:
         if not self.config.lockstep:
             self._spawn(self.dispatcher.run())
             self._spawn(self._watch_lag())
+            self._spawn(self._missing.run())
+            self._spawn(self.watch.run())
+            self._spawn(self.watch.run_mark())
         if not math.isinf(self.config.retention_days):
             self._spawn(self._apply_retention())
         if self._mqtt is not None:
@@ -149,15 +164,18 @@ class TwinService:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.pool.stop()
         await asyncio.to_thread(self.commits.close)
+        with suppress(StoreUnavailable):
+            if not self.watch.fault:
+                await asyncio.to_thread(self.watch.mark)
         self.executor.close()
 
     def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
         store, workers = self._store_healthy(), self.pool.alive
-        dispatching = all(not task.done() for task in self._tasks)
-        ok = store and workers > 0 and dispatching
-        degraded = [*self._lagging(backlog)]
-        return {"ok": ok, "degraded": degraded, "store": store, "workers": workers, "dispatching": dispatching}
+        # A task that ended without an error did so because of the damage.
+        dispatching = not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
+        parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
+        return {"ok": store and workers > 0 and dispatching, "degraded": self._lagging(backlog), **parts}
 
     def _lagging(self, backlog: Backlog | None) -> list[str]:
         """The lag in a sentence, where it is above its limit."""
@@ -167,6 +185,8 @@ class TwinService:
 
     def _store_healthy(self) -> bool:
         """Last read and last write succeeded, or that write failed long ago: none may have been tried since."""
+        if self.watch.fault:
+            return False
         return not self.executor.fault and self.clocks.monotonic() - self._writes.failed_at >= _UNHEALTHY_S
 
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
@@ -229,6 +249,9 @@ class TwinService:
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
+        damaged = "1: the store is damaged, and is not written any more."
+        add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))
+        add("servotwin_store_checks", "Times that the whole store was checked.", lambda: self.watch.rounds)
         mqtt = self._mqtt
         if mqtt is not None:
             add("servotwin_broker_connected", "1 while the MQTT broker is connected.", lambda: mqtt.connected)
