@@ -9,6 +9,8 @@ import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
 from servotwin.store import incoming, queries, results
+from servotwin.store import outgoing as posting
+from servotwin.store.claims import StoredClaim, add_alarm, claim_of, raise_claim
 from servotwin.store.engine import (
     Engines,
     StoreUnavailable,
@@ -149,18 +151,30 @@ class Store:
         An edge that reports a higher serial than any that was posted received it before the store was restored from a
         backup: the next message gets a serial that the edge does not take for a duplicate.
         """
-        messages = self._read(lambda connection: results.outgoing_messages(connection, servo, after, limit))
+        messages = self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
         if not messages and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
-            self._write(lambda connection: results.skip_to_serial(connection, servo, after))
+            self._write(lambda connection: posting.skip_to_serial(connection, servo, after))
         return messages
 
     def post(self, sent: Mapping[str, bytes], now: float) -> None:
         """Post a message to each of these edges; unknown servos are left out."""
-        self._write(lambda connection: results.post(connection, sent, now))
+        self._write(lambda connection: posting.post(connection, sent, now))
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
-        return self._read(lambda connection: results.posted(connection, servos))
+        return self._read(lambda connection: posting.newest_serials(connection, servos))
+
+    def claim_of(self, servo: str) -> StoredClaim:
+        """Newest claim of a servo's edge."""
+        return self._read(lambda connection: claim_of(connection, servo))
+
+    def raise_claim(self, servo: str, new: StoredClaim, below: int, now: float) -> StoredClaim:
+        """Store a claim where the servo's newest has a number below `below`; return the one that counts then."""
+        return self._write(lambda connection: raise_claim(connection, servo, new, below, now))
+
+    def add_alarm(self, servo: str, sentence: str, now: float) -> None:
+        """Store an alarm about a servo's edge, which belongs to no window."""
+        self._write(lambda connection: add_alarm(connection, servo, sentence, now))
 
     def backlog(self, now: float) -> Backlog:
         """Number and age of the unprocessed messages."""
