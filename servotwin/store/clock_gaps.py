@@ -81,6 +81,7 @@ def _receipt(connection: sa.Connection, query: sa.Select[tuple[int, float]], id_
 
 
 _RECEIVED = sa.select(messages.c.id, messages.c.received).limit(1)
-_FIRST, _LAST = _RECEIVED.order_by(messages.c.id), _RECEIVED.order_by(messages.c.id.desc())
+_ALL = _RECEIVED.where(messages.c.id > 0)  # so that a plan names the key, by which the first row ends the search
+_FIRST, _LAST = _ALL.order_by(messages.c.id), _ALL.order_by(messages.c.id.desc())
 _FROM = _RECEIVED.where(messages.c.id >= sa.bindparam("_id")).order_by(messages.c.id)
 _UP_TO = _RECEIVED.where(messages.c.id <= sa.bindparam("_id")).order_by(messages.c.id.desc())

@@ -102,7 +102,7 @@ def check_bodies(store: Store, after: int, most: int) -> tuple[Soundness, int]:
     return result, rows[-1].id if rows else after
 
 
-def missing_windows(store: Store, servo: str, boot: str, newest: int = 1000) -> list[tuple[int, int]]:
+def missing_windows(store: Store, servo: str, boot: str, newest: int = 256) -> list[tuple[int, int]]:
     """Ranges of sequences, both included, that are missing among the newest windows of a boot."""
     with transaction(store.engines.reader) as connection:
         rows = connection.execute(_NEWEST, {"_servo": servo, "_newest": newest}).all()

@@ -49,7 +49,7 @@ from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.requests import Attempts
 from servotwin.twin.state import TwinState, draft_update, noted_setting
-from servotwin.twin.triage import Glance
+from servotwin.twin.triage import Glance, no_glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
 _OTHER = "another controller runs than is stated: a setting follows when a window is of the stated one"
@@ -74,6 +74,8 @@ class WindowArrival(NamedTuple):
     overtaken : bool
         A newer window of the servo waits, or was processed already: this one changes no setting. With triage it gets a
         glance and no more.
+    unseen : bool
+        Other servos wait: without triage an overtaken window is not even estimated.
     too_late : str
         Reason why an update for this window could not be applied in time; empty: it could. It is estimated, and changes
         no setting.
@@ -82,6 +84,7 @@ class WindowArrival(NamedTuple):
     window: WindowMessage
     time: float
     overtaken: bool = False
+    unseen: bool = False
     too_late: str = ""
 
 
@@ -175,6 +178,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
     state, glance = _glance(model, state, decoded, arrived)
+    if glance is None and event.overtaken and event.unseen:
+        glance = no_glance(_OVERTAKEN)
     if not state.has_overtaken(message):
         state = replace(state, newest=(message.boot, message.start))
     if glance is not None:

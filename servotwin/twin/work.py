@@ -39,10 +39,13 @@ class Urgency:
         Time that the work for one servo takes.
     speed : float
         Least ratio of sample time to real time.
+    others_wait : bool
+        Overtaken windows are not estimated, because other servos wait.
     """
 
     expected_s: float = 0.0
     speed: float = 1.0
+    others_wait: bool = False
 
 
 def work(registry: ModelRegistry, lease: Lease, now: float, urgency: Urgency | None = None) -> WorkResult:
@@ -126,7 +129,7 @@ class _Worker:
             if not self.model.settings.enabled:
                 continue
             if urgency is not None and isinstance(event, WindowArrival) and self.state.has_overtaken(event.window):
-                event = event._replace(overtaken=True)
+                event = event._replace(overtaken=True, unseen=urgency.others_wait)
             self._step(message, event, now)
 
     def _decoded(self, batch: Sequence[StoredMessage]) -> Iterator[tuple[int, Event]]:
@@ -171,7 +174,10 @@ def _urgent(
             return event
         left = event.window.start + validity - done_at
         late = f"too late by {-left:.3g} s: an update may be applied for {validity:g} s from the window's start"
-        return event._replace(overtaken=event is not newest, too_late="" if left > 0.0 else late)
+        overtaken = event is not newest
+        return event._replace(
+            overtaken=overtaken, unseen=overtaken and urgency.others_wait, too_late="" if left > 0.0 else late
+        )
 
     # Stable: the order of the others stays.
     ordered = sorted(events, key=lambda each: not isinstance(each[1], messages.Receipt))

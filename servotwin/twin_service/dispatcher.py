@@ -162,7 +162,7 @@ class Dispatcher:
             if not leases:
                 self._pool.release(worker)
                 continue
-            task = asyncio.create_task(self._employ(worker, leases))
+            task = asyncio.create_task(self._employ(worker, leases, self._waited_for))
             self._tasks.add(task)
             # The loop has weak references to tasks only; the set keeps this one from being collected.
             task.add_done_callback(self._tasks.discard)
@@ -252,8 +252,11 @@ class Dispatcher:
         except TimeoutError:
             return
 
-    async def _employ(self, worker: WorkerProcess, leases: Sequence[Lease]) -> None:
-        """Let a worker process leases; those that failed before each in a job of its own, which isolates the fault."""
+    async def _employ(self, worker: WorkerProcess, leases: Sequence[Lease], others_wait: bool) -> None:
+        """Let a worker process leases; those that failed before each in a job of its own, which isolates the fault.
+
+        `others_wait`: other servos waited for a worker, when these were leased.
+        """
         # Failures of this process, not the store's count of leases: that also rises where a worker was lost to another
         # lease.
         leases = [lease._replace(attempts=1 + self._failures[_queue(lease)]) for lease in leases]
@@ -263,15 +266,15 @@ class Dispatcher:
         ]
         left = dict.fromkeys(lease.servo for job in jobs for lease in job)
         commits: list[asyncio.Task[WorkResult | None]] = []
-        now = self._clocks.wall()
+        now, urgency = self._clocks.wall(), (self._pace.seconds, self._speed, others_wait)
         renewal = asyncio.create_task(self._renew(left))
         try:
             for job in filter(None, jobs):
                 waiting = iter(job)
-                async for done in worker.work(job, now, (self._pace.seconds, self._speed)):
+                async for done in worker.work(job, now, urgency):
                     lease = next(waiting)
                     del left[lease.servo]
-                    commits.append(asyncio.create_task(self._complete(lease, done, now)))
+                    commits.append(asyncio.create_task(self._complete(lease, done, now, others_wait)))
         except WorkerLost as lost:
             await self._lost(worker, leases, list(left), str(lost))
         else:
@@ -298,7 +301,9 @@ class Dispatcher:
         await self._pool.replace(worker, why)
         self.wake()
 
-    async def _complete(self, lease: Lease, done: LeaseResult, now: float) -> WorkResult | None:
+    async def _complete(
+        self, lease: Lease, done: LeaseResult, now: float, others_wait: bool = False
+    ) -> WorkResult | None:
         """Commit a worker's result; None: there is none, and the servo is to be released."""
         self._metrics.work.observe(done.seconds)
         if not _queue(lease)[1]:
@@ -309,14 +314,14 @@ class Dispatcher:
         if not await self._committed(done.result):
             return None
         self._failures.pop(_queue(lease), None)
-        await self._hold(lease.servo, done.seconds)
+        if others_wait:
+            await self._hold(lease.servo, done.seconds)
         self._report(lease, done.result, done.seconds, now)
         return done.result
 
     async def _hold(self, servo: str, seconds: float) -> None:
-        """Let the other servos come first after one that took long, where work waits for a worker."""
-        hold = self._pace.hold(seconds)
-        if hold and self._waited_for:
+        """Let the other servos come first after one that took long."""
+        if hold := self._pace.hold(seconds):
             with suppress(StoreUnavailable):
                 await self._executor.run(partial(self._store.hold, servo, self._clocks.wall() + min(hold, LEASE_S)))
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
+from itertools import islice
 
 from servotwin.messages import Resend, WindowMessage, encode
 from servotwin.store.engine import StoreUnavailable
@@ -23,6 +24,8 @@ log = logging.getLogger(__name__)
 _PATIENCE_S = 30.0
 """s that a window may be late behind a newer one, which overtook it on the way or after an outage."""
 _LOOK_S = 5.0
+_BOOTS = 50
+"""Boots that are looked at together: after a start all are due."""
 _REASON = "windows of this boot did not come"
 Boot = tuple[str, str]
 """(servo, boot)."""
@@ -67,9 +70,10 @@ class SequenceWatch:
         self._boots.move_to_end(boot)
 
     def due(self) -> list[Boot]:
-        """Boots whose sequences are to be looked at; each is returned once."""
+        """Boots whose sequences are to be looked at, some at a time; each is returned once."""
         now = self._now()
-        boots = [boot for boot, known in self._boots.items() if known.look_at is not None and known.look_at <= now]
+        due = (boot for boot, known in self._boots.items() if known.look_at is not None and known.look_at <= now)
+        boots = list(islice(due, _BOOTS))
         for boot in boots:
             self._boots[boot].look_at = None
         return boots

@@ -53,6 +53,10 @@ class WorkerStart(NamedTuple):
     folder: str
 
 
+WorkerUrgency = tuple[float, float, bool]
+"""Fields of `twin.work.Urgency`."""
+
+
 class WorkerJob(NamedTuple):
     """Leases to be processed in order.
 
@@ -61,13 +65,13 @@ class WorkerJob(NamedTuple):
     leases : tuple of Lease
     now : float
         s: since the epoch, or sample time in lock-step.
-    urgency : (float, float), optional
+    urgency : (float, float, bool), optional
         Fields of `twin.work.Urgency`; the time then runs on from `now`. None: in lock-step.
     """
 
     leases: tuple[Lease, ...]
     now: float
-    urgency: tuple[float, float] | None = None
+    urgency: WorkerUrgency | None = None
 
 
 class LeaseResult(NamedTuple):
@@ -91,7 +95,7 @@ _encoder = msgspec.msgpack.Encoder()
 _decode_start = msgspec.msgpack.Decoder(WorkerStart).decode
 _decode_job = msgspec.msgpack.Decoder(WorkerJob).decode
 decode_result = msgspec.msgpack.Decoder(LeaseResult).decode
-Work = Callable[[Lease, float, tuple[float, float] | None], WorkResult]
+Work = Callable[[Lease, float, WorkerUrgency | None], WorkResult]
 
 
 def encode_frame(message: WorkerStart | WorkerJob | LeaseResult) -> bytes:
@@ -172,7 +176,7 @@ class WorkerProcess:
                 raise WorkerLost(refusal.decode())
 
     async def work(
-        self, leases: Sequence[Lease], now: float, urgency: tuple[float, float] | None = None
+        self, leases: Sequence[Lease], now: float, urgency: WorkerUrgency | None = None
     ) -> AsyncIterator[LeaseResult]:
         """Process leases, as `WorkerJob` has them; yields their results in order. Raises WorkerLost."""
         self._send(encode_frame(WorkerJob(tuple(leases), now, urgency)))
@@ -352,7 +356,7 @@ def main(descriptor: int) -> None:
                 line.sendall(encode_frame(_attempt(work, lease, now, job.urgency)))
 
 
-def _attempt(work: Work, lease: Lease, now: float, urgency: tuple[float, float] | None) -> LeaseResult:
+def _attempt(work: Work, lease: Lease, now: float, urgency: WorkerUrgency | None) -> LeaseResult:
     """Process a lease; an exception becomes the result's error."""
     begun = time.perf_counter()
     result, error = None, ""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from store_cases import NewAddress, filled, letter, outcome, window
+from store_cases import NEXT, NewAddress, filled, letter, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Resend, decode
@@ -17,7 +17,7 @@ from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.store.engine import transaction
 from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
-from servotwin.store.schema import bodies
+from servotwin.store.schema import REVISION, bodies
 from servotwin.store.store import open_store
 
 pytest_plugins = ("store_fixtures",)
@@ -143,10 +143,10 @@ def test_a_damaged_or_newer_backup_is_not_restored(url: str, tmp_path: Path, lat
     saved.write_bytes(b"".join((whole[: places[-1]], b"aboot/71", whole[places[-1] + 8 :])))
     with pytest.raises(InvalidInput, match="is damaged"):
         restore(saved, str(to))
-    migrations.migrate(store.engines.writer, "0003", later_scripts)
+    migrations.migrate(store.engines.writer, NEXT, later_scripts)
     store.close()
     shutil.copy(tmp_path / "store.db", saved)
-    with pytest.raises(InvalidInput, match="newer than 0002"):
+    with pytest.raises(InvalidInput, match=f"newer than {REVISION}"):
         restore(saved, str(to))
     assert not to.exists()
     with pytest.raises(InvalidInput, match="there is no such file"):

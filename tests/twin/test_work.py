@@ -417,6 +417,14 @@ def test_with_triage_a_window_that_was_overtaken_gets_a_glance_only():
     assert len(outcome.outgoing) == 1
 
 
+def test_while_other_servos_wait_an_overtaken_window_is_stored_only():
+    outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.0, 0.0]), 0.1, Urgency(others_wait=True))
+    assert [kinds(outcome, n) for n in (1, 2)] == [["glance"], ["glance"]]
+    assert {row.status[:14] for row in outcome.evidence if row.message < 3} == {"a newer window"}
+    assert "estimate" in kinds(outcome, 3)
+    assert len(outcome.outgoing) == 1
+
+
 def test_no_setting_is_computed_that_would_come_too_late():
     window = windows()[1]
     spent = window.samples / window.rate
