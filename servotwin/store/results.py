@@ -33,12 +33,19 @@ def acquire(
 ) -> list[str]:
     """Lease the servos whose new messages have waited longest; servos due to be woken get at least half of the places.
 
-    Returns their names.
+    A single place goes to the servo that has waited longest for either. Returns their names.
     """
     leased: list[str] = []
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
     bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
-    for query, share in _queues(frozenset(kinds), only is not None):
+    queues = _queues(frozenset(kinds), only is not None)
+    if limit == 1:
+        heads = [
+            (connection.execute(query, bound | {"_count": 1}).one_or_none(), n) for n, (query, _) in enumerate(queues)
+        ]
+        oldest = sorted((head[1], n) for head, n in heads if head is not None)[:1]
+        queues = [queues[n] for _, n in oldest]
+    for query, share in queues:
         count = min(math.ceil(share * limit), limit - len(leased))
         servos = connection.scalars(query, bound | {"_count": count}).all()
         if servos:
@@ -108,7 +115,7 @@ def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: boo
     late = sa.bindparam("_late", type_=sa.Double)
     free = sa.or_(until.is_(None), until <= _NOW, until > late)
     count = sa.bindparam("_count", type_=sa.Integer)
-    query = sa.select(twins.c.servo).where(turn, free).order_by(order).limit(count)
+    query = sa.select(twins.c.servo, order).where(turn, free).order_by(order).limit(count)
     query = query.where(twins.c.servo == sa.bindparam("_only")) if one else query
     # SQLite has one writer at a time and ignores this.
     return query.with_for_update(skip_locked=True)

@@ -108,6 +108,15 @@ def test_servos_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Sto
     assert len([servo for servo in servos if servo.startswith("m")]) == 2
 
 
+def test_a_single_place_goes_to_whoever_waited_longest(store: Store) -> None:
+    """Otherwise servos whose updates wait for receipts would starve those that never had a turn."""
+    store.put([window("w")])
+    store.commit([outcome(one, wake=150.0) for one in claim(store)], 201.0)
+    store.put([window("m", received=140.0), window("late", received=160.0)])
+    assert [claim(store, limit=1)[0].servo for _ in range(3)] == ["m", "w", "late"]
+    assert claim(store, limit=1) == []
+
+
 def test_large_messages_are_leased_a_few_at_a_time(store: Store) -> None:
     large, small = b"x" * (MAX_LEASE_BYTES // 2), b"y"
     store.put([window("a", sequence, large) for sequence in range(3)])
