@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,8 @@ import numpy as np
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
-from servotwin.logs.formats import FORMATS, LogColumns, SignalTable
+from servotwin.logs.columns import LogColumns, SignalTable
+from servotwin.logs.formats import FORMATS, WRITTEN
 from servotwin.plant.signals import Array
 from servotwin.runtime import files
 
@@ -51,16 +52,28 @@ def read_log(path: Path) -> Log:
         The file is missing, of no known format or damaged; a column is missing, not numeric or not finite somewhere;
         the times are not uniform.
     """
-    if path.suffix not in FORMATS:
+    columns = read_columns(path, _COLUMN_NAMES)
+    return Log(_whole(path, columns), columns.metadata)
+
+
+def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read columns by name from a log of any known format.
+
+    Raises
+    ------
+    InvalidInput
+        The file is missing, of no known format or damaged.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
         raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
     if not path.is_file():
         raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
-    FORMATS[path.suffix].check_installed(f"log {path}")
+    FORMATS[suffix].check_installed(f"log {path}")
     try:
-        columns = FORMATS[path.suffix].read(path, _COLUMN_NAMES)
+        return FORMATS[suffix].read(path, requested)
     except OSError as error:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
-    return Log(_whole(path, columns), columns.metadata)
 
 
 def check_output(path: Path) -> None:
@@ -71,7 +84,7 @@ def check_output(path: Path) -> None:
     InvalidInput
         Unknown suffix, missing directory, or a format whose library is not installed.
     """
-    files.check_file(path, tuple(FORMATS))
+    files.check_file(path, WRITTEN)
     FORMATS[path.suffix].check_installed(f"output {path}")
 
 
@@ -84,8 +97,10 @@ def write_log(table: SignalTable, path: Path) -> None:
         As `check_output`.
     """
     check_output(path)
+    write = FORMATS[path.suffix].write
+    assert write is not None  # checked above
     with files.atomic_output(path) as temporary:
-        FORMATS[path.suffix].write(table, temporary)
+        write(table, temporary)
 
 
 def _whole(path: Path, columns: LogColumns) -> Window:
@@ -99,6 +114,8 @@ def _whole(path: Path, columns: LogColumns) -> Window:
 
 
 def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
+    if name in columns.damaged:
+        raise InvalidInput(f"log {path}: is no table of numbers (column {name!r}, {columns.damaged[name]})")
     try:
         if np.iscomplexobj(columns.values[name]):
             raise TypeError
