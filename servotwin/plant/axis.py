@@ -23,7 +23,7 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
-from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
+from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
 from servotwin.plant.basis import Guide, Play
 from servotwin.plant.fit import check_fit
 from servotwin.plant.law_loop import LawLoop, check_encoders
@@ -370,12 +370,16 @@ class Axis:
         shaft = self.actuator.polynomials()
         return loop.axis_system(self.shaft(), shaft, self._structure, self.p, self.at_motor)
 
-    def _law_loop(self, law: LinearLaw) -> LawLoop:
-        check_encoders(self, law)
+    def plants(self) -> tuple[LinearSystem, LinearSystem]:
+        """Command to the motor's angle and to the load's position, without a gap, with the same states."""
         shaft, polynomials = self.shaft(), self.actuator.polynomials()
         load = loop.axis_system(shaft, polynomials, self._structure, self.p, at_motor=False)
-        motor = replace(load, C=np.eye(load.B.size)[len(shaft.names) - 1])
-        return LawLoop(motor, load, law)
+        row, unknown = np.eye(load.B.size)[len(shaft.names) - 1], np.array([math.nan])
+        return replace(load, C=row, numerator=unknown, denominator=unknown), load
+
+    def _law_loop(self, law: LinearLaw) -> LawLoop:
+        check_encoders(self, law)
+        return LawLoop(*self.plants(), law)
 
     def loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""
@@ -404,7 +408,9 @@ class Axis:
         """
         law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
-            self._law_loop(law).check("axis")
+            self._law_loop(law).check(
+                described_law(controller or self.controller, self.actuator.unit, self.load.motion)
+            )
         else:
             if self.rigid and self.at_motor and self.n > 1 and not np.linalg.eigvals(self.chain().A).real.max() < 0.0:
                 raise InvalidInput(
