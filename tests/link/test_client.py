@@ -123,7 +123,11 @@ def test_a_message_refused_for_good_is_dropped_and_counted(
     assert sender.session.counts[f"refused: {reason.value}"] == 2
 
 
-@pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.temporary and reason is not Refusal.FUTURE])
+OF_ONE = (Refusal.FUTURE, Refusal.UNKNOWN_SCHEMA)
+"""Temporary refusals that concern one message only."""
+
+
+@pytest.mark.parametrize("reason", [reason for reason in Refusal if reason.temporary and reason not in OF_ONE])
 def test_a_message_refused_for_now_stays_in_the_outbox(
     sender: Sender, outbox: SqliteOutbox, script: Script, reason: Refusal
 ) -> None:
@@ -141,6 +145,19 @@ def test_a_window_from_the_future_holds_up_no_other(sender: Sender, outbox: Sqli
     assert sender.step(0.0).window == ("b0", 1)
     assert sender.step(0.0).wait_s == 1.0
     assert sender.step(1.0).window == ("b0", 0)
+
+
+def test_a_window_that_an_older_twin_does_not_know_waits_and_holds_up_no_other(
+    sender: Sender, outbox: SqliteOutbox, script: Script
+) -> None:
+    outbox.put(window(0))
+    outbox.put(window(1))
+    script.faults = [Refused(Refusal.UNKNOWN_SCHEMA, "not known")]
+    sender.step(0.0)
+    assert sender.step(0.0).window == ("b0", 1)
+    assert sender.step(0.0).wait_s == 600.0
+    assert sender.step(600.0).window == ("b0", 0)
+    assert outbox.dropped == {}
 
 
 FAULTS = st.lists(

@@ -11,6 +11,7 @@ import sqlalchemy as sa
 from store_cases import NEXT, NewAddress, filled, letter, outcome, window
 
 from servotwin.errors import InvalidInput
+from servotwin.messages import Resend, decode
 from servotwin.store import migrate as migrations
 from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.store.engine import transaction
@@ -42,14 +43,20 @@ def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
     assert restore(saved, again) == counts
     restored = open_store(again)
     assert restored.audit("a") == store.audit("a")[1:]
-    assert restored.outgoing("a", 0) == store.outgoing("a", 0)
+    (update, asking) = restored.outgoing("a", 0)
+    assert [update] == store.outgoing("a", 0)
+    # An edge is asked for the windows that came after the backup.
+    assert decode(asking.body) == Resend("a", reason="the twin's store was restored from a backup")
     assert restored.window("a", "boot", 3) == store.window("a", "boot", 3)
     (summary,) = restored.servos()
     assert summary.posted > store.servos()[0].posted + 100_000
     restored.put([window(sequence=9)])
     (claim,) = restored.lease("me", 1, 30.0, 300.0)
     restored.commit([outcome(claim, outgoing=(b"v", b"w"))], 301.0)
-    assert [posted.serial for posted in restored.outgoing("a", 1)] == [summary.posted + 1, summary.posted + 2]
+    assert [posted.serial for posted in restored.outgoing("a", asking.serial)] == [
+        summary.posted + 1,
+        summary.posted + 2,
+    ]
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(("backup", ".backup"))) == ["backup.db"]
     restored.close()
     store.close()
