@@ -75,9 +75,19 @@ def linear_load(
     ] = (0.0,),
     friction: Annotated[float, key("friction_n", minimum=0.0, help="Coulomb friction on the last mass.")] = 0.0,
     force: Annotated[float, key("force_n", help="Constant force on the last mass, gravity for one.")] = 0.0,
+    static: Annotated[
+        float | None,
+        key("static_friction_n", above=0.0, help="Friction of it at standstill; absent: the Coulomb friction."),
+    ] = None,
+    stribeck: Annotated[
+        float | None,
+        key(
+            "stribeck_speed_m_per_s", above=0.0, help="Speed at which the friction has fallen to the Coulomb friction."
+        ),
+    ] = None,
 ) -> Load:
     """Masses on a line."""
-    return Load(m, k, c, LINEAR, friction, force)
+    return Load(m, k, c, LINEAR, friction, force, static, stribeck)
 
 
 def rotary_load(
@@ -100,9 +110,21 @@ def rotary_load(
     ] = (0.0,),
     friction: Annotated[float, key("friction_n_m", minimum=0.0, help="Coulomb friction on the last inertia.")] = 0.0,
     force: Annotated[float, key("torque_n_m", help="Constant torque on the last inertia, gravity for one.")] = 0.0,
+    static: Annotated[
+        float | None,
+        key("static_friction_n_m", above=0.0, help="Friction of it at standstill; absent: the Coulomb friction."),
+    ] = None,
+    stribeck: Annotated[
+        float | None,
+        key(
+            "stribeck_speed_rad_per_s",
+            above=0.0,
+            help="Speed at which the friction has fallen to the Coulomb friction.",
+        ),
+    ] = None,
 ) -> Load:
     """Inertias on a shaft."""
-    return Load(m, k, c, ROTARY, friction, force)
+    return Load(m, k, c, ROTARY, friction, force, static, stribeck)
 
 
 FILTERED_PID, CASCADE = "filtered_pid", "cascade"

@@ -48,7 +48,7 @@ def cascade(**changes: object) -> st.Cascade:
         ),
         (
             lambda: policy_of(BALL_SCREW.replace(voltage_limit=None), TwinSettings(policy="margin")),
-            "Coulomb friction and constant forces of this axis do not scale",
+            "limit of this axis do not scale",
         ),
     ],
 )  # fmt: skip

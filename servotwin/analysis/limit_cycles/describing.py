@@ -111,6 +111,8 @@ def _check(servo: Plant, law: Controller, gap: float) -> None:
         )
     if servo.motor_friction or servo.guide.friction:
         raise InvalidInput("the describing function is that of the gap alone; the axis has Coulomb friction too")
+    if servo.command_limit is not None:
+        raise InvalidInput(f"actuator limit = {servo.command_limit:g}: the describing function knows no limit")
     if law.voltage_limit is not None:
         raise InvalidInput(
             f"controller voltage_limit = {law.voltage_limit:g} V: the describing function knows no limit"
