@@ -337,7 +337,7 @@ class Axis:
     def with_position_resolution(self, resolution: float) -> Axis:
         """A copy whose measured position has another resolution, m (rotary: rad)."""
         sensed = {"encoder_resolution": resolution / self.p} if self.at_motor else {"position_resolution": resolution}
-        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **sensed))
+        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **sensed))  # type: ignore[arg-type]
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21).

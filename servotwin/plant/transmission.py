@@ -53,7 +53,7 @@ class Transmission:
             raise InvalidInput(f'transmission in_gap = {self.in_gap!r}: must be "held" or "free"')
         if self.in_gap == FREE and self.rigid:
             raise InvalidInput(
-                'transmission in_gap = "free": needs a finite stiffness (k_d); a rigid transmission is held in the gap'
+                'transmission in_gap = "free": needs a finite stiffness k_d; a rigid transmission is held in the gap'
             )
         if self.c_d > 0.0 and self.play is not Play.FREE:
             raise InvalidInput(
