@@ -8,7 +8,7 @@ JSON too. SI units throughout. Values that are not known, or bounds that do not 
 
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
-from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome
+from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
 from servotwin.messages.setting import Band, Gains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
@@ -50,6 +50,7 @@ __all__ = [
     "Refusal",
     "Request",
     "RequestOutcome",
+    "Resend",
     "Setting",
     "Update",
     "Verification",

@@ -10,7 +10,7 @@ import msgspec
 
 from servotwin.messages.checks import InvalidMessage, Refusal, require
 from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
-from servotwin.messages.requests import Answer, Request
+from servotwin.messages.requests import Answer, Request, Resend
 from servotwin.messages.responses import LearntResponse
 from servotwin.messages.updates import Fallback, Receipt, Update
 from servotwin.messages.windows import Acknowledge, Hello, LetterAcknowledge, WindowMessage, checksum
@@ -25,7 +25,7 @@ _ZSTD_WINDOW = 8 * 1024 * 1024
 """Bytes of memory that a zstd frame may require of its reader: the limit that RFC 8878 recommends."""
 
 ParameterMessage = (
-    Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge | LetterAcknowledge | LearntResponse
+    Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge | LetterAcknowledge | LearntResponse | Resend
 )
 Message = WindowMessage | ParameterMessage
 _Decoded = TypeVar("_Decoded")

@@ -1,4 +1,4 @@
-"""Requests for more informative windows, to the edge, and answers, back."""
+"""Requests to the edge, for more informative windows or for windows that the twin misses; answers, back."""
 
 from enum import StrEnum
 from math import isfinite
@@ -133,3 +133,34 @@ class Answer(Struct, frozen=True, tag="answer/1"):
     def accepted(self) -> bool:
         """True where the edge does what was requested."""
         return self.outcome is RequestOutcome.ACCEPTED
+
+
+class Resend(Struct, frozen=True, omit_defaults=True, tag="resend/1"):
+    """Request for windows that the twin misses: its store was restored from a backup, or lost them.
+
+    An edge keeps windows for a while after they were acknowledged. It sends those that are asked for once more, in the
+    ordinary way, and ignores the rest; there is no answer. The twin stores each window once, whatever it asks for.
+
+    Attributes
+    ----------
+    boot : str or None
+        Boot of the windows; None: every boot.
+    first, last : int, int or None
+        Sequences, both included; None: to the newest.
+    reason : str
+        Reason in words.
+    """
+
+    servo: Name
+    boot: Name | None = None
+    first: Count = 0
+    last: Count | None = None
+    reason: Text = ""
+
+    def __post_init__(self) -> None:
+        require(self.last is None or self.first <= self.last, f"resend first {self.first} is after last {self.last}")
+
+    def asks_for(self, boot: str, sequence: int) -> bool:
+        """True where a window is among those that the twin misses."""
+        in_range = self.first <= sequence and (self.last is None or sequence <= self.last)
+        return in_range and self.boot in (None, boot)

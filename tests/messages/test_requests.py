@@ -16,6 +16,7 @@ from servotwin.messages import (
     Probe,
     Request,
     RequestOutcome,
+    Resend,
     decode,
     decode_json,
     encode,
@@ -49,6 +50,25 @@ def test_answers_survive_the_bytes(
     answer = Answer(servo, boot, serial, sample, outcome, newest)
     assert decode(encode(answer)) == answer
     assert decode_json(encode_json(answer)) == answer
+
+
+@given(NAMES, st.none() | NAMES, COUNTS, st.none() | COUNTS)
+def test_requests_for_missing_windows_survive_the_bytes(
+    servo: str, boot: str | None, first: int, more: int | None
+) -> None:
+    last = None if more is None else first + more
+    resend = Resend(servo, boot, min(first, 2**52), last if last is None else min(last, 2**53), "restored")
+    assert decode(encode(resend)) == decode_json(encode_json(resend)) == resend
+
+
+def test_a_request_for_missing_windows_names_a_range() -> None:
+    some, rest, all_ = Resend("axis-1", "b0", 3, 5), Resend("axis-1", "b0", 7), Resend("axis-1")
+    assert [n for n in range(9) if some.asks_for("b0", n)] == [3, 4, 5]
+    assert [n for n in range(9) if rest.asks_for("b0", n)] == [7, 8]
+    assert not some.asks_for("b1", 4)
+    assert all_.asks_for("b1", 0)
+    with pytest.raises(InvalidMessage, match="first 6 is after last 5"):
+        decode(msgspec.msgpack.encode({"type": "resend/1", "servo": "axis-1", "first": 6, "last": 5}))
 
 
 def test_the_two_kinds_are_distinguished() -> None:
