@@ -63,7 +63,11 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
             r"static_friction_n = 10.0 N: must be at least friction_n = 15.0 N",
         ),
         ("friction_n = 15.0", "friction_n = 15.0\nstribeck_sped_m_per_s = 0.1", "stribeck_speed_m_per_s"),
-        ("mass_kg = [20.0]", "mass_kg = [20.0, 3.0]", r"load k \(stiffness_n_per_m\) = \(0.0,\): must have one value for each"),
+        (
+            "mass_kg = [20.0]",
+            "mass_kg = [20.0, 3.0]",
+            r"load k \(stiffness_n_per_m\) = \(0.0,\): must have one value for each",
+        ),
         ('kind = "linear"', 'kind = "rotary"', 'rotary\' is not allowed; give "linear", for the transmission'),
         ("kp_n_m_per_m", "kp_v_per_m", r"controller.kp_v_per_m'; here its name is 'controller.kp_n_m_per_m'"),
         ("kp_n_m_per_m = 1500.0", "kp_n_m_per_m = nan", "controller.kp_n_m_per_m = nan is not allowed"),
