@@ -12,7 +12,6 @@ from typing import Any
 from servotwin.config.keys import Form, Item, Maker, items_of
 from servotwin.config.table import Table, named
 from servotwin.config.units import unit_of
-from servotwin.errors import InvalidInput
 
 Values = dict[str, Any]
 
@@ -105,9 +104,6 @@ def _read_item(table: Table, item: Item, folder: Path, base: object, values: Val
     if item.key.switch and not table.boolean(item.key.switch, True):
         values[item.name] = None
         return
-    given = [name for name in item.names if name in table.values]
-    if len(given) > 1:
-        raise InvalidInput(f"{table.source}: {table.path(given[0])} and {table.path(given[1])}: give only one of them")
     for name in item.names:
         if name in table.values and table.values[name] != []:
             values[item.name] = _value(table, item, name, folder, base)

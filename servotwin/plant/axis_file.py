@@ -155,6 +155,9 @@ def read_parts(table: Table) -> Parts:
     tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
     actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
     kind = kind_of(tables["transmission"], TRANSMISSIONS)
+    both = [name for name in ("pitch_m_per_rad", "lead_mm_per_rev") if name in tables["transmission"].values]
+    if len(both) == 2:
+        raise InvalidInput(f"{table.source}: transmission.{both[0]} and transmission.{both[1]}: give only one of them")
     transmission: Transmission = read_kind(tables["transmission"], TRANSMISSIONS, Path())
     motion = kind_of(tables["load"], LOADS)
     if motion != _MOTIONS[kind]:

@@ -51,7 +51,7 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
         ("inertia_kg_m2 = 0.00012", "inertia_kg_m2 = -1.0", "inertia_kg_m2 = -1.0 is not allowed; give a positive"),
         ("pitch_m_per_rad", "pitch_mm_per_rad", "transmission.pitch_m_per_rad' is missing"),
         ("mass_kg = [20.0]", "mass_kg = [20.0, 0.0]", r"load.mass_kg\[1\] = 0.0 is not allowed"),
-        ("lead_mm_per_rev = 5.0", "lead_mm_per_rev = 5.0\npitch_m_per_rad = 1e-3", "give only one of them"),
+        ("pitch_m_per_rad = ", "lead_mm_per_rev = 5.0\npitch_m_per_rad = ", "give only one of them"),
         (
             "friction_n = 15.0",
             "friction_n = 15.0\nstatic_friction_n = 20.0",
