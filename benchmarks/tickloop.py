@@ -109,7 +109,7 @@ def measured(rate: float, seconds: float, moving: bool, priority: int, folder: P
     file = folder / "edge.toml"
     file.write_text(edge_toml(settings), encoding="utf-8")
     drive, outlet = PacedDrive(rate, seconds, moving), PipeOutlet(False)
-    child = LinkChild(link_command(file), outlet)
+    child = LinkChild(link_command(file, "bench"), outlet)
     edge = EdgeRuntime(settings, "bench", outlet, child, None, time.perf_counter, time.sleep)
     role = ControlRole(edge, drive)
     child.check(edge.clock())

@@ -224,6 +224,8 @@ def _event(one: JsonObject) -> Entry:
         text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body)}"
     elif kind == "answer":
         text = f"the edge answers a request: {one['status']}"
+    elif kind == "alarm":
+        text = f"ALARM: {one['status']}"
     else:
         text = one["status"] or kind
     return one["created"], "", f"{_time(one['created'])}  {text}"
@@ -231,7 +233,7 @@ def _event(one: JsonObject) -> Entry:
 
 def _measured(body: JsonObject) -> str:
     """Measured and allowed value, in the cause's unit."""
-    if body.get("cause") == Cause.DRIVE:
+    if body.get("cause") in (Cause.DRIVE, Cause.CONFLICT):
         return ""
     scale, unit = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, "V")}.get(body.get("cause", ""), (1e6, "um"))
     try:

@@ -185,6 +185,12 @@ class Agent:
         self._deadline = self._next_deadline()
         return [ScheduledMessage(self.samples, each) for each in messages]
 
+    def superseded(self) -> list[ScheduledMessage]:
+        """Fall back, since another edge of the servo has taken over; return messages."""
+        messages = self._supervisor.superseded()
+        self._deadline = self._next_deadline()
+        return [ScheduledMessage(self.samples, each) for each in messages]
+
     def hello(self) -> Hello:
         """Make the message that introduces the edge: send it after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller

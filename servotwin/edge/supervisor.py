@@ -244,6 +244,13 @@ class Supervisor:
         """Put former parameters in force again, since the drive has refused the present ones."""
         return self._advance(restore(self._state, former, self._here))
 
+    def superseded(self) -> Messages:
+        """Fall back, since another edge of the servo has taken over, and its updates are not for this one."""
+        if self._fallback is None or self.parameters.fallback:
+            return ()
+        violation = Violation(Cause.CONFLICT, 0.0, 0.0)
+        return self._advance(fall_back(self._state, self._fallback, violation, self._here))
+
     def window_sent(self, now: float) -> None:
         """Note that a window is on its way to the twin."""
         self._unanswered_since = now if self._unanswered_since is None else self._unanswered_since

@@ -122,6 +122,9 @@ class EdgeRuntime:
             self.send(self.agent.receive(message))
         if received.pending_changed:
             self.agent.outlet_changed()
+        if received.superseded:
+            log("conflict", boot=self.agent.settings.boot)
+            self.send(self.agent.superseded())
         if received.reconnected:
             self._outlet.send_letter(self.agent.hello())
 

@@ -110,8 +110,12 @@ class ReconnectedFrame(Struct, frozen=True, array_like=True, tag="reconnected"):
     """The twin is reached again."""
 
 
+class SupersededFrame(Struct, frozen=True, array_like=True, tag="superseded"):
+    """Another edge of the servo has taken over: nothing is sent any more."""
+
+
 ToLink = WindowFrame | LetterFrame | ResponseFrame | SaveFrame | ProcessedFrame | StatusFrame
-ToControl = AckFrame | MessageFrame | PendingFrame | ReconnectedFrame
+ToControl = AckFrame | MessageFrame | PendingFrame | ReconnectedFrame | SupersededFrame
 
 encode = msgspec.msgpack.Encoder().encode
 _to_link: msgspec.msgpack.Decoder[ToLink] = msgspec.msgpack.Decoder(ToLink)

@@ -17,11 +17,11 @@ Start = Callable[[socket.socket], ChildProcess]
 _END_S = 10.0
 
 
-def link_command(file: Path) -> Start:
-    """Return a function that starts a link process for an `edge.toml`; no secret is in its arguments."""
+def link_command(file: Path, run: str) -> Start:
+    """Return a function that starts a link process for an `edge.toml`, in a run of the edge; no argument is secret."""
 
     def start(end: socket.socket) -> ChildProcess:
-        command = [sys.executable, "-m", "servotwin.edge_process.link_process", str(file), str(end.fileno())]
+        command = [sys.executable, "-m", "servotwin.edge_process.link_process", str(file), str(end.fileno()), run]
         return ChildProcess(command, pass_fds=(end.fileno(),))
 
     return start

@@ -1,6 +1,6 @@
 """The link process: it filters, packs, stores, sends and receives, so that the control process never waits.
 
-`python -m servotwin.edge_process.link_process edge.toml FD`; it ends when the other end of the socket FD is closed.
+`python -m servotwin.edge_process.link_process edge.toml FD RUN`; it ends when the other end of the socket FD is closed.
 
 A frame of the control process is confirmed when its content is on the disk, or when nothing of it has to be stored.
 """
@@ -25,15 +25,15 @@ import msgspec
 from servotwin.edge.outlet import FILTERED, WindowWriter
 from servotwin.edge.store import FileParameterStore
 from servotwin.edge_process import frames
-from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
+from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frames import LetterFrame, ProcessedFrame, SaveFrame, StatusFrame, ToLink, WindowFrame
 from servotwin.edge_process.monitoring import TroubleLog, log, summarise, write_status
+from servotwin.edge_process.transports import exclusive_transport, link_token
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Key
 from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import MOST_UNWRITTEN, SqliteOutbox
-from servotwin.link.transport import Transport
 from servotwin.messages import Acknowledge, InvalidMessage, LearntResponse, decode, encode
 from servotwin.runtime.frames import FrameSocket
 
@@ -160,16 +160,18 @@ class LinkProcess:
     config : EdgeConfig
     end : socket
         To the control process.
+    run : str
+        Name of the control process's run, which claims the servo.
     """
 
-    def __init__(self, config: EdgeConfig, end: socket.socket) -> None:
+    def __init__(self, config: EdgeConfig, end: socket.socket, run: str) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
         files = config.files
         self.outbox = SqliteOutbox(config.path(files.outbox), config.agent.servo, files.windows, files.bytes)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
-        self._token, self._token_replaced = _token(config), False
-        self._transport = _transport(config)
+        self._token, self._token_replaced = link_token(config), False
+        self._transport = exclusive_transport(config, self.outbox, run)
         self._session = Session(self.outbox, config.agent.retry, random.random)
         self._sender = self._receiver = None
         if self._transport is not None:
@@ -185,6 +187,7 @@ class LinkProcess:
         self._pending = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
         self._troubles, self._dropped = TroubleLog(), dict[str, int]()
+        self._conflict = False
 
     def run(self) -> None:
         """Run until the control process is gone."""
@@ -244,6 +247,7 @@ class LinkProcess:
         for serial in self._handler.retry():
             self._pipe.post(frames.encode(frames.AckFrame(serial)))
         self._log_troubles()
+        self._report_conflict()
         self._check_token()
         try:
             write_status(self._config.path(self._config.files.status), self._status())
@@ -255,7 +259,7 @@ class LinkProcess:
         if self._receiver is None or not (self._session.trouble or self._receiver.trouble):
             return
         with suppress(InvalidInput):  # it is being replaced just now
-            self._token_replaced = _token(self._config) != self._token
+            self._token_replaced = link_token(self._config) != self._token
         if self._token_replaced:
             log("token replaced")
 
@@ -271,6 +275,12 @@ class LinkProcess:
         if dropped != self._dropped:
             self._dropped = dropped
             log("windows dropped", **dropped)
+
+    def _report_conflict(self) -> None:
+        """Tell the control process, once, that another edge of the servo has taken over."""
+        if self._transport is not None and self._transport.superseded and not self._conflict:
+            self._conflict = True
+            self._pipe.post(frames.encode(frames.SupersededFrame()))
 
     def _send_pending(self) -> None:
         """Send the number of pending windows to the control process where it has changed."""
@@ -343,40 +353,9 @@ class LinkProcess:
         }
         if self._receiver is not None:
             status["up"] = {"trouble": self._session.trouble, **self._session.counts}
+            status["conflict"] = self._conflict
             status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
-
-
-def _transport(config: EdgeConfig) -> Transport | None:
-    """Make the transport of a configuration; None: there is no twin."""
-    twin = config.twin
-    if twin is None:
-        return None
-    ca_file = None if twin.ca_file is None else str(config.path(twin.ca_file))
-    return _TRANSPORTS["mqtt" if twin.over_mqtt else "http"](config, twin, _token(config), ca_file)
-
-
-def _http(config: EdgeConfig, twin: TwinLink, token: str, ca_file: str | None) -> Transport:
-    from servotwin.link.http import HttpTransport
-
-    return HttpTransport(twin.url, config.agent.servo, token, ca_file, twin.timeout_s, twin.wait_s)
-
-
-def _mqtt(config: EdgeConfig, twin: TwinLink, token: str, ca_file: str | None) -> Transport:
-    from servotwin.link.broker import Broker
-    from servotwin.link.mqtt import MqttTransport
-
-    broker = Broker(twin.url, twin.user, password_of(twin, config.folder), ca_file)
-    return MqttTransport(broker, config.agent.servo, token, twin.timeout_s, twin.wait_s)
-
-
-_TRANSPORTS: dict[str, Callable[[EdgeConfig, TwinLink, str, str | None], Transport]] = {"http": _http, "mqtt": _mqtt}
-"""Transports by name; each is imported when it is used."""
-
-
-def _token(config: EdgeConfig) -> str:
-    """Token of the servo; empty where there is no twin."""
-    return "" if config.twin is None else token_of(config.twin, config.folder)
 
 
 def main(arguments: list[str]) -> int:
@@ -384,10 +363,10 @@ def main(arguments: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICE)
-    path, descriptor = arguments
+    path, descriptor, run = arguments
     end = socket.socket(fileno=int(descriptor))
     try:
-        LinkProcess(load(path), end).run()
+        LinkProcess(load(path), end, run).run()
     except Exception as error:
         log("link process failed", error=f"{type(error).__name__}: {error}")
         return 1

@@ -12,7 +12,7 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Cut
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process import frames
-from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame
+from servotwin.edge_process.frames import AckFrame, MessageFrame, PendingFrame, ReconnectedFrame, SupersededFrame
 from servotwin.messages import InvalidMessage, LearntResponse, Message, decode, encode
 from servotwin.runtime.frames import FrameError, FrameSocket
 
@@ -32,11 +32,13 @@ class ReceivedFrames:
         True where the number of windows that wait for the twin's acknowledgement may have changed.
     reconnected : bool
         True where the twin is reached again: the agent sends a hello.
+    superseded : bool
+        True where another edge of the servo has taken over.
     """
 
     def __init__(self) -> None:
         self.messages: list[Message] = []
-        self.pending_changed = self.reconnected = False
+        self.pending_changed = self.reconnected = self.superseded = False
 
 
 class PipeOutlet:
@@ -164,6 +166,8 @@ class PipeOutlet:
                 received.pending_changed = True
             elif isinstance(frame, ReconnectedFrame):
                 received.reconnected = True
+            elif isinstance(frame, SupersededFrame):
+                received.superseded = True
         return received
 
     def _message(self, frame: MessageFrame, received: ReceivedFrames) -> None:

@@ -75,7 +75,7 @@ def _run(config: EdgeConfig, path: Path) -> None:
     # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
     boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
-    child = LinkChild(link_command(path), outlet)
+    child = LinkChild(link_command(path, boot), outlet)
     stop = StopSignal()
     before = {each: signal.signal(each, stop) for each in SIGNALS if not _is_ignored(each)}
     try:

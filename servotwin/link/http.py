@@ -12,14 +12,17 @@ from urllib.parse import quote, urlsplit
 
 import msgspec
 
+from servotwin.link.claim import Held
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
-from servotwin.messages import MAX_BYTES, Acknowledge, InvalidMessage, Refusal, decode
+from servotwin.messages import MAX_BYTES, Acknowledge, EdgeClaim, InvalidMessage, Refusal, Standing, decode, encode
 
 if TYPE_CHECKING:
     import ssl
 
 BODY = "application/msgpack"
+CLAIM = "Servotwin-Claim"
+"""Header that names the sender's claim."""
 _LONGEST_PAUSE_S = 300.0
 """A longer Retry-After is cut to this."""
 _PIECE = 65536
@@ -170,12 +173,13 @@ class HttpTransport:
     ) -> None:
         context = tls_context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
+        self.claim = Held()
         self._up = _PersistentConnection(url, token, timeout_s, context)
         self._down = _PersistentConnection(url, token, timeout_s + wait_s, context)
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when the twin has the message safe; see `Transport`."""
-        headers = {"Content-Type": BODY}
+        headers = {"Content-Type": BODY, **self._claimed()}
         if parcel.encoding:
             headers["Content-Encoding"] = parcel.encoding
         if not parcel.is_window:
@@ -192,7 +196,26 @@ class HttpTransport:
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
         path = f"{self._base}/outgoing?after={after}&wait={self._wait:g}"
-        return _decode_list(_checked(self._down.request("GET", path, None, {}, 4 * MAX_BYTES), (200,)).body)
+        return _decode_list(
+            _checked(self._down.request("GET", path, None, self._claimed(), 4 * MAX_BYTES), (200,)).body
+        )
+
+    def ask(self, claim: EdgeClaim) -> Standing | None:
+        """Send a question or a claim; see `ClaimingTransport`."""
+        headers = {"Content-Type": BODY}
+        response = self._up.request("POST", f"{self._base}/claim", encode(claim), headers, _LONGEST_RESPONSE)
+        if response.status == 404 and _refusal_of(response) is Refusal.NOT_UNDERSTOOD:
+            return None  # a twin of a version without claims has no such path
+        try:
+            standing = decode(_checked(response, (200,)).body)
+        except InvalidMessage:
+            standing = None
+        if not isinstance(standing, Standing):
+            raise Unreachable("the answer to a claim is none: whoever answers is not the twin")
+        return standing
+
+    def _claimed(self) -> dict[str, str]:
+        return {CLAIM: self.claim.text} if self.claim.number else {}
 
     def close(self) -> None:
         """Close both connections."""
@@ -216,11 +239,23 @@ def _checked(response: _Response, good: tuple[int, ...]) -> _Response:
     """
     if response.status in good:
         return response
-    try:
-        refusal = msgspec.json.decode(response.body[:_LONGEST_ERROR], type=_RefusalBody)
-    except (msgspec.MsgspecError, UnicodeDecodeError):
-        raise Unreachable(f"HTTP status {response.status}, without a reason code of the twin's") from None
+    refusal = _refusal_body(response)
+    if refusal is None:
+        raise Unreachable(f"HTTP status {response.status}, without a reason code of the twin's")
     raise Refused(refusal.code, refusal.detail[:200], _retry_after_s(response.retry_after))
+
+
+def _refusal_body(response: _Response) -> _RefusalBody | None:
+    """Read the body of a refusal; None: it has none of the twin's."""
+    try:
+        return msgspec.json.decode(response.body[:_LONGEST_ERROR], type=_RefusalBody)
+    except (msgspec.MsgspecError, UnicodeDecodeError):
+        return None
+
+
+def _refusal_of(response: _Response) -> Refusal | None:
+    body = _refusal_body(response)
+    return None if body is None else body.code
 
 
 def _retry_after_s(text: str) -> float:

@@ -14,6 +14,7 @@ from itertools import count
 from threading import Event, Lock
 
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
+from servotwin.link.claim import Held
 from servotwin.link.mqtt_messages import (
     TWIN_GONE,
     MqttRequest,
@@ -31,9 +32,11 @@ from servotwin.link.mqtt_messages import (
 )
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
+from servotwin.messages import MAX_BYTES, EdgeClaim, InvalidMessage, Refusal, Standing
 
 _SESSION_S = 3600
+_NO_MESSAGE = 2**53
+"""Above every serial of a message."""
 _NO_SUBSCRIBER = "no twin listens at the broker"
 
 
@@ -49,10 +52,21 @@ class MqttTransport:
         Time limit of a response, s.
     wait_s : float
         Time for which one poll waits for a message, s.
+    run : str
+        Name of this run of the edge. It is part of the client's name: a broker that sees a name twice ends the older
+        connection, and two edges of one servo would do that to each other for ever.
     """
 
-    def __init__(self, broker: Broker, servo: str, token: str, timeout_s: float = 10.0, wait_s: float = 25.0) -> None:
-        self._servo, self._key = servo, key_of(verifier_of(token))
+    def __init__(
+        self,
+        broker: Broker,
+        servo: str,
+        token: str,
+        timeout_s: float = 10.0,
+        wait_s: float = 25.0,
+        run: str = "",
+    ) -> None:
+        self._servo, self._key, self.claim = servo, key_of(verifier_of(token)), Held()
         self._timeout, self._wait = timeout_s, wait_s
         # Serials begin at random, so that a response to an earlier process does not match a request of this one.
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
@@ -60,7 +74,8 @@ class MqttTransport:
         self._published: dict[int, Future[MqttResponse | UnknownPeer]] = {}
         self._without_subscriber: set[int] = set()
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
-        session = MqttSession(f"servotwin-edge-{servo}", (response_topic(servo), TWIN_GONE), _SESSION_S)
+        name = f"servotwin-edge-{servo}" + (f"-{run}" if run else "")
+        session = MqttSession(name, (response_topic(servo), TWIN_GONE), _SESSION_S)
         self._connection = Connection(
             broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._no_subscriber)
         )
@@ -69,16 +84,24 @@ class MqttTransport:
         """Return when a twin has the message safe; see `Transport`."""
         if len(parcel.body) > MAX_BYTES:
             raise Refused(Refusal.TOO_LARGE, f"a message of {len(parcel.body)} bytes: at most {MAX_BYTES} are allowed")
-        response = self._request(PutRequest(parcel.body, parcel.encoding), self._timeout)
+        response = self._request(PutRequest(parcel.body, parcel.encoding, self.claim.text), self._timeout)
         if not isinstance(response, PutResponse):
             raise Unreachable("the answer to a message does not acknowledge it")
 
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
-        response = self._request(PollRequest(after, self._wait), self._wait + self._timeout)
+        response = self._request(PollRequest(after, self._wait, self.claim.text), self._wait + self._timeout)
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a poll holds no messages")
         return response.messages
+
+    def ask(self, claim: EdgeClaim) -> Standing | None:
+        """Send a question or a claim; see `ClaimingTransport`."""
+        # In a poll for messages that there cannot be: a twin without claims answers it like any other.
+        response = self._request(PollRequest(_NO_MESSAGE, 0.0, question=claim), self._timeout)
+        if not isinstance(response, PollResponse):
+            raise Unreachable("the answer to a claim is none")
+        return response.standing
 
     def close(self) -> None:
         """Close the connection; requests under way raise `Unreachable`."""

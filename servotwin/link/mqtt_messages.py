@@ -13,7 +13,7 @@ import msgspec
 from msgspec import Meta, Struct
 
 from servotwin.link.seal import OVERHEAD, TO_TWIN, Sealed, opened, seal
-from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
+from servotwin.messages import MAX_BYTES, EdgeClaim, InvalidMessage, Refusal, Standing
 from servotwin.messages.checks import Count
 
 ROOT = "servotwin"
@@ -25,7 +25,10 @@ LIMIT = 4 * MAX_BYTES + 2 * OVERHEAD
 _UP = re.compile(ROOT + r"/([A-Za-z0-9][A-Za-z0-9._-]{0,63})/up")
 
 
-class PutRequest(Struct, frozen=True, tag="carry/1"):
+ClaimText = Annotated[str, Meta(max_length=96)]
+
+
+class PutRequest(Struct, frozen=True, omit_defaults=True, tag="carry/1"):
     """Request: store this message.
 
     Attributes
@@ -34,13 +37,16 @@ class PutRequest(Struct, frozen=True, tag="carry/1"):
         Encoded message, compressed as `encoding` says.
     encoding : str
         As HTTP's Content-Encoding; "" stands for identity.
+    claim : str
+        Claim that the sender holds; "": none.
     """
 
     body: bytes
     encoding: Annotated[str, Meta(max_length=16)] = ""
+    claim: ClaimText = ""
 
 
-class PollRequest(Struct, frozen=True, tag="listen/1"):
+class PollRequest(Struct, frozen=True, omit_defaults=True, tag="listen/1"):
     """Request: poll for messages.
 
     Attributes
@@ -49,20 +55,27 @@ class PollRequest(Struct, frozen=True, tag="listen/1"):
         Only messages with higher serials are requested.
     wait : float
         Time to wait for the first one, s.
+    claim : str
+        Claim that the sender holds; "": none.
+    question : EdgeClaim, optional
+        Question or claim, which is answered at once, without messages. A twin of a version without claims ignores it.
     """
 
     after: Count
     wait: Annotated[float, Meta(ge=0.0, le=30.0)]
+    claim: ClaimText = ""
+    question: EdgeClaim | None = None
 
 
 class PutResponse(Struct, frozen=True, tag="taken/1"):
     """Response: the message is stored, by this request or an earlier one."""
 
 
-class PollResponse(Struct, frozen=True, tag="heard/1"):
-    """Response: messages, each sealed, with rising serials."""
+class PollResponse(Struct, frozen=True, omit_defaults=True, tag="heard/1"):
+    """Response: messages, each sealed, with rising serials; `standing` is the answer to a question."""
 
     messages: list[bytes]
+    standing: Standing | None = None
 
 
 class RefusedResponse(Struct, frozen=True, tag="refused/1"):

@@ -7,6 +7,7 @@ JSON too. SI units throughout. Values that are not known, or bounds that do not 
 """
 
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
+from servotwin.messages.claims import PROTOCOL, EdgeClaim, Standing
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
@@ -29,12 +30,14 @@ __all__ = [
     "FINE",
     "MAX_BYTES",
     "NAME_PATTERN",
+    "PROTOCOL",
     "Acknowledge",
     "Answer",
     "Ask",
     "Band",
     "Cause",
     "Channel",
+    "EdgeClaim",
     "Fallback",
     "Gains",
     "Hello",
@@ -52,6 +55,7 @@ __all__ = [
     "RequestOutcome",
     "Resend",
     "Setting",
+    "Standing",
     "Update",
     "Verification",
     "WindowMessage",

@@ -27,6 +27,7 @@ class Refusal(StrEnum):
     FUTURE = "future"
     TOO_MANY = "too_many"
     UNAVAILABLE = "unavailable"
+    SUPERSEDED = "superseded"
 
     @property
     def temporary(self) -> bool:
@@ -36,6 +37,7 @@ class Refusal(StrEnum):
             Refusal.FUTURE,
             Refusal.TOO_MANY,
             Refusal.UNAVAILABLE,
+            Refusal.SUPERSEDED,
             Refusal.UNKNOWN_SERVO,
         )
 

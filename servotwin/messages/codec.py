@@ -9,6 +9,7 @@ from typing import TypeVar, get_args
 import msgspec
 
 from servotwin.messages.checks import InvalidMessage, Refusal, require
+from servotwin.messages.claims import EdgeClaim, Standing
 from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.requests import Answer, Request, Resend
 from servotwin.messages.responses import LearntResponse
@@ -25,7 +26,18 @@ _ZSTD_WINDOW = 8 * 1024 * 1024
 """Bytes of memory that a zstd frame may require of its reader: the limit that RFC 8878 recommends."""
 
 ParameterMessage = (
-    Update | Receipt | Fallback | Request | Answer | Hello | Acknowledge | LetterAcknowledge | LearntResponse | Resend
+    Update
+    | Receipt
+    | Fallback
+    | Request
+    | Answer
+    | Hello
+    | Acknowledge
+    | LetterAcknowledge
+    | LearntResponse
+    | Resend
+    | EdgeClaim
+    | Standing
 )
 Message = WindowMessage | ParameterMessage
 _Decoded = TypeVar("_Decoded")

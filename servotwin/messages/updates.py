@@ -40,6 +40,7 @@ class Cause(StrEnum):
     EFFORT = "effort outside the predicted band"
     SILENCE = "the twin is silent"
     DRIVE = "the drive does not take the parameters"
+    CONFLICT = "another edge of the servo has taken over"
 
 
 class Verification(Struct, frozen=True):

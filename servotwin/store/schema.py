@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-REVISION = "0002"
+REVISION = "0003"
 """Newest migration, which makes the tables below."""
 
 metadata = sa.MetaData(
@@ -102,6 +102,16 @@ outgoing = sa.Table(
     sa.Column("servo", sa.Text, sa.ForeignKey(twins.c.servo), primary_key=True),
     sa.Column("serial", sa.BigInteger, primary_key=True, autoincrement=False),
     sa.Column("body", sa.LargeBinary, nullable=False),
+    sa.Column("created", sa.Double, nullable=False),
+)
+
+# Not tied to `twins`: an edge claims its servo before its first message.
+claims = sa.Table(
+    "claims",
+    metadata,
+    sa.Column("servo", sa.Text, primary_key=True),
+    sa.Column("run", sa.Text, nullable=False),
+    sa.Column("number", sa.BigInteger, nullable=False),
     sa.Column("created", sa.Double, nullable=False),
 )
 

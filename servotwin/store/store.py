@@ -9,6 +9,7 @@ import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
 from servotwin.store import incoming, queries, results
+from servotwin.store.claims import StoredClaim, add_alarm, claim_of, raise_claim
 from servotwin.store.engine import (
     Engines,
     StoreUnavailable,
@@ -146,6 +147,18 @@ class Store:
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
         return self._read(lambda connection: results.posted(connection, servos))
+
+    def claim_of(self, servo: str) -> StoredClaim:
+        """Newest claim of a servo's edge."""
+        return self._read(lambda connection: claim_of(connection, servo))
+
+    def raise_claim(self, servo: str, new: StoredClaim, below: int, now: float) -> StoredClaim:
+        """Store a claim where the servo's newest has a number below `below`; return the one that counts then."""
+        return self._write(lambda connection: raise_claim(connection, servo, new, below, now))
+
+    def add_alarm(self, servo: str, sentence: str, now: float) -> None:
+        """Store an alarm about a servo's edge, which belongs to no window."""
+        self._write(lambda connection: add_alarm(connection, servo, sentence, now))
 
     def backlog(self, now: float) -> Backlog:
         """Number and age of the unprocessed messages."""

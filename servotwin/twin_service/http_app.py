@@ -67,6 +67,11 @@ class HttpRequest:
         return bearer_token(self.header(b"authorization"))
 
     @property
+    def claim(self) -> str:
+        """Claim that the sender holds; "": it names none."""
+        return (self.header(b"servotwin-claim") or b"").decode("latin-1")
+
+    @property
     def content_length(self) -> str | None:
         """Content-Length as sent."""
         value = self.header(b"content-length")
@@ -297,6 +302,7 @@ def parameter(
 SERVO = parameter("servo", {"type": "string", "pattern": _NAME}, "Name of the servo.", "path")
 BOOT = parameter("boot", {"type": "string", "pattern": _NAME}, "Boot of the edge.", "path")
 SEQUENCE = parameter("sequence", INTEGER, "Number of the window within the boot.", "path")
+CLAIM = parameter("servotwin-claim", {"type": "string"}, "Number and run of the sender's claim.", "header")
 ENCODING = parameter(
     "content-encoding",
     {"type": "string", "enum": ["identity", "deflate", "zstd"]},

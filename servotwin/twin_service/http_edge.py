@@ -6,14 +6,18 @@ import asyncio
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 
+from servotwin import __version__
 from servotwin.link.seal import TO_EDGE, key_of, seal
-from servotwin.messages import Refusal
+from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, encode
 from servotwin.store.records import OutgoingMessage, PutResult
 from servotwin.twin_service.auth import EdgeGate
+from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_app import (
     BOOT,
+    CLAIM,
     ENCODING,
     INTEGER,
+    JSON,
     MESSAGE_ERRORS,
     MSGPACK,
     SECONDS,
@@ -22,6 +26,7 @@ from servotwin.twin_service.http_app import (
     HttpRequest,
     HttpResponse,
     HttpRoute,
+    json_response,
     msgpack_response,
     operation,
     parameter,
@@ -61,6 +66,7 @@ class LongPolls:
         self._waiting: dict[str, dict[asyncio.Future[None], int]] = {}
         self._notifications: Counter[str] = Counter()
         self._empty_after: dict[str, int] = {}
+        self._evictions: Counter[str] = Counter()
         self._closed = False
         self.open = 0
 
@@ -71,6 +77,11 @@ class LongPolls:
         for waiting in self._waiting.pop(servo, ()):
             if not waiting.done():
                 waiting.set_result(None)
+
+    def evict(self, servo: str) -> None:
+        """End the polls of a servo now, without messages."""
+        self._evictions[servo] += 1
+        self.notify(servo)
 
     @property
     def waiting(self) -> list[str]:
@@ -107,11 +118,13 @@ class LongPolls:
 
     async def _poll(self, servo: str, after: int, wait: float) -> Sequence[OutgoingMessage]:
         loop = asyncio.get_running_loop()
-        until = loop.time() + wait
+        until, evictions = loop.time() + wait, self._evictions[servo]
         while True:
             notifications = self._notifications[servo]
             messages = await self._read_newer(servo, after)
             left = until - loop.time()
+            if evictions != self._evictions[servo]:
+                return ()
             if messages or left <= 0.0 or self._closed:
                 return messages
             # A notification that came while the store was read must not be slept through.
@@ -166,14 +179,22 @@ class EdgeApi:
     bodies : BodyReader
     ingest : Ingest
     polls : LongPolls
+    claims : EdgeClaims
     wake : callable
         Wakes the dispatcher after a new message.
     """
 
     def __init__(
-        self, gate: EdgeGate, bodies: BodyReader, ingest: Ingest, polls: LongPolls, wake: Callable[[], None]
+        self,
+        gate: EdgeGate,
+        bodies: BodyReader,
+        ingest: Ingest,
+        polls: LongPolls,
+        claims: EdgeClaims,
+        wake: Callable[[], None],
     ) -> None:
         self._gate, self._bodies, self._ingest, self._polls, self._wake = gate, bodies, ingest, polls, wake
+        self._claims = claims
 
     def routes(self) -> list[HttpRoute]:
         """Declarations."""
@@ -183,14 +204,14 @@ class EdgeApi:
                 201: ("New, and safe: an array with its acknowledgement.", MSGPACK),
                 200: ("Known already, likewise.", MSGPACK),
             },
-            parameters=(SERVO, BOOT, SEQUENCE, ENCODING),
+            parameters=(SERVO, BOOT, SEQUENCE, ENCODING, CLAIM),
             body="A window/1, MessagePack.",
             errors=MESSAGE_ERRORS,
         )
         post_letter = operation(
             "Commit a hello, receipt, fallback or answer",
             {202: ("It is safe.", None)},
-            parameters=(SERVO, ENCODING),
+            parameters=(SERVO, ENCODING, CLAIM),
             body="A hello/2, receipt/1, fallback/2 or answer/1, MessagePack; hello/1 and fallback/1 are read too.",
             errors=MESSAGE_ERRORS,
         )
@@ -201,19 +222,31 @@ class EdgeApi:
                 SERVO,
                 parameter("after", INTEGER, "Only messages with higher serials."),
                 parameter("wait", {**SECONDS, "maximum": MAX_WAIT_S}, "Longest wait for one, s."),
+                CLAIM,
             ),
-            errors=(400, 401, 403, 404, 429, 503),
+            errors=(400, 401, 403, 404, 409, 429, 503),
         )
+        post_claim = operation(
+            "Claim to be the servo's only edge, or ask which one is",
+            {200: ("The servo's newest claim, a standing/1.", MSGPACK)},
+            parameters=(SERVO,),
+            body="A claim/1, MessagePack.",
+            errors=(400, 401, 403, 404, 413, 429, 503),
+        )
+        version = operation("Versions of the protocol and of servotwin", {200: ("protocol, servotwin.", JSON)})
         return [
             HttpRoute("PUT", WINDOW_PATH, self._put_window, put_window),
             HttpRoute("POST", SERVO_PATH + "/letters", self._post_letter, post_letter),
             HttpRoute("GET", SERVO_PATH + "/outgoing", self._get_outgoing, get_outgoing),
+            HttpRoute("POST", SERVO_PATH + "/claim", self._post_claim, post_claim),
+            HttpRoute("GET", "/v1/version", _get_version, version),
         ]
 
     async def _put_window(self, request: HttpRequest) -> HttpResponse:
         """Commit a window, then acknowledge it: 201 if it is new, 200 if it is known."""
         servo = request.path["servo"]
         self._gate.admit(servo, request.token)
+        await self._claims.check(servo, request.claim)
         body = await self._bodies.read(request.content_length, request.receive)
         incoming, window = self._ingest.read_window(servo, body, request.content_encoding)
         if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
@@ -227,6 +260,7 @@ class EdgeApi:
         """Commit a hello, receipt, fallback or answer: 202."""
         servo = request.path["servo"]
         self._gate.admit(servo, request.token)
+        await self._claims.check(servo, request.claim)
         body = await self._bodies.read(request.content_length, request.receive)
         incoming, _ = self._ingest.read_letter(servo, body, request.content_encoding)
         if await self._ingest.commit(incoming) is PutResult.NEW:
@@ -241,5 +275,22 @@ class EdgeApi:
         if wait > MAX_WAIT_S:
             detail = f"wait = {wait:g} s: at most {MAX_WAIT_S:g} s are allowed"
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, detail)
+        await self._claims.check(servo, request.claim)
         messages = await self._polls.messages(servo, after, wait)
+        await self._claims.check(servo, request.claim)  # another edge may have taken over meanwhile
         return msgpack_response(seal_messages(self._gate.verifier(servo), servo, messages))
+
+    async def _post_claim(self, request: HttpRequest) -> HttpResponse:
+        """Answer a question or a claim."""
+        servo = request.path["servo"]
+        self._gate.admit(servo, request.token)
+        body = await self._bodies.read(request.content_length, request.receive)
+        claim = self._ingest.decode(servo, body, request.content_encoding)
+        if not isinstance(claim, EdgeClaim):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "a claim is expected here")
+        return HttpResponse(200, encode(await self._claims.answer(servo, claim)), MSGPACK)
+
+
+async def _get_version(_request: HttpRequest) -> HttpResponse:
+    """Versions, without a token: an edge or an operator of any version may ask."""
+    return json_response({"protocol": PROTOCOL, "servotwin": __version__})

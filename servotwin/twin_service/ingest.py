@@ -131,6 +131,10 @@ class Ingest:
             self._sample_times.hello(servo, message.boot, message.time, now)
         return Incoming(servo, MessageKind.LETTER, digest.hex(), body, encoding, digest, self._clocks.wall()), message
 
+    def decode(self, servo: str, body: bytes, encoding: str = "") -> Message:
+        """Decode a message of that servo that is not to be stored; raises RequestRejected as `read` does."""
+        return self._decoded(servo, body, encoding)[1]
+
     async def commit(self, incoming: Incoming) -> PutResult:
         """Commit a message; returns when it is on the disk.
 

@@ -23,6 +23,7 @@ STATUS: Mapping[Refusal, int] = {
     Refusal.BAD_TOKEN: 401,
     Refusal.UNKNOWN_SERVO: 404,
     Refusal.CONFLICT: 409,
+    Refusal.SUPERSEDED: 409,
     Refusal.TOO_LARGE: 413,
     Refusal.FUTURE: 422,
     Refusal.TOO_MANY: 429,

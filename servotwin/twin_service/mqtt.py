@@ -30,6 +30,7 @@ from servotwin.link.seal import key_of
 from servotwin.messages import InvalidMessage, Refusal
 from servotwin.store.records import PutResult
 from servotwin.twin_service.auth import EdgeGate
+from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_edge import LongPolls, seal_messages
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RequestRejected
@@ -55,15 +56,23 @@ class MqttRequestHandler:
     gate : EdgeGate
     ingest : Ingest
     polls : LongPolls
+    claims : EdgeClaims
     wake : callable
         Wakes the dispatcher after a new message.
     metrics : Metrics
     """
 
     def __init__(
-        self, gate: EdgeGate, ingest: Ingest, polls: LongPolls, wake: Callable[[], None], metrics: Metrics
+        self,
+        gate: EdgeGate,
+        ingest: Ingest,
+        polls: LongPolls,
+        claims: EdgeClaims,
+        wake: Callable[[], None],
+        metrics: Metrics,
     ) -> None:
         self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
+        self._claims = claims
 
     def decode(self, servo: str, data: bytes) -> ReceivedRequest | bytes | None:
         """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
@@ -92,9 +101,14 @@ class MqttRequestHandler:
         servo, question = request.servo, request.content
         if isinstance(question, PollRequest):
             self._gate.admit_authenticated(servo, limited=False)
+            if question.question is not None:
+                return PollResponse([], await self._claims.answer(servo, question.question))
+            await self._claims.check(servo, question.claim)
             messages = await self._polls.messages(servo, question.after, question.wait)
+            await self._claims.check(servo, question.claim)  # another edge may have taken over meanwhile
             return PollResponse(seal_messages(self._gate.verifier(servo), servo, messages))
         self._gate.admit_authenticated(servo)
+        await self._claims.check(servo, question.claim)
         incoming, _ = self._ingest.read(servo, question.body, question.encoding)
         if await self._ingest.commit(incoming) is PutResult.NEW:
             self._wake()

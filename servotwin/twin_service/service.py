@@ -12,6 +12,7 @@ from functools import lru_cache, partial
 from typing import Any
 from uuid import uuid4
 
+from servotwin import __version__
 from servotwin.messages import NAME_PATTERN
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
@@ -20,6 +21,7 @@ from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
+from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
 from servotwin.twin_service.http_app import HttpApp
@@ -96,9 +98,14 @@ class TwinService:
             owner=self._owner,
             quota=VerificationQuota(config.verifications_per_minute),
         )
+        self.claims = EdgeClaims(
+            store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
+        )
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
-            handler = MqttRequestHandler(self.gate, self.ingest, self.polls, self.dispatcher.wake, self.metrics)
+            handler = MqttRequestHandler(
+                self.gate, self.ingest, self.polls, self.claims, self.dispatcher.wake, self.metrics
+            )
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []
         self._add_gauges()
@@ -106,7 +113,7 @@ class TwinService:
     def http_app(self) -> HttpApp:
         """HTTP application, whose lifespan starts and stops the service."""
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
-        edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.dispatcher.wake)
+        edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
         operator = OperatorApi(self.access, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
         routes = [*edge.routes(), *operator.routes()]
         if self.config.lockstep:

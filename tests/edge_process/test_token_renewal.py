@@ -40,7 +40,7 @@ def linked(tmp_path: Path):
     (tmp_path / "edge.toml").write_text(EDGE.format(port=port))
     write_token(tmp_path, "first")
     ours, theirs = socket.socketpair()
-    running = Thread(target=LinkProcess(load(tmp_path / "edge.toml"), theirs).run)
+    running = Thread(target=LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-00").run)
     running.start()
     yield tmp_path, running
     ours.close()

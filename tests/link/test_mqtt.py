@@ -16,6 +16,7 @@ from relay import Relay, State, Weather
 
 from servotwin.link import mqtt_messages as wire
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
+from servotwin.link.claim import ExclusiveTransport, Held
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Setting, encode
@@ -257,3 +258,20 @@ def test_closing_ends_requests_under_way(server: Mosquitto) -> None:
 def test_without_a_broker_the_twin_is_unreachable() -> None:
     with edge(Broker(f"mqtt://127.0.0.1:{free_port()}"), timeout_s=0.5) as here, pytest.raises(Unreachable):
         here.deliver(parcel(0))
+
+
+def test_a_second_edge_of_a_servo_takes_over_over_a_broker_too(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as there, edge(at, run="b1-aa") as first, edge(at, run="b1-bb") as second:
+        older = ExclusiveTransport(first, "axis-1", Held("b1-aa"))
+        newer = ExclusiveTransport(second, "axis-1", Held("b1-bb"))
+        older.deliver(parcel(0))
+        newer.deliver(parcel(1))
+        for _ in range(2):
+            with pytest.raises(Refused, match="another edge of this servo"):
+                older.deliver(parcel(2))
+            newer.deliver(parcel(3))
+        assert newer.listen(0) == []
+        assert kept(store) == [0, 1, 3]
+        assert [(event.kind, event.status[:8]) for event in store.events("axis-1")] == [("alarm", "conflict")]
+        assert refusals(there)["superseded"] >= 2

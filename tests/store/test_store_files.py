@@ -15,7 +15,7 @@ import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
-from store_cases import MORE, NewAddress, filled, outcome, window
+from store_cases import MORE, NEXT, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations
@@ -78,7 +78,7 @@ def test_an_old_database_is_brought_up_to_date_with_all_it_holds(new_address: Ne
     url = new_address()
     store = filled(url)
     before = store.audit("a")
-    migrations.migrate(store.engines.writer, "0003", later_scripts)
+    migrations.migrate(store.engines.writer, NEXT, later_scripts)
     assert store.audit("a") == before
     with transaction(store.engines.reader) as connection:
         assert connection.execute(sa.text("SELECT colour FROM twins")).scalars().all() == ["grey"]
@@ -88,20 +88,22 @@ def test_an_old_database_is_brought_up_to_date_with_all_it_holds(new_address: Ne
 def test_a_newer_database_is_refused(new_address: NewAddress, later_scripts: Path) -> None:
     url = new_address()
     store = filled(url)
-    migrations.migrate(store.engines.writer, "0003", later_scripts)
+    migrations.migrate(store.engines.writer, NEXT, later_scripts)
     store.close()
-    with pytest.raises(InvalidInput, match=r"its schema 0003 is newer than 0002.*install the newer servotwin$"):
+    with pytest.raises(
+        InvalidInput, match=rf"its schema {NEXT} is newer than {REVISION}.*install the newer servotwin$"
+    ):
         open_store(url)
 
 
 def test_a_migration_that_fails_leaves_nothing(new_address: NewAddress, later_scripts: Path) -> None:
     url = new_address()
     filled(url).close()
-    broken = later_scripts / "versions" / "0003_more.py"
+    broken = later_scripts / "versions" / f"{NEXT}_more.py"
     broken.write_text(MORE + '    op.execute("INSERT INTO nowhere VALUES (1)")\n')
     engines = engines_of(parse_address(url))
     with pytest.raises((StoreUnavailable, sa.exc.DBAPIError)):
-        migrations.migrate(engines.writer, "0003", later_scripts)
+        migrations.migrate(engines.writer, NEXT, later_scripts)
     engines.dispose()
     store = open_store(url)
     assert "colour" not in {column["name"] for column in sa.inspect(store.engines.reader).get_columns("twins")}

@@ -4,6 +4,7 @@ import asyncio
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from mosquitto import Mosquitto
 
@@ -17,11 +18,13 @@ from servotwin.store.group_commit import AwaitedCommits, GroupCommit
 from servotwin.store.records import OutgoingMessage, WorkResult
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import AccessControl, EdgeGate, Verifiers
+from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_edge import LongPolls
-from servotwin.twin_service.ingest import Ingest
+from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import RateLimiter, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
+from servotwin.twin_service.store_executor import StoreExecutor
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
 SERVOS = ("axis-1", "axis-2")
@@ -72,7 +75,9 @@ class Twin:
         limits = SampleTimeLimiter(1.0, 1e9)
         ingest = Ingest(AwaitedCommits(self.commits).put, known, limits, self.metrics)
         gate = EdgeGate(AccessControl(VERIFIERS), known, RateLimiter(1e6, 1e6, self._loop.time))
-        handler = MqttRequestHandler(gate, ingest, self.polls, lambda: None, self.metrics)
+        executor = StoreExecutor()
+        claims = EdgeClaims(self.store, executor, self.polls.evict, self.metrics, Clocks(), True, "test")
+        handler = MqttRequestHandler(gate, ingest, self.polls, claims, lambda: None, self.metrics)
         server = MqttServer(self._broker, handler, "twins")
         await server.start()
         while not server.connected:
@@ -81,6 +86,7 @@ class Twin:
         await self._stop.wait()
         self.polls.close()
         await server.stop()
+        executor.close()
 
     async def _posted(self, servo: str, serial: int) -> list[OutgoingMessage]:
         return list(await asyncio.to_thread(self.store.outgoing, servo, serial))
@@ -96,7 +102,7 @@ def twin(at: Broker, store: Store) -> Iterator[Twin]:
 
 
 @contextmanager
-def edge(at: Broker, servo: str = "axis-1", token: str | None = None, **times: float) -> Iterator[MqttTransport]:
+def edge(at: Broker, servo: str = "axis-1", token: str | None = None, **times: Any) -> Iterator[MqttTransport]:
     options = {"timeout_s": 10.0, "wait_s": 5.0} | times
     transport = MqttTransport(at, servo, TOKENS[servo] if token is None else token, **options)
     try:

@@ -10,17 +10,19 @@ from pathlib import Path
 import postgres
 
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, WorkResult
+from servotwin.store.schema import REVISION
 from servotwin.store.store import Store, open_store
 
 SYSTEMS = ("sqlite", "postgresql")
 NewAddress = Callable[[], str]
 """URL of a new, empty database."""
 
-MORE = """
+NEXT = f"{int(REVISION) + 1:04d}"
+MORE = f"""
 import sqlalchemy as sa
 from alembic import op
-revision = "0003"
-down_revision = "0002"
+revision = "{NEXT}"
+down_revision = "{REVISION}"
 def upgrade():
     op.add_column("twins", sa.Column("colour", sa.Text, nullable=False, server_default="grey"))
 """

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from store_cases import MORE, SYSTEMS, NewAddress, addresses
+from store_cases import MORE, NEXT, SYSTEMS, NewAddress, addresses
 
 from servotwin.store import migrate as migrations
 from servotwin.store.engine import transaction
@@ -46,5 +46,5 @@ def later_scripts(tmp_path: Path) -> Path:
     """The migrations of some later servotwin."""
     folder = tmp_path / "migrations"
     shutil.copytree(migrations.SCRIPTS, folder, ignore=shutil.ignore_patterns("__pycache__"))
-    (folder / "versions" / "0003_more.py").write_text(MORE)
+    (folder / "versions" / f"{NEXT}_more.py").write_text(MORE)
     return folder

@@ -47,7 +47,7 @@ class Clock:
 
 def test_every_reason_has_a_status():
     assert set(STATUS) == set(Refusal)
-    assert {status for reason, status in STATUS.items() if reason.temporary} == {401, 404, 422, 429, 503}
+    assert {status for reason, status in STATUS.items() if reason.temporary} == {401, 404, 409, 422, 429, 503}
 
 
 @given(

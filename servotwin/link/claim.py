@@ -1,0 +1,173 @@
+"""One live edge per servo: the edge's claim, and the transport that sends nothing without it.
+
+A folder that was copied runs two edges with one token. Each run of an edge claims its servo once, when it begins; the
+newest claim counts. The edge that was superseded sends nothing more, keeps its windows, and asks at every later try
+whether it still is, which the twin reports as a conflict. `servotwin.messages.claims` has the protocol.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from threading import Lock
+from typing import Protocol
+
+from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
+from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
+
+SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
+_TRIES = 8
+"""Claims in a row that others may win: each run of an edge claims once."""
+
+
+class ClaimingTransport(Transport, Protocol):
+    """A transport whose requests name a claim.
+
+    Attributes
+    ----------
+    claim : Held
+        Named by every request from now on.
+    """
+
+    claim: Held
+
+    def ask(self, claim: EdgeClaim) -> Standing | None:
+        """Send a question or a claim; None: the twin is of a version without claims.
+
+        Raises
+        ------
+        Refused
+        Unreachable
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Claim that an edge holds.
+
+    Parameters
+    ----------
+    run : str
+        Name of the edge's run.
+    number : int
+        0: none.
+    """
+
+    run: str = ""
+    number: int = 0
+
+    @property
+    def text(self) -> str:
+        """Text that a request carries; empty: no claim is held."""
+        return f"{self.number} {self.run}" if self.number else ""
+
+
+def held_of(text: str) -> Held | None:
+    """Read a claim as `Held.text` writes it; None: it is none."""
+    number, _, run = text.partition(" ")
+    if not (number.isascii() and number.isdecimal() and len(number) <= 16 and run):
+        return None
+    return Held(run, int(number))
+
+
+class ExclusiveTransport:
+    """Transport that claims the servo before its first message, and sends nothing once another run has claimed it.
+
+    Parameters
+    ----------
+    transport : ClaimingTransport
+    servo : str
+    held : Held
+        Name of this run; with a number where an earlier link process of the same run has claimed.
+    store : callable
+        Called with a new claim, to be stored before it is used.
+    software : str
+        Version of servotwin, for the twin.
+
+    Attributes
+    ----------
+    superseded : bool
+        Another edge has taken over.
+    twin : Standing or None
+        The twin's last answer; None: there was none, or the twin is of a version without claims.
+    """
+
+    def __init__(
+        self,
+        transport: ClaimingTransport,
+        servo: str,
+        held: Held,
+        store: Callable[[Held], None] = lambda _: None,
+        software: str = "",
+    ) -> None:
+        self._transport, self._servo, self._store, self._software = transport, servo, store, software
+        self._held, self._settled, self._lock = held, False, Lock()
+        self.superseded = False
+        self.twin: Standing | None = None
+
+    def deliver(self, parcel: Parcel) -> None:
+        """Send a message; raises Refused (SUPERSEDED) where another edge has taken over."""
+        self._settle()
+        try:
+            self._transport.deliver(parcel)
+        except (Refused, Unreachable) as error:
+            self._failed(error)
+            raise
+
+    def listen(self, after: int) -> list[bytes]:
+        """Return the twin's messages; raises Refused (SUPERSEDED) where another edge has taken over."""
+        self._settle()
+        try:
+            return self._transport.listen(after)
+        except (Refused, Unreachable) as error:
+            self._failed(error)
+            raise
+
+    def close(self) -> None:
+        """Close the connections at once."""
+        self._transport.close()
+
+    def _failed(self, error: Refused | Unreachable) -> None:
+        """Ask again: the claim may not count any more, or the twin may be of another version when it is back."""
+        superseded = isinstance(error, Refused) and error.reason is Refusal.SUPERSEDED
+        if superseded or isinstance(error, Unreachable):
+            self._settled = False
+        if superseded:
+            self._settle()
+
+    def _settle(self) -> None:
+        with self._lock:
+            if self._settled:
+                return
+            if self.superseded:  # for ever: an edge that took over again by itself would do so in turns with the other
+                self._ask(0)
+                raise Refused(Refusal.SUPERSEDED, SUPERSEDED)
+            self._claim()
+            self._settled = True
+
+    def _claim(self) -> None:
+        standing = self._ask(0)
+        for _ in range(_TRIES):
+            if standing is None:
+                self._transport.claim = Held()
+                return
+            if self._held.number and standing.run != self._held.run and standing.number >= self._held.number:
+                self.superseded = True
+                raise Refused(Refusal.SUPERSEDED, SUPERSEDED)
+            if self._held.number or standing.run == self._held.run:
+                # A number below ours: the twin was restored from a backup, and takes ours over from our next request.
+                self._hold(max(standing.number, self._held.number))
+                return
+            standing = self._ask(standing.number + 1)
+        raise Unreachable("others claim this servo all the time")
+
+    def _hold(self, number: int) -> None:
+        held = Held(self._held.run, number)
+        if held != self._held:
+            self._store(held)
+        self._held = self._transport.claim = held
+
+    def _ask(self, takes: int) -> Standing | None:
+        question = EdgeClaim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software)
+        self.twin = self._transport.ask(question)
+        return self.twin

@@ -1,0 +1,120 @@
+"""Another edge of the same servo: the link process sends nothing more, says so, and the edge falls back."""
+
+import socket
+import time
+from array import array
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from edge_process_parts import SETTINGS, LinkEnd, cut, exchange_all
+from faketwin import FakeTwin
+
+from servotwin.edge.agent import Agent
+from servotwin.edge.parameters import FallbackSet, Parameters
+from servotwin.edge.settings import Supervision
+from servotwin.edge_process import frames
+from servotwin.edge_process.config_file import load
+from servotwin.edge_process.link_process import LinkProcess
+from servotwin.edge_process.monitoring import read_status
+from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.messages import Cause, Fallback, Setting, Standing
+from servotwin.runtime.frames import FrameSocket
+
+PATIENCE = 60.0
+EDGE = """
+servo = "ax-1"
+role = "supervise"
+sample_rate_hz = 100.0
+[drive]
+kind = "simulated"
+address = "unix:nothing.sock"
+[retry]
+first_s = 0.05
+longest_s = 0.1
+[twin]
+url = "{url}"
+token_file = "token"
+wait_s = 0.2
+"""
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+def send(pipe: FrameSocket, sequence: int) -> None:
+    pipe.post(frames.encode(frames.window_frame(cut(sequence), "b1-aa", sequence + 1)))
+    while pipe.backlog:
+        pipe.send()
+
+
+@pytest.fixture
+def twin() -> Iterator[FakeTwin]:
+    with FakeTwin("ax-1", "first") as twin:
+        twin.standing = Standing("ax-1")
+        yield twin
+
+
+def test_an_edge_that_was_superseded_keeps_its_windows_and_tells_the_control_process(
+    tmp_path: Path, twin: FakeTwin, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "edge.toml").write_text(EDGE.format(url=twin.url))
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    ours, theirs = socket.socketpair()
+    pipe = FrameSocket(ours)
+    running = Thread(target=LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa").run)
+    running.start()
+    try:
+        send(pipe, 0)
+        until(lambda: ("b1-aa", 0) in twin.windows)
+        assert twin.standing == Standing("ax-1", "b1-aa", 1)
+        twin.standing = Standing("ax-1", "b1-bb", 2)
+        send(pipe, 1)
+        found: list[frames.ToControl] = []
+
+        def told() -> bool:
+            found.extend(frames.to_control(data) for data in pipe.receive())
+            return any(isinstance(frame, frames.SupersededFrame) for frame in found)
+
+        until(told)
+        until(lambda: (read_status(tmp_path / "status.json") or {}).get("conflict") is True)
+    finally:
+        pipe.close()
+        running.join(PATIENCE)
+    status = read_status(tmp_path / "status.json") or {}
+    assert status["windows"] == {"waiting": 1, "letters_waiting": 0, "dropped": {}}
+    assert list(twin.windows) == [("b1-aa", 0)]
+    assert "another edge of this servo" in capfd.readouterr().err
+
+
+def test_the_control_process_is_told_once_by_a_frame() -> None:
+    end = LinkEnd()
+    outlet = PipeOutlet(has_twin=True)
+    outlet.connect(end.near)
+    end.send(frames.SupersededFrame())
+    received = outlet.exchange()
+    assert received is not None
+    assert received.superseded
+    exchange_all(outlet)
+    end.close()
+
+
+def test_an_agent_that_was_superseded_falls_back_once_and_says_why() -> None:
+    fallback = FallbackSet(Setting(0.0))
+    settings = replace(
+        SETTINGS, boot="b1", parameters=Parameters(3, Setting(1e-4)), supervision=Supervision(fallback=fallback)
+    )
+    agent = Agent(settings)
+    agent.absorb_block(*(array("d", [0.0]) * 10 for _ in range(4)))
+    [sent] = agent.superseded()
+    assert isinstance(sent.message, Fallback)
+    assert (sent.message.cause, sent.message.replaced) == (Cause.CONFLICT, 3)
+    assert agent.parameters.fallback
+    assert agent.superseded() == []

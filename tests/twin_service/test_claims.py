@@ -1,0 +1,111 @@
+"""Two edges of one servo at the service: the older is refused, and an alarm is raised only if it still runs."""
+
+import asyncio
+import logging
+from pathlib import Path
+
+import httpx
+import pytest
+from service_system import MSGPACK, OTHER, bearer, place, served, twin_file, window
+
+from servotwin import __version__
+from servotwin.link.claim import Held
+from servotwin.messages import PROTOCOL, EdgeClaim, Standing, decode, encode
+
+PATH = "/v1/servos/ax-1/claim"
+
+
+async def ask(client: httpx.AsyncClient, claim: EdgeClaim) -> Standing:
+    response = await client.post(PATH, content=encode(claim), headers={**bearer(), **MSGPACK})
+    assert response.status_code == 200, response.text
+    standing = decode(response.content)
+    assert isinstance(standing, Standing)
+    return standing
+
+
+async def put(client: httpx.AsyncClient, sequence: int, boot: str, number: int, run: str | None = None) -> int:
+    headers = {**bearer(), **MSGPACK}
+    if number:
+        headers["servotwin-claim"] = Held(run or boot, number).text
+    message = window(sequence, boot=boot, start=0.0)
+    return (await client.put(place(message), content=encode(message), headers=headers)).status_code
+
+
+async def listen(client: httpx.AsyncClient, held: Held, wait: float) -> int:
+    headers = {**bearer(), "servotwin-claim": held.text}
+    return (await client.get(f"/v1/servos/ax-1/outgoing?after=0&wait={wait}", headers=headers)).status_code
+
+
+def test_a_copied_folder_is_refused_and_an_alarm_is_stored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def run() -> None:
+        async with served(twin_file(tmp_path)) as (system, client):
+            assert await ask(client, EdgeClaim("ax-1", "one")) == Standing("ax-1", "", 0, PROTOCOL, __version__)
+            assert (await ask(client, EdgeClaim("ax-1", "one", 0, 1))).run == "one"
+            assert await put(client, 0, "one", 1) == 201
+            poll = asyncio.create_task(listen(client, Held("one", 1), 20.0))
+            while not system.polls.open:
+                await asyncio.sleep(0.01)
+            assert (await ask(client, EdgeClaim("ax-1", "two", 0, 2))).run == "two"
+            assert await asyncio.wait_for(poll, 10.0) == 409, "its poll ends at once, without messages"
+            assert await put(client, 1, "one", 1) == 409
+            assert await put(client, 0, "two", 2) == 201
+            assert system.store.events("ax-1") == [], "a restart is no conflict"
+            for _ in range(2):
+                assert (await ask(client, EdgeClaim("ax-1", "one", 1))).run == "two"
+            [alarm] = system.store.events("ax-1")
+            assert alarm.kind == "alarm"
+            assert alarm.status == "conflict: two edges of this servo run, one and two; the newer one counts"
+            assert system.metrics.rejected.values[("superseded",)] >= 2
+            assert (await client.get("/v1/servos/ax-2", headers=bearer(OTHER))).status_code == 403
+
+    with caplog.at_level(logging.WARNING, "servotwin"):
+        asyncio.run(run())
+    assert [record.message for record in caplog.records].count("conflict") == 2
+
+
+def test_a_claim_outlives_a_restart_of_the_twin_and_an_older_backup_of_its_store(tmp_path: Path) -> None:
+    async def first() -> None:
+        async with served(twin_file(tmp_path)) as (_, client):
+            assert (await ask(client, EdgeClaim("ax-1", "one", 0, 1))).number == 1
+
+    async def second() -> None:
+        async with served(tmp_path / "twin.toml") as (system, client):
+            assert (await ask(client, EdgeClaim("ax-1", "two"))).run == "one"
+            assert await put(client, 0, "two", 3) == 201, "the store is older than the edge's claim"
+            assert tuple(system.store.claim_of("ax-1")) == ("two", 3)
+            assert await put(client, 0, "one", 1) == 409
+
+    asyncio.run(first())
+    asyncio.run(second())
+
+
+def test_of_two_that_claim_at_once_one_wins_and_a_repeated_claim_changes_nothing(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with served(twin_file(tmp_path)) as (_, client):
+            claims = [EdgeClaim("ax-1", name, 0, 1) for name in ("one", "two")]
+            answers = await asyncio.gather(*(ask(client, claim) for claim in claims))
+            assert answers[0] == answers[1]
+            winner = answers[0].run
+            assert (await ask(client, EdgeClaim("ax-1", "three", 0, 2))).run == "three"
+            for claim in claims:
+                assert (await ask(client, claim)).run == "three", winner
+
+    asyncio.run(run())
+
+
+def test_requests_without_a_claim_pass_and_broken_claims_are_refused(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with served(twin_file(tmp_path)) as (_, client):
+            await ask(client, EdgeClaim("ax-1", "one", 0, 1))
+            assert await put(client, 0, "old", 0) == 201
+            headers = {**bearer(), **MSGPACK, "servotwin-claim": "rubbish"}
+            message = window(1, boot="old")
+            assert (await client.put(place(message), content=encode(message), headers=headers)).status_code == 400
+            version = await client.get("/v1/version")
+            assert version.json() == {"protocol": PROTOCOL, "servotwin": __version__}
+            other = await client.post(PATH, content=encode(EdgeClaim("ax-2", "x")), headers={**bearer(), **MSGPACK})
+            assert (other.status_code, other.json()["code"]) == (400, "other_name")
+            wrong = await client.post(PATH, content=encode(message), headers={**bearer(), **MSGPACK})
+            assert (wrong.status_code, wrong.json()["code"]) == (400, "not_understood")
+
+    asyncio.run(run())
