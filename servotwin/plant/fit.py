@@ -26,6 +26,7 @@ PARTS: Mapping[str, tuple[type, ...]] = {
     "sensors": (Sensors,),
 }
 """Classes of each part of an axis."""
+_LIMITS = {"V": "voltage_limit_v", "N m": "torque_limit_n_m"}
 # A cascade may be told a ratio that is off by less.
 _OTHER_RATIO = 0.2
 
@@ -94,8 +95,8 @@ def _check_holding(actuator: Actuator, transmission: Transmission, load: Load) -
     held = most + actuator.coulomb + transmission.p * load.friction
     if transmission.p * abs(load.force) > held:
         raise InvalidInput(
-            f"actuator limit = {actuator.limit!r} {actuator.unit}: gives {most:.6g} N m, and the load's force takes "
-            f"{transmission.p * abs(load.force):.6g} N m of the motor; the drive must be able to hold its load"
+            f"actuator {_LIMITS[actuator.unit]} = {actuator.limit!r} {actuator.unit}: gives {most:.6g} N m, and "
+            f"the load's force takes {transmission.p * abs(load.force):.6g} N m of the motor; the drive must be able to hold its load"
         )
 
 
