@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import servotwin as st
 from servotwin.cosim import Loop
-from servotwin.logs.formats import SignalTable
+from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import check_output, read_log, write_log
 
 

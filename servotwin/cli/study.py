@@ -57,7 +57,16 @@ def convert(
 
 
 def identify(
-    log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
+    logs: Annotated[list[Path], typer.Argument(help="Recordings: .csv, .txt, .npz, .parquet, .mat, .h5 ...")],
+    motor: Annotated[str | None, typer.Option(help="Column of the motor's position.")] = None,
+    load: Annotated[str | None, typer.Option(help="Column of the load's position.")] = None,
+    command: Annotated[
+        str | None, typer.Option(help="Column of the motor's command: shows how far it winds up.")
+    ] = None,
+    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
+    motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as deg.")] = None,
+    load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as mm.")] = None,
     servo: Annotated[
         str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
     ] = None,
@@ -79,11 +88,20 @@ def identify(
     gap_limit_deg: Annotated[float | None, typer.Option(help="Predict when the gap reaches this limit, deg.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
-    """Estimate the gap and its trend from a recorded log."""
+    """Estimate the gap from recordings of two encoders, or with a model of the machine (--servo, or the log's own)."""
     from servotwin.cli.identify import IdentifyOptions, show
+    from servotwin.cli.lost_motion import describes_its_machine
+    from servotwin.cli.lost_motion import show as show_lost_motion
+    from servotwin.logs.recordings import RecordingColumns
 
+    columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
+    if columns != RecordingColumns() or (servo is None and not describes_its_machine(logs[0])):
+        show_lost_motion(logs, columns, json)
+        return
+    if len(logs) > 1:
+        raise InvalidInput("servotwin identify: one log at a time with --servo or a log that describes its servo")
     options = IdentifyOptions(
-        log=log,
+        log=logs[0],
         servo=servo,
         start=start,
         duration=duration,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,8 @@ from servotwin.config.table import did_you_mean
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
-from servotwin.logs.formats import FORMATS, LogColumns, SignalTable
+from servotwin.logs.columns import LogColumns, SignalTable
+from servotwin.logs.formats import FORMATS, WRITTEN
 from servotwin.plant.signals import Array
 from servotwin.runtime import files
 
@@ -64,19 +65,31 @@ def read_log(path: Path) -> Log:
         The file is missing, of no known format or damaged; a column is missing, not numeric or not finite somewhere;
         the times are not uniform.
     """
-    if path.suffix not in FORMATS:
-        raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
-    if not path.is_file():
-        raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
-    FORMATS[path.suffix].check_installed(f"log {path}")
-    try:
-        columns = FORMATS[path.suffix].read(path, _COLUMN_NAMES)
-    except OSError as error:
-        raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
+    columns = read_columns(path, _COLUMN_NAMES)
     names = _chosen(path, columns)
     channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in names.items()}
     whole = Window(**channels, time=_numbers(path, TIME, columns), source=f"log {path}")
     return Log(whole, columns.metadata, names)
+
+
+def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read columns by name from a log of any known format.
+
+    Raises
+    ------
+    InvalidInput
+        The file is missing, of no known format or damaged.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
+    if not path.is_file():
+        raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
+    FORMATS[suffix].check_installed(f"log {path}")
+    try:
+        return FORMATS[suffix].read(path, requested)
+    except OSError as error:
+        raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
 
 
 def check_output(path: Path) -> None:
@@ -87,7 +100,7 @@ def check_output(path: Path) -> None:
     InvalidInput
         Unknown suffix, missing directory, or a format whose library is not installed.
     """
-    files.check_file(path, tuple(FORMATS))
+    files.check_file(path, WRITTEN)
     FORMATS[path.suffix].check_installed(f"output {path}")
 
 
@@ -100,8 +113,10 @@ def write_log(table: SignalTable, path: Path) -> None:
         As `check_output`.
     """
     check_output(path)
+    write = FORMATS[path.suffix].write
+    assert write is not None  # checked above
     with files.atomic_output(path) as temporary:
-        FORMATS[path.suffix].write(table, temporary)
+        write(table, temporary)
 
 
 def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
@@ -121,6 +136,8 @@ def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
 
 
 def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
+    if name in columns.damaged:
+        raise InvalidInput(f"log {path}: is no table of numbers (column {name!r}, {columns.damaged[name]})")
     try:
         if np.iscomplexobj(columns.values[name]):
             raise TypeError

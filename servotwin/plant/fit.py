@@ -96,7 +96,8 @@ def _check_holding(actuator: Actuator, transmission: Transmission, load: Load) -
     if transmission.p * abs(load.force) > held:
         raise InvalidInput(
             f"actuator {_LIMITS[actuator.unit]} = {actuator.limit!r} {actuator.unit}: gives {most:.6g} N m, and "
-            f"the load's force takes {transmission.p * abs(load.force):.6g} N m of the motor; the drive must be able to hold its load"
+            f"the load's force takes {transmission.p * abs(load.force):.6g} N m of the motor; "
+            "the drive must be able to hold its load"
         )
 
 

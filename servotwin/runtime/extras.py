@@ -13,6 +13,7 @@ EXTRAS = {
     "asyncua": ("asyncua", "opcua"),
     "control": ("control", "interop"),
     "distributed": ("dask[distributed]", "dask"),
+    "h5py": ("h5py", "hdf5"),
     "httptools": ("httptools", "twin"),
     "joblib": ("joblib", "maps"),
     "matplotlib": ("matplotlib", "plot"),

@@ -9,7 +9,7 @@ import pytest
 import servotwin as st
 from servotwin.cli.identify import IdentifyOptions, identify
 from servotwin.errors import InvalidInput
-from servotwin.logs.formats import SignalTable
+from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import read_log, write_log
 
 DRIVE, GAP = st.Axis.preset("two-mass-drive"), math.radians(1.0)

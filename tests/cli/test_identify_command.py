@@ -175,7 +175,7 @@ BAD = {
     "no header": (lambda lines: lines[1:], "line 1 must name the columns"),
     "no rows": (lambda lines: lines[:1], "n >= 16 samples"),
     "blank rows": (lambda lines: [lines[0], "", ""], "n >= 16 samples"),
-    "zeros": (lambda _lines: ["\0" * 100], "it is: not text"),
+    "zeros": (lambda _lines: ["\0" * 100], "is not a text file"),
     "other names": (lambda lines: [lines[0].replace("theta_m_rad", "theta_m_deg"), *lines[1:]], "no theta_m"),
     "no position": (lambda lines: [lines[0].replace("position_m", "position_mm"), *lines[1:]], "mean 'position_mm'"),
     "no time": (lambda lines: [lines[0].replace("time_s", "t"), *lines[1:]], "column 'time_s' is missing"),

@@ -19,7 +19,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.logs.formats import SignalTable
+from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import write_log
 from servotwin.messages import Setting, WindowMessage, unpack_channel
 

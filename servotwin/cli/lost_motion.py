@@ -1,0 +1,174 @@
+"""`servotwin identify` without a model: the gap between the two encoders of a recording."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
+from servotwin.logs.log import read_columns
+from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
+
+_PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
+
+
+def describes_its_machine(path: Path) -> bool:
+    """True for a log that holds its servo, as `servotwin simulate` writes it."""
+    return isinstance(read_columns(path, ()).metadata.get("servo"), str)
+
+
+def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool) -> None:
+    """Estimate each log's gap and print it; with several, their differences too.
+
+    Raises
+    ------
+    InvalidInput
+        As `read_recording` and `estimate_lost_motion`.
+    """
+    console = Console(stderr=as_json)
+    answers = []
+    for path in logs:
+        with console.status(f"{path.name}"):
+            log = read_recording(path, columns)
+            answers.append((log, estimate_lost_motion(log.recording)))
+    if as_json:
+        rows = [as_dict(log, found) for log, found in answers]
+        print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))
+        return
+    for log, found in answers:
+        _print(console, log, found)
+    for before, after in pairwise(answers):
+        console.print(_change(before, after), highlight=False)
+
+
+def as_dict(log: RecordedLog, found: LostMotion) -> dict[str, Any]:
+    """Make the JSON object: gaps in the units of the recording, null where there is no number."""
+    recording = log.recording
+    return {
+        "log": recording.source.removeprefix("log "),
+        "status": found.status.value,
+        "reasons": list(found.reasons),
+        "model_kind": found.model,
+        "gap_load": _number(found.gap_load),
+        "std_load": _number(found.std_load),
+        "interval_load": [_number(end) for end in found.interval_load],
+        "unit_load": recording.load_unit,
+        "gap_motor": _number(found.gap_motor),
+        "std_motor": _number(found.std_motor),
+        "interval_motor": [_number(end) for end in found.interval_motor],
+        "unit_motor": recording.motor_unit,
+        "ratio": _number(found.ratio),
+        "lag_s": _number(found.lag),
+        "cyclic_periods_motor": list(found.cycles),
+        "rms_load": _number(found.rms),
+        "models": [
+            {"model_kind": each.model.name, "gap_motor": _number(each.gap), "rms_out_of_sample_load": _number(each.rms)}
+            for each in found.comparisons
+        ],
+        "segments": [
+            {"time_s": each.time, "position_load": each.position, "gap_motor": each.gap} for each in found.local
+        ],
+        "samples": log.samples,
+        "defects": dict(log.found),
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _print(console: Console, log: RecordedLog, found: LostMotion) -> None:
+    recording, unit = log.recording, log.recording.load_unit
+    span = float(recording.time[-1] - recording.time[0])
+    parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
+    name = recording.source.removeprefix("log ")
+    console.print(f"{name}: {recording.time.size} samples in {span:.4g} s ({parts})", markup=False)
+    for defect, count in log.found.items():
+        console.print(f"  {count} {defect}", style="dim", highlight=False)
+    console.print(_headline(found, unit, recording.motor_unit), highlight=False)
+    for reason in found.reasons:
+        console.print(f"  {reason}", style="yellow", highlight=False)
+    if not found.comparisons:
+        return
+    cyclic = "".join(f", cyclic error every {period:.4g} {recording.motor_unit}" for period in found.cycles)
+    shown = cyclic if "cyclic" in found.model else ""
+    console.print(
+        f"model: {found.model}; {abs(found.ratio):.6g} {unit} per {recording.motor_unit}, "
+        f"lag {1e3 * found.lag:.3g} ms{shown}, rms left {found.rms:.3g} {unit}",
+        highlight=False,
+    )
+    console.print(_models(found, unit), highlight=False)
+    if len(found.local) > 1:
+        console.print(_local(found, unit), highlight=False)
+
+
+def _headline(found: LostMotion, unit: str, motor_unit: str) -> str:
+    low, high = found.interval_load
+    color = "green" if found.ok else "yellow"
+    if math.isinf(found.interval_motor[1]):
+        return f"gap > {found.gap_motor:.4g} {motor_unit} at the motor: [{color}]{found.status.value}[/]"
+    return (
+        f"gap {found.gap_load:.4g} {unit} at the load, {found.gap_motor:.4g} {motor_unit} at the motor "
+        f"(95 %: {low:.4g} .. {high:.4g} {unit}): [{color}]{found.status.value}[/]"
+    )
+
+
+def _models(found: LostMotion, unit: str) -> Table:
+    table = Table("model", f"gap, {unit}", f"error on unseen strokes, {unit}", box=None, pad_edge=False)
+    for each in found.comparisons:
+        name = f"[bold]{each.model.name}[/]" if each.model.name == found.model else each.model.name
+        table.add_row(name, f"{each.gap * abs(found.ratio):.4g}", f"{each.rms:.4g}")
+    return table
+
+
+def _local(found: LostMotion, unit: str) -> Table:
+    """Median gap of parts of the travel and of the time."""
+    gaps = np.array([each.gap for each in found.local]) * abs(found.ratio)
+    table = Table(f"position, {unit}", f"gap, {unit}", "reversals", "time, s", f"gap, {unit}", "reversals", box=None)
+    places, times = (
+        _binned(np.array([getattr(each, key) for each in found.local]), gaps) for key in ("position", "time")
+    )
+    for place, time in zip(places, times, strict=True):
+        table.add_row(*place, *time)
+    return table
+
+
+def _binned(keys: Any, gaps: Any) -> list[tuple[str, str, str]]:
+    edges = np.linspace(keys.min(), keys.max(), _PLACES + 1)
+    place = np.clip(np.searchsorted(edges, keys, side="right") - 1, 0, _PLACES - 1)
+    rows = []
+    for i in range(_PLACES):
+        here = gaps[place == i]
+        middle = f"{np.median(here):.4g}" if here.size else "-"
+        rows.append((f"{edges[i]:.4g} .. {edges[i + 1]:.4g}", middle, str(here.size)))
+    return rows
+
+
+def _change(before: tuple[RecordedLog, LostMotion], after: tuple[RecordedLog, LostMotion]) -> str:
+    """The difference of two logs' gaps, and if it is more than their uncertainty."""
+    (first, old), (second, new) = before, after
+    if not (math.isfinite(old.std_load) and math.isfinite(new.std_load)):
+        return "no change can be told: a gap of the two logs is only bounded"
+    if first.recording.load_unit != second.recording.load_unit:
+        raise InvalidInput(
+            f"{second.recording.source}: its load is in {second.recording.load_unit}, that of {first.recording.source} "
+            f"in {first.recording.load_unit}: give --load-unit"
+        )
+    change, std = new.gap_load - old.gap_load, math.hypot(_half(old), _half(new)) / 1.96
+    times = abs(change) / std if std else math.inf
+    said = "more than chance explains" if times > 1.96 else "no more than chance explains"
+    return f"change: {change:+.4g} {second.recording.load_unit} ({times:.1f} standard deviations: {said})"
+
+
+def _half(found: LostMotion) -> float:
+    low, high = found.interval_load
+    return 0.5 * (high - low)

@@ -1,0 +1,270 @@
+"""Gap between two encoders without a model of the dynamics: `estimate_lost_motion`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
+from servotwin.estimation.kinematic import bootstrap as draws
+from servotwin.estimation.kinematic.cyclic import periods
+from servotwin.estimation.kinematic.local import LocalGap, local_gaps
+from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
+from servotwin.estimation.kinematic.profile import least_gap
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.regression import LAG, RATIO, Regression, columns, products, regression, solved
+from servotwin.estimation.kinematic.strokes import play_and_side, resolution, strokes_of
+from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
+from servotwin.plant.signals import Array
+
+_GAPS = 32  # of the coarse search, geometric from a count to the whole travel
+_FINE = 17  # of each finer one
+_ROUNDS = 4
+_COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
+_LEAST_REVERSALS = 2
+_CHANCE = 0.025  # on either side of a 95 % interval
+
+
+@dataclass(frozen=True)
+class LostMotion:
+    """What a recording says of the gap; angles and lengths in the units of the recording.
+
+    Attributes
+    ----------
+    gap_motor, std_motor : float
+        Total gap on the motor's side and its standard deviation, the motor's unit; a lower bound where the status says
+        so; NaN where nothing is known.
+    interval_motor : (float, float)
+        95 %.
+    ratio : float
+        Load per motor; NaN where unknown.
+    lag : float
+        s, by which the load follows.
+    status : GapStatus
+    reasons : tuple of str
+    model : str
+        The model that the evidence chose.
+    comparisons : tuple of ModelScore
+        All models out of sample, from simple to rich.
+    cycles : tuple of float
+        Periods of cyclic errors, the motor's unit.
+    rms : float
+        What the model leaves, the load's unit.
+    local : tuple of LocalGap
+        One for each reversal.
+    """
+
+    gap_motor: float
+    std_motor: float
+    interval_motor: Interval
+    ratio: float
+    lag: float
+    status: GapStatus
+    reasons: tuple[str, ...] = ()
+    model: str = ""
+    comparisons: tuple[ModelScore, ...] = ()
+    cycles: tuple[float, ...] = ()
+    rms: float = np.nan
+    local: tuple[LocalGap, ...] = ()
+
+    @property
+    def gap_load(self) -> float:
+        return self.gap_motor * abs(self.ratio)
+
+    @property
+    def std_load(self) -> float:
+        return self.std_motor * abs(self.ratio)
+
+    @property
+    def interval_load(self) -> Interval:
+        low, high = self.interval_motor
+        return (low * abs(self.ratio), high * abs(self.ratio))
+
+    @property
+    def ok(self) -> bool:
+        return self.status is GapStatus.OK
+
+
+def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
+    """Fit load = ratio x play(motor) + offset, with lag, wind-up and cyclic errors where the log shows them.
+
+    The model is chosen by its errors on strokes that it was not fitted to; the interval is a block bootstrap over
+    cycles of motion. Two weightings of the samples, by time and by travel, have one answer where the model is right:
+    where they differ, or models that the log cannot tell apart, the interval covers all of them and the status is not
+    OK.
+
+    Raises
+    ------
+    InvalidInput
+        The motor or the load does not move, or the motor never reverses.
+    """
+    least = _least_motion(recording)
+    strokes = strokes_of(recording, least)
+    _check(recording, least, strokes.reversals)
+    prepared = regression(recording, strokes, 0)
+    coarse = _coarse(prepared, least)
+    # Until the gap has been taken up once nobody knows where the load is within it.
+    first = _settled(recording, 1.1 * coarse)
+    if first is None:
+        return _bound(recording)
+    prepared = regression(recording, strokes, first)
+    prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
+    grid, tensor = _tensor(prepared, coarse, least)
+    counts = np.diff(prepared.bounds, append=prepared.rows.size)
+    comparisons = compared(prepared, grid, tensor, counts)
+    best = chosen(comparisons[:-1])
+    return _answer(recording, prepared, best, comparisons, least)
+
+
+def _least_motion(recording: EncoderRecording) -> float:
+    """Motion of the motor that is more than its encoder's counts and noise."""
+    motor = recording.motor
+    second = np.diff(motor, 2)
+    noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6.0)
+    return max(_COUNTS * resolution(motor), 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(motor)))
+
+
+def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
+    unit, source = recording.motor_unit, recording.source
+    reach = float(np.ptp(recording.motor))
+    if not reach > 2.0 * least:
+        raise InvalidInput(
+            f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and noise explain: record a "
+            "motion to and fro that takes up the gap on both sides"
+        )
+    if reversals < _LEAST_REVERSALS:
+        raise InvalidInput(
+            f"{source}: the motor reverses {max(reversals, 0)} times in {np.ptp(recording.time):.4g} s: the gap shows "
+            f"at reversals only; record at least {_LEAST_REVERSALS}, better ten"
+        )
+
+
+def _settled(recording: EncoderRecording, gap: float) -> int | None:
+    """First sample by which the motor has moved by `gap`."""
+    motor = recording.motor
+    reach = np.maximum.accumulate(motor) - np.minimum.accumulate(motor)
+    place = int(np.searchsorted(reach, gap))
+    return None if place > motor.size // 2 else place
+
+
+def _coarse(prepared: Regression, least: float) -> float:
+    """Gap of the least mean square on a geometric grid, everything else free but the lag."""
+    reach = float(np.ptp(prepared.recording.motor))
+    grid = np.concatenate([[0.0], np.geomspace(0.1 * least, 0.95 * reach, _GAPS)])
+    used = Model("", (RATIO, "offset")).places(prepared)
+    squares = []
+    for gap in grid:
+        values, side = columns(prepared, gap)
+        known = values[:, side != 0]
+        squares.append(float(solved(known @ known.T, used).squares) / max(known.shape[1], 1))
+    return float(grid[int(np.argmin(squares))])
+
+
+def _cycles(prepared: Regression, gap: float) -> tuple[float, ...]:
+    values, _ = columns(prepared, gap)
+    used = Model("", (RATIO, "offset", LAG)).places(prepared)
+    fit = solved(values @ values.T, used)
+    return periods(values[1], values[0] - fit.coefficients @ values[used])
+
+
+def _tensor(prepared: Regression, coarse: float, least: float) -> tuple[Array, Array]:
+    """Sums of products on a grid from 0 to twice the coarse gap."""
+    grid = np.linspace(0.0, 2.0 * max(coarse, least), 2 * _FINE + 1)
+    return grid, np.array([products(prepared, gap) for gap in grid])
+
+
+def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
+    """Gap by time and by travel, and their bootstrap, on grids that are narrowed to the spread."""
+    places = model.places(prepared)
+    travel = _travel(prepared)
+    for _ in range(_ROUNDS):
+        grid = np.linspace(max(gap - width, 0.0), gap + width, _FINE)
+        by_time = np.array([products(prepared, each) for each in grid])
+        by_travel = np.array([products(prepared, each, travel) for each in grid])
+        spread = draws.bootstrap(grid, by_time, by_travel, places)
+        gap, other = (float(least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel))
+        wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), 1e-3 * gap)
+        if 0.4 * width <= wanted <= 1.5 * width:
+            break
+        width = wanted
+    return gap, other, spread
+
+
+def _travel(prepared: Regression) -> Array:
+    """Way of the motor from one row to the next, its counts and noise left out, relative to the mean."""
+    motor = prepared.recording.motor
+    side = np.zeros(motor.size, dtype=np.int8)
+    smooth = play_and_side(motor, 2.0 * resolution(motor), side)[prepared.rows]
+    way = np.abs(np.diff(smooth, prepend=smooth[0]))
+    return way / max(float(way.mean()), np.finfo(float).tiny)
+
+
+def _answer(
+    recording: EncoderRecording,
+    prepared: Regression,
+    best: ModelScore,
+    comparisons: tuple[ModelScore, ...],
+    least: float,
+) -> LostMotion:
+    """Fit the chosen model closely and judge it."""
+    if LAG in best.model.used:
+        prepared = _with_lag(prepared, best)
+    gap, by_travel, spread = _fitted(prepared, best.model, best.gap, max(0.5 * best.gap, least))
+    values, side = columns(prepared, gap)
+    places = best.model.places(prepared)
+    fit = solved(values @ values.T, places)
+    residual, ratio = values[0] - fit.coefficients @ values[places], float(fit.coefficients[0])
+    quantisation = float(np.hypot(resolution(recording.motor), resolution(recording.load) / abs(ratio))) / math.sqrt(
+        12.0
+    )
+    quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
+    half = quantile * math.hypot(spread.std, 0.25 * quantisation)
+    judged = verdict(
+        KinematicFit(
+            gap=gap,
+            by_travel=by_travel,
+            simpler=simpler(best, comparisons),
+            spread=spread,
+            half=half,
+            quantisation=quantisation,
+            left=structured(prepared, residual) / abs(ratio),
+            better_than_none=best.rms < comparisons[-1].rms,
+        ),
+        recording.motor_unit,
+    )
+    rows, known = prepared.rows, judged.interval != NOTHING_KNOWN
+    return LostMotion(
+        gap_motor=gap if known else math.nan,
+        std_motor=half / quantile if known else math.inf,
+        interval_motor=judged.interval,
+        ratio=ratio,
+        lag=prepared.lag,
+        status=judged.status,
+        reasons=judged.reasons,
+        model=best.model.name,
+        comparisons=comparisons,
+        cycles=tuple(map(float, prepared.cycles)),
+        rms=float(np.sqrt(np.mean(residual**2))),
+        local=local_gaps(recording.time[rows], recording.load[rows], side, residual, gap, ratio) if known else (),
+    )
+
+
+def _with_lag(prepared: Regression, best: ModelScore) -> Regression:
+    """The design with the lag moved from its column, which is right to first order, into the time."""
+    places = best.model.places(prepared)
+    lag = places.index(prepared.names.index(LAG))
+    for _ in range(3):
+        values, _ = columns(prepared, best.gap)
+        fit = solved(values @ values.T, places)
+        prepared = prepared._replace(lag=prepared.lag + float(fit.coefficients[lag] / fit.coefficients[0]))
+    return prepared
+
+
+def _bound(recording: EncoderRecording) -> LostMotion:
+    reach = float(np.ptp(recording.motor))
+    reason = f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the gap is larger"
+    return LostMotion(reach, np.inf, (reach, np.inf), np.nan, 0.0, GapStatus.LOWER_BOUND, (reason,))

@@ -1,0 +1,33 @@
+"""A recording of two encoders: the input of the kinematic estimate, in whatever units its log has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from servotwin.plant.signals import Array
+
+
+@dataclass(frozen=True, eq=False)
+class EncoderRecording:
+    """Samples of one machine, in increasing time, not necessarily uniform.
+
+    Attributes
+    ----------
+    time : (n,) array
+        s.
+    motor, load : (n,) array
+        Positions before and behind the gap, each in its own unit.
+    command : (n,) array or None
+        What drives the motor, in its own unit: shows how far the transmission winds up.
+    motor_unit, load_unit : str
+    source : str
+        Where it is from, for messages.
+    """
+
+    time: Array
+    motor: Array
+    load: Array
+    command: Array | None = None
+    motor_unit: str = "rad"
+    load_unit: str = "rad"
+    source: str = "recording"

@@ -1,0 +1,130 @@
+"""What a fit is worth: status, interval and reasons."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
+from servotwin.estimation.kinematic.bootstrap import Spread
+from servotwin.estimation.kinematic.models import ModelScore
+from servotwin.estimation.kinematic.regression import INERTIA, LAG, WIND_UP, Regression
+from servotwin.plant.signals import Array
+
+_DISAGREE = 2.0  # standard deviations between two weightings of the samples that a right model does not show
+# Share of the gap that a model may leave of the load's motion, noise aside: beyond the first the interval covers other
+# models, beyond the second nothing is said of the gap.
+_LEFT, _LEFT_AT_MOST = 0.1, 0.3
+_PIECES = 10  # of a stroke, in each of which white noise averages out
+_COUNTS = 4.0
+_SAID = {LAG: "a lag of the load", WIND_UP: "wind-up by the command", INERTIA: "wind-up by acceleration"}
+
+
+class KinematicFit(NamedTuple):
+    """A fitted model; gaps and counts in the motor's unit.
+
+    Attributes
+    ----------
+    gap, by_travel : float
+        With every moment, and with every bit of the motor's way, counting alike.
+    simpler : mapping
+        Gaps of the simpler models that the chosen one contains, by what they leave out.
+    spread : Spread
+    half : float
+        Half width of the 95 % interval of `gap`.
+    quantisation : float
+        Standard deviation of the encoders' quantisation.
+    left : float
+        What the model leaves of the load's motion, noise aside.
+    better_than_none : bool
+        Unseen strokes are predicted better with a gap than without.
+    """
+
+    gap: float
+    by_travel: float
+    simpler: Mapping[str, float]
+    spread: Spread
+    half: float
+    quantisation: float
+    left: float
+    better_than_none: bool
+
+
+class KinematicVerdict(NamedTuple):
+    """Status, 95 % interval and reasons."""
+
+    status: GapStatus
+    interval: Interval
+    reasons: tuple[str, ...] = ()
+
+
+def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
+    """Judge a fit; `unit` is the motor's."""
+    low, high = fit.gap - fit.half, fit.gap + fit.half
+    none = low <= 0.0 or not fit.better_than_none
+    if fit.left > max(_LEFT_AT_MOST * fit.gap, _COUNTS * fit.quantisation):
+        reason = (
+            f"the load deviates by {fit.left:.3g} {unit} (rms, at the motor) from following the motor through a gap of "
+            f"{fit.gap:.3g} {unit}: it swings or winds up; record a slow motion, or give the machine (--servo)"
+        )
+        return KinematicVerdict(GapStatus.MODEL_MISMATCH, NOTHING_KNOWN, (reason,))
+    if none:
+        high = max(high, 3.0 * fit.left, *(gap + fit.half for gap in fit.simpler.values()))
+        return KinematicVerdict(
+            GapStatus.UNIDENTIFIABLE, (0.0, high), (f"no gap can be told from none: at most {high:.3g} {unit}",)
+        )
+    reasons = _doubts(fit, unit)
+    if not reasons:
+        return KinematicVerdict(GapStatus.OK, (max(low, 0.0), high))
+    ends = (low, high, fit.by_travel - fit.half, fit.by_travel + fit.half, *fit.simpler.values())
+    return KinematicVerdict(GapStatus.MODEL_MISMATCH, (max(min(ends), 0.0), max(ends)), reasons)
+
+
+def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
+    """Reasons not to believe the interval."""
+    reasons = []
+    if abs(fit.by_travel - fit.gap) > _DISAGREE * math.hypot(fit.spread.std_of_difference, fit.quantisation):
+        reasons.append(
+            f"the gap is {fit.gap:.4g} {unit} if every moment counts alike and {fit.by_travel:.4g} {unit} if the "
+            "motor's way does: the model leaves out something that is not noise"
+        )
+    if fit.left > max(_LEFT * fit.gap, _COUNTS * fit.quantisation, fit.half):
+        reasons.append(f"the load deviates from the model by {fit.left:.3g} {unit} (rms, at the motor), noise aside")
+    for name, gap in fit.simpler.items():
+        # What a swinging load does at a reversal is no proof of a gap, nor against one; a lag shows at other speeds.
+        if (reasons or name != LAG) and abs(gap - fit.gap) > fit.half + 2.0 * fit.quantisation:
+            reasons.append(
+                f"gap and {_SAID[name]} look alike here: {fit.gap:.4g} {unit} with it, {gap:.4g} {unit} without; "
+                "record the same motion at half and at a tenth of the speed"
+            )
+    return tuple(reasons)
+
+
+def simpler(best: ModelScore, comparisons: tuple[ModelScore, ...]) -> Mapping[str, float]:
+    """Gaps of the models that leave out the chosen one's lag, or its wind-up."""
+    result = {}
+    for name in (LAG, WIND_UP, INERTIA):
+        used = tuple(each for each in best.model.used if each != name and (name, each) != (LAG, INERTIA))
+        found = next((each.gap for each in comparisons[:-1] if each.model.used == used), None)
+        if name in best.model.used and found is not None:
+            result[name] = found
+    return result
+
+
+def structured(design: Regression, residual: Array) -> float:
+    """Root mean square of the residual's means over pieces of the strokes, white noise taken off."""
+    edges = np.unique(
+        np.concatenate([np.linspace(a, b, _PIECES + 1).astype(int) for a, b in _pairs(design.bounds, residual.size)])
+    )
+    sizes = np.diff(edges)
+    means = np.add.reduceat(residual, edges[:-1]) / sizes
+    white = 0.5 * float(np.mean(np.diff(residual) ** 2)) if residual.size > 1 else 0.0
+    squares = float(np.average(means**2, weights=sizes)) - white * len(sizes) / residual.size
+    return math.sqrt(max(squares, 0.0))
+
+
+def _pairs(bounds: Array, size: int) -> list[tuple[int, int]]:
+    return list(zip(bounds, [*bounds[1:], size], strict=True))

@@ -1,0 +1,62 @@
+"""NumPy and Parquet files."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.logs.columns import LogColumns, SignalTable, parsed
+
+
+def read_npz(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read arrays by name."""
+    try:
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
+            metadata = parsed(str(file["metadata"])) if "metadata" in file.files else {}
+            return LogColumns({name: file[name] for name in file.files if name in requested}, file.files, metadata)
+    except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, KeyError) as error:
+        raise InvalidInput(f"log {path}: is not an .npz file of numbers ({str(error).splitlines()[0]})") from None
+
+
+def write_npz(table: SignalTable, path: Path) -> None:
+    """Write arrays by name, and the metadata as JSON."""
+    arrays: dict[str, Any] = {"metadata": np.array(json.dumps(table.metadata)), **table.columns}
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+
+
+def read_parquet(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read columns by name."""
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        schema = parquet.read_schema(path)
+        table = parquet.read_table(path, columns=[name for name in requested if name in schema.names])
+        columns = {name: table[name].to_numpy() for name in table.column_names}
+    except pyarrow.ArrowException as error:
+        raise InvalidInput(f"log {path}: is not a parquet file of numbers ({str(error).splitlines()[0]})") from None
+    noted = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items() if key != b"ARROW:schema"}
+    return LogColumns(columns, schema.names, {key: _number(value) for key, value in noted.items()})
+
+
+def write_parquet(table: SignalTable, path: Path) -> None:
+    """Write columns by name."""
+    import pyarrow
+    from pyarrow import parquet
+
+    described = {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.metadata.items()}
+    parquet.write_table(pyarrow.table(dict(table.columns)).replace_schema_metadata(described), path)
+
+
+def _number(text: str) -> Any:
+    try:
+        return float(text)
+    except ValueError:
+        return text

@@ -1,0 +1,109 @@
+"""Cleaning of recorded samples: what is wrong is mended or left out, and counted; nothing is refused for one sample."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from servotwin.plant.signals import Array
+
+_Mask = np.ndarray[Any, np.dtype[np.bool_]]
+
+_STALE = 50.0  # times the usual interval: a first sample so far before the others is an old one
+_DROPOUT = 5.0  # times the usual interval
+_SPIKE = 20.0  # times the usual step between samples, there and back
+_WRAPS = 3  # jumps of about one turn that make an angle a wrapped one
+
+
+class Cleaned(NamedTuple):
+    """Samples in increasing time, all finite, and what was done to them.
+
+    Attributes
+    ----------
+    time : (n,) array
+        s.
+    channels : mapping
+        (n,) arrays by name.
+    found : mapping
+        Number of samples by defect, in words; only defects that occur.
+    """
+
+    time: Array
+    channels: Mapping[str, Array]
+    found: Mapping[str, int]
+
+
+def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float]) -> Cleaned:
+    """Leave out samples that are damaged, repeated, stale or out of order; unwrap angles; count all of it.
+
+    Parameters
+    ----------
+    time : (n,) array
+        s; NaN where the log has none.
+    channels : mapping
+        (n,) arrays by name.
+    turns : mapping
+        Full turn of the channels that are angles, in their units.
+    """
+    found: dict[str, int] = {}
+    names = list(channels)
+    table = np.column_stack([time, *channels.values()])
+
+    def keep(kept: _Mask, defect: str) -> None:
+        nonlocal table
+        if not kept.all():
+            found[defect] = int(np.sum(~kept))
+            table = table[kept]
+
+    keep(np.isfinite(table.sum(axis=1)), "without a number in some column")
+    if len(table) > 2:
+        intervals = np.diff(table[:, 0])
+        usual = float(np.median(np.abs(intervals)))
+        stale = int(intervals[0] > _STALE * usual) if usual > 0.0 else 0
+        kept = np.ones(len(table), dtype=np.bool_)
+        kept[:stale] = False
+        keep(kept, "stale, long before all others")
+    latest = np.maximum.accumulate(table[:, 0]) if len(table) else table[:, 0]
+    repeated = np.concatenate([[False], np.diff(latest) == 0.0])
+    back = table[:, 0] < latest
+    keep(~back, "earlier than the sample before")
+    keep(~repeated[~back], "at the time of the sample before")
+    for place, name in enumerate(names, 1):
+        if name in turns:
+            table[:, place], count = _unwrapped(table[:, place], turns[name])
+            if count:
+                found[f"turns of {name} that were unwrapped"] = count
+    for place, name in enumerate(names, 1):
+        keep(~_spikes(table[:, place]), f"spikes of {name}")
+    gaps = _dropouts(table[:, 0])
+    if gaps:
+        found["pauses longer than five intervals"] = gaps
+    return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found)
+
+
+def _unwrapped(angle: Array, turn: float) -> tuple[Array, int]:
+    """The angle without its jumps by a turn, and their number; unchanged where it does not wrap."""
+    steps = np.diff(angle)
+    jumps = np.abs(np.abs(steps) - turn) < 0.2 * turn
+    within = angle.size > 0 and float(np.ptp(angle)) <= 1.01 * turn
+    if not within or np.sum(jumps) < 1 or (np.sum(jumps) < _WRAPS and float(np.ptp(angle)) < 0.95 * turn):
+        return angle, 0
+    return np.unwrap(angle, period=turn), int(np.sum(jumps))
+
+
+def _spikes(values: Array) -> _Mask:
+    """Single samples that jump away and back by far more than the samples around them move."""
+    if values.size < 5:
+        return np.zeros(values.size, dtype=bool)
+    steps = np.diff(values)
+    usual = float(np.quantile(np.abs(steps), 0.99))
+    there, back = steps[:-1], steps[1:]
+    lonely = (np.minimum(np.abs(there), np.abs(back)) > _SPIKE * usual) & (np.abs(there + back) < 0.2 * np.abs(there))
+    return np.concatenate([[False], lonely & (usual > 0.0), [False]])
+
+
+def _dropouts(time: Array) -> int:
+    intervals = np.diff(time)
+    return int(np.sum(intervals > _DROPOUT * np.median(intervals))) if intervals.size else 0

@@ -1,0 +1,206 @@
+"""Text tables: any separator, decimal comma, comment lines, units in the header; cells without a number are told."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from itertools import islice
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.logs.columns import LogColumns, SignalTable, parsed
+from servotwin.plant.signals import Array
+
+_ROWS = 50_000  # read or written at a time
+_LOOKED_AT = 40  # lines from which the layout is guessed
+_METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
+_COMMENTS = ("#", "%", "//")
+_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
+
+
+class _Layout(NamedTuple):
+    """How a text table is laid out.
+
+    Attributes
+    ----------
+    encoding : str
+    separator : str or None
+        None: any white space.
+    decimal_comma : bool
+    names : tuple of str
+    named : bool
+        False: the table has no line of names, and they are made up.
+    first : int
+        Lines before the first row of numbers.
+    metadata : mapping
+    """
+
+    encoding: str
+    separator: str | None
+    decimal_comma: bool
+    names: tuple[str, ...]
+    named: bool
+    first: int
+    metadata: Mapping[str, Any]
+
+
+def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read the requested columns; a cell that is no number becomes NaN, and the first of each column is described.
+
+    The metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is.
+    In files of earlier versions they are a first line that begins with #.
+    """
+    layout = _layout(path)
+    wanted = [name for name in layout.names if name in requested]
+    metadata = layout.metadata
+    with path.open(encoding=layout.encoding, newline=None) as file:
+        for _ in islice(file, layout.first):
+            pass
+        if not metadata and layout.names and layout.names[-1] == _METADATA:
+            metadata = _first_metadata(path, layout)
+        if not wanted and requested and not layout.named:
+            raise InvalidInput(
+                f"log {path}: line 1 must name the columns ({next(iter(requested))}, ...); without names they are "
+                f"called {', '.join(layout.names[:8])}"
+            )
+        if not wanted:
+            return LogColumns({}, layout.names, metadata)
+        values, damaged = _values(file, layout, [layout.names.index(name) for name in wanted])
+    found = dict(zip(wanted, values.T, strict=True))
+    return LogColumns(found, layout.names, metadata, {wanted[place]: text for place, text in damaged.items()})
+
+
+def _layout(path: Path) -> _Layout:
+    with path.open("rb") as opened:
+        begin = opened.read(4)
+    encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if begin.startswith(mark)), "utf-8")
+    try:
+        with path.open(encoding=encoding) as file:
+            lines = [line.rstrip("\r\n") for line in islice(file, 4 * _LOOKED_AT)]
+    except UnicodeDecodeError as error:
+        raise InvalidInput(f"log {path}: is not a text file (byte {error.start} is not UTF-8)") from None
+    metadata = parsed(lines[0].removeprefix("#")) if lines and lines[0].startswith("#") else {}
+    kept = [(place, line) for place, line in enumerate(lines) if line.strip() and not line.startswith(_COMMENTS)]
+    if not kept:
+        raise InvalidInput(f"log {path}: line 1 must name the columns; the file holds no row")
+    if any("\0" in line for _, line in kept):
+        raise InvalidInput(f"log {path}: is not a text file (line {kept[0][0] + 1} holds binary data)")
+    separator = _separator([line for _, line in kept[1:_LOOKED_AT]] or [kept[0][1]])
+    comma = separator != "," and any(re.search(r"\d,\d", line) for _, line in kept[1:_LOOKED_AT])
+    first = next((i for i, (_, line) in enumerate(kept) if _numeric(line, separator, comma)), len(kept))
+    names = (
+        _cells(kept[0][1], separator) if first else [f"col{i + 1}" for i in range(len(_cells(kept[0][1], separator)))]
+    )
+    units = _cells(kept[1][1], separator) if first == 2 else []
+    if len(units) == len(names):
+        names = [
+            f"{name} [{unit.strip('[]()')}]" if unit.strip("[]()") else name
+            for name, unit in zip(names, units, strict=True)
+        ]
+    last = kept[first][0] if first < len(kept) else len(lines)
+    return _Layout(encoding, separator, comma, tuple(names), first > 0, last, metadata)
+
+
+def _separator(lines: Sequence[str]) -> str | None:
+    """The separator with which most lines have the same number of cells, more than one."""
+    best: str | None = ","
+    score = 0
+    for separator in ("\t", ";", ",", "|", None):
+        counts = [len(_cells(line, separator)) for line in lines]
+        usual = max(set(counts), key=counts.count)
+        # Among equals the earlier: a comma inside a row with semicolons is a decimal one.
+        if usual > 1 and counts.count(usual) > score:
+            best, score = separator, counts.count(usual)
+    return best
+
+
+def _cells(line: str, separator: str | None) -> list[str]:
+    return [cell.strip().strip('"') for cell in line.split(separator)]
+
+
+def _numeric(line: str, separator: str | None, comma: bool) -> bool:
+    """True for a row of which the first cell is a number or a date, and half of all."""
+    cells = [cell for cell in _cells(line, separator) if cell]
+    good = [_number(cell, comma) is not None for cell in cells]
+    return bool(good) and good[0] and 2 * sum(good) >= len(good)
+
+
+def _number(cell: str, comma: bool) -> float | None:
+    text = cell.replace(",", ".") if comma else cell
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    if _DATE.match(cell):
+        try:
+            return float(np.datetime64(cell.rstrip("Z").replace(" ", "T"), "us").astype(np.int64)) * 1e-6
+        except ValueError:
+            return None
+    return None
+
+
+def _values(file: IO[str], layout: _Layout, places: Sequence[int]) -> tuple[Array, dict[int, str]]:
+    """(n, c) numbers, and in words the first cell of each column that is none."""
+    blocks: list[Array] = []
+    damaged: dict[int, str] = {}
+    for line_number, lines in _blocks(file, layout.first + 1):
+        text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
+        try:
+            block = np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None)
+        except ValueError:
+            block = _patiently(lines, layout, places, line_number, damaged)
+        blocks.append(block)
+    return (np.concatenate(blocks) if blocks else np.empty((0, len(places)))), damaged
+
+
+def _blocks(file: IO[str], line_number: int) -> Iterator[tuple[int, list[str]]]:
+    while lines := list(islice(file, _ROWS)):
+        kept = [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
+        if kept:
+            yield line_number, kept
+        line_number += len(lines)
+
+
+def _patiently(
+    lines: Sequence[str], layout: _Layout, places: Sequence[int], line: int, damaged: dict[int, str]
+) -> Array:
+    result = np.full((len(lines), len(places)), np.nan)
+    for row, text in enumerate(lines):
+        cells = _cells(text, layout.separator)
+        for column, place in enumerate(places):
+            cell = cells[place] if place < len(cells) else ""
+            number = _number(cell, layout.decimal_comma)
+            if number is None:
+                damaged.setdefault(column, f"line {line + row}: {cell[:30]!r}")
+            else:
+                result[row, column] = number
+    return result
+
+
+def _first_metadata(path: Path, layout: _Layout) -> Mapping[str, Any]:
+    with path.open(encoding=layout.encoding) as file:
+        line = next(islice(file, layout.first, None), "")
+    quoted = line.partition(',"')[2].rstrip().removesuffix('"')
+    return parsed(quoted.replace('""', '"'))
+
+
+def write_csv(table: SignalTable, path: Path) -> None:
+    """Write a line of names, then numbers; the metadata are in the first row of a last column."""
+    values = np.column_stack(list(table.columns.values()))
+    names, end = list(table.columns), "\n"
+    if table.metadata:
+        names, end = [*names, _METADATA], ",\n"
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(f"{','.join(names)}\n")
+        if table.metadata and len(values):
+            np.savetxt(file, values[:1], fmt="%.12g", delimiter=",", newline=",")
+            quoted = json.dumps(table.metadata).replace('"', '""')
+            file.write(f'"{quoted}"\n')
+            values = values[1:]
+        for first in range(0, len(values), _ROWS):
+            np.savetxt(file, values[first : first + _ROWS], fmt="%.12g", delimiter=",", newline=end)

@@ -1,0 +1,203 @@
+"""Reading a recording of two encoders from a foreign log: which columns, which units, which times."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from servotwin.config.table import did_you_mean
+from servotwin.errors import InvalidInput
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.logs.cleaning import Cleaned, cleaned
+from servotwin.logs.columns import LogColumns
+from servotwin.logs.log import read_columns
+from servotwin.plant.signals import Array
+
+_LEAST = 100  # samples
+_MOST_LOST = 0.5  # of the samples: beyond, the log is not what it seems
+# A number in brackets is a row of a matrix.
+_UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
+_ENDINGS = ("deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n_m", "n")
+_SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
+_TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}
+# Names by which columns are found where none is given, in order of preference.
+_GUESSES = {
+    "time": ("time", "t", "timestamp"),
+    "motor": ("motor", "theta_m", "motor_position", "motor_angle", "qm", "motor_pos"),
+    "load": ("load", "position", "measured_position", "load_position", "joint", "load_angle", "load_pos", "scale"),
+    "command": ("command", "voltage", "torque", "current"),
+}
+
+
+@dataclass(frozen=True)
+class RecordingColumns:
+    """Columns of a log as the user names them; None: found by their names, or absent (command, time).
+
+    Attributes
+    ----------
+    motor, load, command, time : str or None
+    rate : float or None
+        Hz, of a log without times.
+    motor_unit, load_unit : str or None
+        Where the header does not say them.
+    """
+
+    motor: str | None = None
+    load: str | None = None
+    command: str | None = None
+    time: str | None = None
+    rate: float | None = None
+    motor_unit: str | None = None
+    load_unit: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedLog:
+    """A recording and what was found while it was read.
+
+    Attributes
+    ----------
+    recording : EncoderRecording
+    columns : mapping
+        Name of each part's column.
+    samples : int
+        Read from the file.
+    found : mapping
+        Number of samples by defect, in words.
+    """
+
+    recording: EncoderRecording
+    columns: Mapping[str, str]
+    samples: int
+    found: Mapping[str, int]
+
+
+def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
+    """Read, find the columns and clean.
+
+    Raises
+    ------
+    InvalidInput
+        A file that cannot be read, columns that are missing or hold no numbers, neither times nor a rate, or too few
+        samples.
+    """
+    names = tuple(read_columns(path, ()).names)
+    chosen = _chosen(path, names, wanted)
+    columns = read_columns(path, tuple(chosen.values()))
+    arrays = _arrays(path, chosen, columns)
+    size = len(arrays["motor"])
+    units = {part: _unit(name) for part, name in chosen.items()}
+    motor_unit = wanted.motor_unit or units["motor"] or "motor unit"
+    load_unit = wanted.load_unit or units["load"] or "load unit"
+    time = _times(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size)
+    turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
+    clean = cleaned(time, arrays, turns)
+    _check_left(path, clean, size, columns)
+    recording = EncoderRecording(
+        time=clean.time,
+        motor=clean.channels["motor"],
+        load=clean.channels["load"],
+        command=clean.channels.get("command"),
+        motor_unit=motor_unit,
+        load_unit=load_unit,
+        source=f"log {path}",
+    )
+    return RecordedLog(recording, chosen, size, clean.found)
+
+
+def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
+    """Columns by their parts, of one length."""
+    arrays = {part: _numbers(path, name, columns) for part, name in chosen.items()}
+    size = len(arrays["motor"])
+    for part, values in arrays.items():
+        if len(values) != size:
+            raise InvalidInput(
+                f"log {path}: column {chosen[part]!r} has {len(values)} values and {chosen['motor']!r} has {size}: "
+                "they must be of one table"
+            )
+    return arrays
+
+
+def _check_left(path: Path, clean: Cleaned, size: int, columns: LogColumns) -> None:
+    left = clean.time.size
+    if left >= max(_LEAST, _MOST_LOST * size):
+        return
+    what = "; ".join(f"{count} {defect}" for defect, count in clean.found.items()) or "the log is short"
+    first = next(iter(columns.damaged.items()), None)
+    where = f"; column {first[0]!r}, {first[1]}" if first else ""
+    raise InvalidInput(
+        f"log {path}: {left} of {size} samples can be used, of at least {_LEAST} and half of all ({what}{where})"
+    )
+
+
+def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[str, str]:
+    """Name of the column of each part."""
+    result: dict[str, str] = {}
+    for part in ("time", "motor", "load", "command"):
+        given = getattr(wanted, part)
+        name = _given(path, part, given, names) if given is not None else _guessed(part, names)
+        if name is not None:
+            result[part] = name
+        elif part in ("motor", "load"):
+            raise InvalidInput(
+                f"log {path}: no column is called like the {part}'s position; give --{part} COLUMN, one of "
+                f"{', '.join(names) or 'none'}"
+            )
+    return result
+
+
+def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
+    """The column of that name, with its unit or without."""
+    fitting = [name for name in names if given in (name, _bare(name))]
+    if not fitting:
+        hint = did_you_mean(given, names)
+        raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
+    return fitting[0]
+
+
+def _guessed(part: str, names: Sequence[str]) -> str | None:
+    bare = {_bare(name).lower().replace(" ", "_"): name for name in reversed(names)}
+    return next((bare[guess] for guess in _GUESSES[part] if guess in bare), None)
+
+
+def _bare(name: str) -> str:
+    """A column's name without its unit."""
+    found = _UNIT.match(name)
+    if found:
+        return found["name"]
+    ending = next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), None)
+    return name[: -len(ending) - 1] if ending else name
+
+
+def _unit(name: str) -> str:
+    """The unit that a column's name says; empty where it says none."""
+    found = _UNIT.match(name)
+    if found:
+        return found["unit"].strip()
+    return next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
+
+
+def _times(path: Path, time: Array | None, unit: str, rate: float | None, size: int) -> Array:
+    if time is not None:
+        if unit and unit.lower() not in _SECONDS:
+            raise InvalidInput(f"log {path}: times in {unit!r}: allowed are {', '.join(_SECONDS)}")
+        return time * _SECONDS.get(unit.lower(), 1.0)
+    if rate is None or not (np.isfinite(rate) and rate > 0.0):
+        raise InvalidInput(f"log {path}: no column is called like a time; give --time COLUMN, or --rate in Hz above 0")
+    return np.arange(size) / rate
+
+
+def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
+    values = columns.values[name]
+    if getattr(values, "dtype", None) is not None and values.dtype.kind == "M":
+        values = values.astype("datetime64[ns]").astype(np.int64) * 1e-9
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError
+        return np.asarray(values, dtype=np.float64).ravel()
+    except (TypeError, ValueError):
+        raise InvalidInput(f"log {path}: column {name!r} must hold numbers") from None

@@ -1,0 +1,125 @@
+"""The gap between two encoders, without a model of the dynamics."""
+
+import math
+
+import numpy as np
+import pytest
+from recordings import recording, swings
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.strokes import play_and_side
+from servotwin.plant.backlash import play
+
+
+@pytest.mark.parametrize("gap", [0.002, 0.05, 0.7, 6.0])
+def test_from_two_counts_to_most_of_the_travel(gap):
+    found = estimate_lost_motion(recording(gap=gap))
+    low, high = found.interval_motor
+    assert found.ok, found.reasons
+    assert low <= gap <= high
+    assert high - low < 0.02 * gap + 1e-3
+    assert found.gap_load == pytest.approx(0.1 * found.gap_motor, rel=1e-3)
+
+
+def test_a_lag_is_told_from_the_gap():
+    found = estimate_lost_motion(recording(lag=5e-3))
+    assert found.ok
+    assert found.gap_motor == pytest.approx(0.05, abs=3e-4)
+    assert found.lag == pytest.approx(5e-3, rel=0.02)
+
+
+def test_a_cyclic_error_of_unknown_period():
+    found = estimate_lost_motion(recording(error=lambda angle: 4e-4 * np.sin(angle / 0.13 + 1.0)))
+    assert "cyclic" in found.model
+    assert any(period == pytest.approx(2.0 * math.pi * 0.13, rel=0.03) for period in found.cycles)
+    low, high = found.interval_motor
+    assert low <= 0.05 <= high
+
+
+def test_without_a_gap_none_is_claimed():
+    found = estimate_lost_motion(recording(gap=0.0))
+    assert found.status is GapStatus.UNIDENTIFIABLE
+    assert found.interval_motor[0] == 0.0
+    assert found.interval_motor[1] < 2e-3
+    assert "at most" in found.reasons[0]
+
+
+def test_a_load_that_never_follows_is_a_bound():
+    time, motor = swings()
+    found = estimate_lost_motion(EncoderRecording(time, motor, np.full(time.size, 0.3)))
+    assert found.status is not GapStatus.OK
+    assert not math.isfinite(found.interval_motor[1])
+
+
+def test_a_swinging_load_is_no_gap():
+    # A resonance in place of a gap: y'' + 2 d w y' + w^2 y = w^2 r m.
+    time, motor = swings()
+    omega, load, state = 12.0, np.empty(time.size), np.zeros(2)
+    step = time[1]
+    for i in range(time.size):
+        state[1] += step * (omega**2 * (0.1 * motor[i] - state[0]) - 2.0 * omega * 0.05 * state[1])
+        state[0] += step * state[1]
+        load[i] = state[0]
+    found = estimate_lost_motion(EncoderRecording(time, motor, load))
+    assert found.status is GapStatus.MODEL_MISMATCH
+    assert math.isnan(found.gap_motor)
+
+
+def test_each_reversal_shows_where_the_gap_is_worn():
+    time, motor = swings()
+    # Twice the gap in the upper half of the travel.
+    gap = 0.05 * (1.0 + 1.0 / (1.0 + np.exp(-4.0 * motor)))
+    found = estimate_lost_motion(EncoderRecording(time, motor, 0.1 * play(motor, gap)))
+    upper = np.median([each.gap for each in found.local if each.position > 0.15])
+    lower = np.median([each.gap for each in found.local if each.position < -0.15])
+    assert 0.05 < lower < 0.065
+    assert 0.085 < upper < 0.1
+
+
+def test_two_weightings_disagree_where_the_model_is_wrong():
+    # The load lags by a constant way when it is fast only: neither gap nor lag, and no model has it.
+    time, motor = swings()
+    rate = np.gradient(motor, time)
+    load = 0.1 * play(motor, 0.05) - 3e-3 * np.tanh(0.3 * rate) ** 3
+    found = estimate_lost_motion(EncoderRecording(time, motor, load))
+    assert found.status is GapStatus.MODEL_MISMATCH
+    assert "if the motor's way does" in found.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("motor", "message"),
+    [(lambda t: np.full(t.size, 1.0), "the motor moves by"), (lambda t: 0.3 * t, "reverses 0 times")],
+    ids=["at rest", "one direction"],
+)
+def test_motions_that_show_nothing_are_refused(motor, message):
+    time, _ = swings()
+    with pytest.raises(InvalidInput, match=message):
+        estimate_lost_motion(EncoderRecording(time, motor(time), 0.1 * motor(time)))
+
+
+def test_play_is_the_play_operator_from_the_first_contact_on():
+    _, motor = swings()
+    side = np.zeros(motor.size, dtype=np.int8)
+    output = play_and_side(motor, 0.4, side)
+    known = side != 0
+    assert np.array_equal(output[known], play(motor, 0.4)[known])
+    assert set(np.unique(side)) == {-1, 0, 1}
+
+
+def test_intervals_cover():
+    # Errors that are neither white nor Gaussian: a random walk of the offset, a cyclic error, counts.
+    inside = accepted = 0
+    for seed in range(12):
+        generator = np.random.default_rng(100 + seed)
+        made = recording(
+            gap=0.08, noise=0.0, seconds=12.0, rate=100.0, seed=seed, error=lambda angle: 3e-4 * np.sin(7.0 * angle)
+        )
+        drift = np.cumsum(generator.standard_normal(made.time.size)) * 1e-5
+        found = estimate_lost_motion(EncoderRecording(made.time, made.motor, made.load + drift))
+        accepted += found.ok
+        inside += found.interval_motor[0] <= 0.08 <= found.interval_motor[1]
+    assert inside >= 11
+    assert accepted >= 6

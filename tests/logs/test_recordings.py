@@ -1,0 +1,186 @@
+"""Foreign logs: every format, and what real ones have in them."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from recordings import recording
+from typer.testing import CliRunner
+
+from servotwin.cli.app import app
+from servotwin.errors import InvalidInput
+from servotwin.logs.cleaning import cleaned
+from servotwin.logs.recordings import RecordingColumns, read_recording
+
+GAP, RATIO = 0.05, 0.1
+
+
+@pytest.fixture(scope="module")
+def made():
+    return recording(gap=GAP, ratio=RATIO, seconds=12.0, rate=200.0)
+
+
+def rows(made):
+    return np.column_stack([made.time, made.motor, made.load])
+
+
+def csv(path, values, header="time_s,motor_rad,load_rad", separator=",", comma=False, comments=()):
+    lines = [*comments, header.replace(",", separator)]
+    lines += [separator.join(f"{value:.9g}" for value in row) for row in values]
+    text = "\n".join(lines) + "\n"
+    path.write_text(text.replace(".", ",") if comma else text)
+    return path
+
+
+def seen(path, made, columns=None):
+    log = read_recording(path, columns or RecordingColumns())
+    assert np.allclose(log.recording.motor, made.motor, atol=1e-8)
+    assert np.allclose(log.recording.load, made.load, atol=1e-8)
+    return log
+
+
+def test_tables_of_text(tmp_path, made):
+    values = rows(made)
+    plain = seen(csv(tmp_path / "a.csv", values), made)
+    assert (plain.recording.motor_unit, plain.recording.load_unit) == ("rad", "rad")
+    german = seen(csv(tmp_path / "b.csv", values, separator=";", comma=True, comments=["# Prüfstand 7"]), made)
+    assert german.recording.motor_unit == "rad"
+    bracketed = seen(csv(tmp_path / "c.txt", values, "t [s],motor [deg],load (mm)", "\t"), made)
+    assert (bracketed.recording.motor_unit, bracketed.recording.load_unit) == ("deg", "mm")
+    units = csv(tmp_path / "d.csv", values, "t,qa,qb\ns,rad,um", ";")
+    assert seen(units, made, RecordingColumns(motor="qa", load="qb")).recording.load_unit == "um"
+    bare = tmp_path / "e.dat"
+    np.savetxt(bare, values)
+    seen(bare, made, RecordingColumns(time="col1", motor="col2", load="col3"))
+
+
+def test_milliseconds(tmp_path, made):
+    values = rows(made) * [1e3, 1.0, 1.0]
+    log = seen(csv(tmp_path / "a.csv", values, "time_ms,motor,load"), made)
+    assert np.allclose(log.recording.time, made.time)
+
+
+def test_arrays_of_numpy_and_matlab(tmp_path, made):
+    from scipy.io import savemat
+
+    np.savez(tmp_path / "a.npz", time=made.time, motor=made.motor, load=made.load)
+    seen(tmp_path / "a.npz", made)
+    savemat(tmp_path / "b.mat", {"data": rows(made).T, "note": "text"})
+    columns = RecordingColumns(time="data[0]", motor="data[1]", load="data[2]")
+    seen(tmp_path / "b.mat", made, columns)
+    with pytest.raises(InvalidInput, match=r"there is no such column .*it has data\[0\], data\[1\], data\[2\]"):
+        read_recording(tmp_path / "b.mat", RecordingColumns(motor="date[1]"))
+
+
+def test_hdf5_and_the_matlab_file_that_is_one(tmp_path, made):
+    h5py = pytest.importorskip("h5py", reason="the extra hdf5 is not installed")
+    for name, userblock in (("a.h5", 0), ("b.mat", 512)):
+        with h5py.File(tmp_path / name, "w", userblock_size=userblock) as file:
+            file["axis/table"] = rows(made)
+            file["axis/name"] = "rig"
+        columns = RecordingColumns(time="axis/table[0]", motor="axis/table[1]", load="axis/table[2]")
+        seen(tmp_path / name, made, columns)
+    (tmp_path / "c.h5").write_bytes((tmp_path / "a.h5").read_bytes()[:3000])
+    with pytest.raises(InvalidInput, match="is not an HDF5 file that can be read"):
+        read_recording(tmp_path / "c.h5", RecordingColumns())
+
+
+def test_events_of_epics(tmp_path, made):
+    # Each variable reports when it changes, and the first line is the last value of yesterday.
+    begin = np.datetime64("2026-03-01T08:00:00", "us")
+    lines = [f"RIG:LOAD 2026-02-28 17:00:00.000000 {made.load[0]:.6f}"]
+    for place, (time, motor, load) in enumerate(rows(made)):
+        for name, value, offset in (("RIG:MOTOR", motor, 0.0), ("RIG:LOAD", load, 1e-3)):
+            stamp = str(begin + np.timedelta64(round(1e6 * (time + offset)), "us")).replace("T", " ")
+            if name == "RIG:MOTOR" or place % 2:
+                lines.append(f"{name} {stamp} {value:.6f}")
+    path = tmp_path / "camonitor.txt"
+    path.write_text("\n".join(lines))
+    log = read_recording(path, RecordingColumns(motor="RIG:MOTOR", load="RIG:LOAD"))
+    assert log.recording.time.size > made.time.size
+    at = np.interp(log.recording.time - log.recording.time[5], made.time - made.time[3], made.load)
+    assert np.max(np.abs(log.recording.load - at)[20:-20]) < 0.01
+
+
+def test_defects_are_mended_and_counted(tmp_path, made):
+    values = rows(made)
+    values[:, 1] %= 2.0 * np.pi
+    text = [",".join(f"{value:.9g}" for value in row) for row in values]
+    text[100] = text[100].rpartition(",")[0] + ",n/a"
+    text[200] = text[199]
+    text[300], text[301] = text[301], text[300]
+    text[400] = ",".join([*text[400].split(",")[:2], "99"])
+    del text[500:560]
+    text.insert(0, "-3600,0,0")
+    path = tmp_path / "log.csv"
+    path.write_text("time_s,motor_rad,load_rad\n" + "\n".join(text))
+    log = read_recording(path, RecordingColumns())
+    assert log.found.pop("turns of motor that were unwrapped") > 5
+    assert log.found == {
+        "without a number in some column": 1,
+        "stale, long before all others": 1,
+        "earlier than the sample before": 1,
+        "at the time of the sample before": 1,
+        "spikes of load": 1,
+        "pauses longer than five intervals": 1,
+    }
+    motor = np.interp(log.recording.time, made.time, made.motor)
+    turns = (log.recording.motor - motor) / (2.0 * np.pi)
+    assert np.max(np.abs(turns - np.round(turns[0]))) < 0.01
+
+
+def test_a_clean_log_is_left_as_it_is(made):
+    clean = cleaned(made.time, {"motor": made.motor, "load": made.load}, {"motor": 2.0 * np.pi})
+    assert not clean.found
+    assert clean.channels["motor"] == pytest.approx(made.motor)
+
+
+BAD = {
+    "no such column": (("--motor", "moter_rad"), r"did you mean 'motor_rad'\?"),
+    "no column like it": (("--time", "time_s"), "no column is called like the motor's position; give --motor COLUMN"),
+    "one direction": ((), "the motor reverses 0 times in"),
+    "words": ((), r"samples can be used, .* column 'motor_rad', line 2: 'slow'"),
+    "empty": ((), "the file holds no row"),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_a_bad_log_is_one_sentence(tmp_path, made, kind):
+    values = rows(made)[::4]
+    path = csv(
+        tmp_path / "log.csv", values, "time_s,a,b" if kind == "no column like it" else "time_s,motor_rad,load_rad"
+    )
+    if kind == "one direction":
+        csv(path, np.column_stack([values[:, 0]] * 3))
+    elif kind == "words":
+        path.write_text("\n".join(["time_s,motor_rad,load_rad", *(f"{row[0]},slow,1" for row in values)]))
+    elif kind == "empty":
+        path.write_text("# nothing\n")
+    options, message = BAD[kind]
+    result = CliRunner().invoke(app, ["identify", str(path), *options])
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") <= 1
+    assert re.search(message, result.stderr)
+
+
+def test_identify_from_a_log_to_json(tmp_path, made):
+    path = csv(tmp_path / "log.csv", rows(made), "t [s],motor [rad],load [mm]")
+    result = CliRunner().invoke(app, ["identify", str(path), "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert (found["status"], found["unit_motor"], found["unit_load"]) == ("ok", "rad", "mm")
+    low, high = found["interval_load"]
+    assert low <= GAP * RATIO <= high
+    assert found["gap_motor"] == pytest.approx(GAP, abs=1e-3)
+    assert len(found["segments"]) > 10
+
+
+def test_the_change_between_two_logs(tmp_path, made):
+    first = csv(tmp_path / "old.csv", rows(made))
+    worn = recording(gap=0.06, ratio=RATIO, seconds=12.0, rate=200.0, seed=2)
+    second = csv(tmp_path / "new.csv", rows(worn))
+    result = CliRunner().invoke(app, ["identify", str(first), str(second)])
+    assert result.exit_code == 0, result.output
+    assert "change: +0.001" in result.output
+    assert "more than chance explains" in result.output
