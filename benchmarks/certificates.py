@@ -16,13 +16,14 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.decisions import KNOWN_BIAS, LEARNT, NARROW, UNKNOWN_BIAS, WHOLE, WIDE
 from servotwin.control.controller import Controller
+from servotwin.control.retuning import unfed, without_integral
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import Demands, NotVerified
 from servotwin.redesign.certified.certify import certify
-from servotwin.redesign.certified.margins import unfed, widened
+from servotwin.redesign.certified.margins import widened
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Range, Uncertainty, draw_independently
 
@@ -151,7 +152,7 @@ def _row(preset: str, servo: Servo, name: str, known: Uncertainty, count: int, s
         share_at_least(settled, count, demands.confidence),
         float(measures.tail.max()),
         plants,
-        worst_peak(servo, widened(known, demands), found.setting.controller, plants, seed),
+        worst_peak(servo, widened(known, demands), found.setting.pid, plants, seed),
         found.loop.Ms_worst,
     )
 
@@ -160,7 +161,7 @@ def worst_peak(servo: Servo, known: Uncertainty, law: Controller, count: int, se
     """Largest Ms of a law, its integral acting and stopped, on fresh plants with every delay; inf: unstable."""
     laws = [unfed(law)]
     if law.integral_only:
-        laws.append(laws[0].replace(Ki=0.0))
+        laws.append(without_integral(laws[0]))
     fresh = draw_independently(servo, known, count, seed)
     plants = PlantSet.of([plant.plant() for plant in fresh.plants], law.sample_rate)
     delays = range(1 if law.sample_rate is None else known.delay + 1)

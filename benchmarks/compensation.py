@@ -17,10 +17,11 @@ from rich.table import Table
 
 from benchmarks import report
 from servotwin.control.controller import Controller
+from servotwin.control.laws import filtered_pid
+from servotwin.control.retuning import scaled
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.redesign.certified.margins import scaled_law
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 
@@ -124,7 +125,7 @@ def _measured(servo: Servo, machines: SimulatedMachines, form: str, time: float,
     velocity, share = FORMS[form]
     gap, step = machines.gap[:, 0], machines.step[:, 0]
     fed = servo.k_B * (velocity / servo.p + share * gap / step)
-    own = scaled_law(servo.controller, scale, (1.0, 1.0), 0.0)
+    own = filtered_pid(scaled(servo.controller, scale, (1.0, 1.0), 0.0))
     laws = np.array([_law(own, each, time) for each in fed.tolist()], dtype=object)
     plants = np.array(machines.plants, dtype=object)
     begins = MOVE * np.arange(MOVES)

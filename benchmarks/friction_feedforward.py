@@ -18,7 +18,8 @@ from benchmarks import report
 from benchmarks.policies.loops import scored
 from benchmarks.policies.worn import WornMachine, worn_machines
 from servotwin.control.controller import Controller
-from servotwin.redesign.certified.margins import scaled_law
+from servotwin.control.laws import filtered_pid
+from servotwin.control.retuning import scaled
 
 NAME, SCHEMA = "friction", "servotwin-bench-friction/1"
 MACHINES, QUICK, SEED = 20, 2, 1
@@ -96,7 +97,7 @@ def _row(name: str, share: float, machines: Sequence[WornMachine], law: tuple[fl
 def _law(machine: WornMachine, share: float, scale: float, velocity: float, integral: float) -> Controller:
     """The servo's own law, scaled, with feedforwards."""
     own, needed = machine.model.controller, machine.model.k_B / machine.model.p
-    return scaled_law(own, scale, (1.0, 1.0), integral).replace(
+    return filtered_pid(scaled(own, scale, (1.0, 1.0), integral)).replace(
         velocity_feedforward=velocity * needed,
         velocity_time=_VELOCITY_TIME * needed / own.Kp,
         friction_feedforward=share * machine.friction * machine.plant.R / machine.plant.k_T,

@@ -12,6 +12,7 @@ from functools import partial
 from msgspec import structs
 
 from servotwin.control.gains import gains_of
+from servotwin.control.laws import filtered_pid
 from servotwin.cosim.scenario import Scenario
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -49,7 +50,7 @@ def deceived_twin(scenario: Scenario, gap: float) -> Twin:
         interval = max(0.0, gap - 2.0 * SPREAD), gap + 2.0 * SPREAD
         return GapEstimate(gap, SPREAD, SPREAD, interval, GapStatus.OK, window.mid_time, method="constant")
 
-    start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
+    start = Setting.of(scenario.start_tolerance, gains_of(scenario.start_law))
     policy, observer = policy_of(scenario.model, scenario.twin), partial(disturbance, servo=scenario.model)
     model = TwinModel(estimate, policy, scenario.twin, observer, start)
     return Twin(scenario.name, model)
@@ -148,5 +149,5 @@ class HostileTwin:
 
 def gains(scenario: Scenario) -> Gains:
     """The servo's own gains."""
-    own = scenario.law
+    own = filtered_pid(scenario.law)
     return Gains(own.Kp, own.Ki, own.Kd, own.Tf)

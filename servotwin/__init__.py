@@ -49,6 +49,7 @@ _HOMES = {
     "simulate": "servotwin.simulation",
     "stability_map": "servotwin.design",
     "tune": "servotwin.design",
+    "tune_cascade": "servotwin.analysis.tuning.cascade",
 }
 
 if TYPE_CHECKING:
@@ -123,6 +124,7 @@ __all__ = [
     "simulate",
     "stability_map",
     "tune",
+    "tune_cascade",
 ]
 
 

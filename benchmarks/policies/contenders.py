@@ -45,7 +45,7 @@ def constants(model: Servo, known: Uncertainty) -> dict[str, Design]:
     own, policies = model.controller, dict[str, Design]()
     every = candidates_of(model, known, demands, disturbed=True, noisy=False)
     for setting in every:
-        law = setting.controller
+        law = setting.pid
         fed = f", velocity x {law.velocity_feedforward * model.p / model.k_B:g}" if law.velocity_feedforward else ""
         stops = f", stops within {setting.tolerance * 1e6:g} um" if law.integral_only else ""
         policies[f"Kp, Kd x {law.Kp / own.Kp:g}, Ki x {law.Ki / own.Ki:g}{stops}{fed}"] = setting

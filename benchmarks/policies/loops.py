@@ -14,9 +14,10 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachine, worn_machines
 from servotwin.analysis.maps.pool import shared, workplace
+from servotwin.control.laws import filtered_pid
+from servotwin.control.retuning import scaled
 from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.messages.updates import Update
-from servotwin.redesign.certified.margins import scaled_law
 from servotwin.redesign.registry import certified_policy
 from servotwin.simulation import Run
 
@@ -144,12 +145,12 @@ def _compared(task: _Task) -> dict[str, LoopScores]:
     fallback = certified_policy(machine.model, machine.scenario.twin).fallback().setting
     scores = {
         TWIN: with_twin(machine),
-        FALLBACK: scored(machine, machine.under(fallback.controller, fallback.tolerance)),
+        FALLBACK: scored(machine, machine.under(fallback.pid, fallback.tolerance)),
     }
     for scale in _SCALES:
         for share in _INTEGRAL:
             name = {(1.0, 0.0): OWN, (0.6, 0.0): SLOWER}.get((scale, share), f"Kp, Kd x {scale:g}, Ki x {share:g}")
-            scores[name] = scored(machine, machine.under(scaled_law(own, scale, (1.0, 1.0), share)))
+            scores[name] = scored(machine, machine.under(filtered_pid(scaled(own, scale, (1.0, 1.0), share))))
     return scores
 
 

@@ -102,7 +102,7 @@ def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Con
         told_for = believed
         if now != setting:
             simulation.advance(_sample(end + DELAY, block))
-            simulation.set_controller(_law(now.controller, block), now.tolerance)
+            simulation.set_controller(_law(now.pid, block), now.tolerance)
             setting = now
     simulation.advance(_sample(REST + DURATION, block))
     return scores(simulation.run(), machine.step, setting, model)
@@ -110,7 +110,7 @@ def run_machine(machine: TrialMachine, block: str, model: Servo, competitor: Con
 
 def scores(run: Run, step: float, setting: Design, model: Servo) -> Scores:
     """Measure a run with one step from the step on; state the setting at its end."""
-    law, own = setting.controller, model.controller
+    law, own = setting.pid, model.controller
     error = (run.reference - run.position)[round(REST * run.sample_rate) :]
     last = slice(-round(LAST * run.sample_rate), None)
     outside = np.flatnonzero(np.abs(error) > NEAR * step)
@@ -148,7 +148,7 @@ def _simulation(machine: TrialMachine, block: str, setting: Design, rng: np.rand
     return Simulation(
         machine.servo,
         REST + DURATION,
-        _law(setting.controller, block),
+        _law(setting.pid, block),
         reference=Step(machine.step, REST),
         gap=machine.gap,
         tolerance=setting.tolerance,

@@ -161,7 +161,7 @@ def cells(row: DemoStep) -> tuple[str, ...]:
 
 def sent(update: Update, servo: st.Servo) -> tuple[str, ...]:
     """Make the texts of an update, in the order of `_SENT`; gains relative to the servo's own."""
-    new, verification, own = update.setting.gains, update.verification, servo.controller
+    new, verification, own = update.setting.pid, update.verification, servo.controller
     if new is None or verification is None:
         return (f"{update.data_time:.0f}", *("-" for _ in _SENT[1:]))
     gains = f"x {new.Kp / own.Kp:.2f}", f"x {new.Ki / own.Ki:.2f}"

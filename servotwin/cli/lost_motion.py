@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
@@ -26,8 +27,8 @@ def describes_its_machine(path: Path) -> bool:
     return isinstance(read_columns(path, ()).metadata.get("servo"), str)
 
 
-def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool) -> None:
-    """Estimate each log's gap and print it; with several, their differences too.
+def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool, page: Path | None = None) -> None:
+    """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
     Raises
     ------
@@ -35,11 +36,19 @@ def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool) -> None
         As `read_recording` and `estimate_lost_motion`.
     """
     console = Console(stderr=as_json)
+    if page is not None:
+        from servotwin.cli.lost_motion_page import check_page, write_page
+
+        check_page(page)
     answers = []
     for path in logs:
         with console.status(f"{path.name}"):
             log = read_recording(path, columns)
             answers.append((log, estimate_lost_motion(log.recording)))
+    if page is not None:
+        log, found = answers[-1]
+        said = Text.from_markup(_headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
+        write_page(page, log, found, said)
     if as_json:
         rows = [as_dict(log, found) for log, found in answers]
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))

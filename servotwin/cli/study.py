@@ -67,6 +67,7 @@ def identify(
     rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
     motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as deg.")] = None,
     load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as mm.")] = None,
+    page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
     servo: Annotated[
         str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
     ] = None,
@@ -96,7 +97,7 @@ def identify(
 
     columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
     if columns != RecordingColumns() or (servo is None and not describes_its_machine(logs[0])):
-        show_lost_motion(logs, columns, json)
+        show_lost_motion(logs, columns, json, page)
         return
     if len(logs) > 1:
         raise InvalidInput("servotwin identify: one log at a time with --servo or a log that describes its servo")

@@ -10,12 +10,16 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from servotwin.analysis.tuning.cascade import tune_cascade
 from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.laws import filtered_pid
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Axis
+from servotwin.plant.axis_file import file_values
 from servotwin.plant.loop import gain_units
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant, resolve_plant
@@ -23,6 +27,7 @@ from servotwin.plant.shown import command_unit, position_unit
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
+_CASCADE_GAINS = ("position_gain", "velocity_gain", "integral_time")
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,9 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     if not 0.0 < request.phase_margin_deg < 180.0:
         raise InvalidInput(f"phase margin {request.phase_margin_deg:g} deg: must be above 0 and below 180 deg")
     servo = resolve_plant(request.servo)
+    if isinstance(servo, Axis) and isinstance(servo.controller, Cascade):
+        print_cascade(servo, servo.controller, request, as_json)
+        return
     servo = servo.replace(sample_rate=None)
     delay = 1e-3 * request.delay_ms
     tuning = tune(
@@ -76,6 +84,26 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
         more = f"; with setpoint weights b = {b:g}, c = {c:g}: {100 * overshoots[1]:.1f} %"
         more = more if (b, c) != (1.0, 1.0) else ""
         console.print(f"overshoot without a gap {100 * overshoots[0]:.1f} %{more}", highlight=False)
+
+
+def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool) -> None:
+    """Print a cascade tuned from inside outwards: crossover and margin are those of its velocity loop."""
+    margin, delay = math.radians(request.phase_margin_deg), 1e-3 * request.delay_ms
+    tuned = tune_cascade(axis, request.crossover, margin, delay=delay)
+    found, present = (file_values(law, axis.actuator.unit, axis.load.motion) for law in (tuned.controller, own))
+    gains = {name: value for name, value in found.items() if name.startswith(_CASCADE_GAINS)}
+    if as_json:
+        loop = {"omega": tuned.position_crossover, "phase_margin_deg": math.degrees(tuned.position_margin)}
+        print(json.dumps({"gains": gains, "position_loop": loop, "Ms": tuned.margins.Ms}, indent=2))
+        return
+    table = Table("", "tuned", "present", box=None, pad_edge=False)
+    for name, value in gains.items():
+        table.add_row(name, f"{value:.6g}", f"{present.get(name, math.nan):.6g}")
+    console = Console()
+    console.print(table, highlight=False)
+    outer = f"{tuned.position_crossover:.4f} rad/s ({math.degrees(tuned.position_margin):.2f} deg)"
+    console.print(f"position loop, crossover (phase margin): {outer}", highlight=False)
+    console.print(f"Ms at the command, at the law's own rate: {tuned.margins.Ms:.4f}", highlight=False)
 
 
 def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str, Any]:

@@ -12,9 +12,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, NamedTuple
 
+import msgspec
+
 from servotwin.config.keys import key, settings
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
+from servotwin.control.retuning import friction_feedforward, integrates
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
@@ -24,13 +30,14 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.gap import shortest_window
 from servotwin.estimation.whitened.estimator import SHORTEST
-from servotwin.messages import Gains, Setting
+from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
+from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors
 from servotwin.redesign.dead_zones import HysteresisPolicy
@@ -50,6 +57,7 @@ _MOST_SAMPLES = 1e8  # some 10 GB of signals
 _ROUNDING = 1.0 + 1e-9
 # Factor by which the resonance of a learnt machine may be off the model's, either way.
 _NOTCH_MOVES = 2.0
+_BELOW_HALF = 0.49
 
 
 @settings("recording")
@@ -110,7 +118,7 @@ class Guarding(NamedTuple):
 
     supervision: Supervision
     limits: Limits
-    middle: Gains
+    middle: AnyGains
 
 
 def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
@@ -136,7 +144,7 @@ def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guardi
     policy = certified_policy(servo, settings)
     verified = policy.fallback()
     gains, band = gains_of(verified.setting.controller), band_of(verified, noise)
-    fallback = FallbackSet(Setting(verified.setting.tolerance, gains, band), policy.horizon)
+    fallback = FallbackSet(Setting.of(verified.setting.tolerance, gains, band), policy.horizon)
     supervision = supervision_of(servo, settings, fallback)
     sent = policy_of(servo, settings)
     return Guarding(
@@ -165,32 +173,59 @@ def start_of(fallback: FallbackSet) -> Parameters:
     return Parameters(setting=fallback.setting, fallback=True)
 
 
-def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, Gains]:
+def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, AnyGains]:
     """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
-    own, demands = policy.servo.pidf, policy.demands_within_band()
+    own, demands = policy.servo.controller, policy.demands_within_band()
     laws = _candidates(policy, demands)
-    ends = {name: _range([getattr(law, name) for law in laws]) for name in ("Kp", "Kd", "Tf")}
-    middle = {name: math.copysign(math.sqrt(low * high), getattr(own, name)) for name, (low, high) in ends.items()}
-    kick = max(abs(law.velocity_feedforward) / law.velocity_time for law in laws)
+    sent, centre = [gains_of(law) for law in laws], gains_of(own)
+    ends = {name: _range([getattr(gains, name) for gains in sent]) for name in centre.scaled}
+    middle = {name: math.copysign(math.sqrt(low * high), getattr(centre, name)) for name, (low, high) in ends.items()}
     widest = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values())
+    kick = _kick(laws)
     factor = max(widest, kick / abs(middle["Kp"]) if kick else 0.0) * _ROUNDING
-    notches = [law.notch_hz for law in laws if law.notch_hz]
+    notches = [gains.notch_hz for gains in sent if not isinstance(gains, LinearGains) and gains.notch_hz]
+    dampings = [gains.notch_damping for gains in sent if not isinstance(gains, LinearGains) and gains.notch_hz]
     leave = max([law.leave for law in laws] + [leave for _, leave in demands.hysteresis])
     limits = Limits(
         maximum=demands.tolerance,
         gain_factor=factor,
-        integral_factor=max(demands.integral, default=0.0) * _ROUNDING,
+        integral_factor=max(integral_shares(own, demands), default=0.0) * _ROUNDING,
         feedforward=policy.feedforward_limit * _ROUNDING,
         # The centre follows the learnt machine.
         notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,
-        notch_max_hz=max(notches, default=0.0) * _NOTCH_MOVES,
-        notch_damping=max((law.notch_damping for law in laws if law.notch_hz), default=own.notch_damping),
+        notch_max_hz=min(max(notches, default=0.0) * _NOTCH_MOVES, _highest_notch(own)),
+        notch_damping=max(dampings, default=0.5 if isinstance(own, LinearLaw) else own.notch_damping),
         patience_s=PATIENCE * scales(policy.servo).time,
     )
-    return limits, Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, max(leave, own.leave) / factor)
+    return limits, _centre_of(centre, middle, _ROUNDING * max(leave, own.leave) / factor)
 
 
-def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[Controller]:
+def _highest_notch(own: AnyController) -> float:
+    """Hz: a cascade has no notch at half of its rate or above."""
+    if not isinstance(own, Cascade) or own.sample_rate is None:
+        return math.inf
+    return _BELOW_HALF * own.sample_rate
+
+
+def _kick(laws: list[AnyController]) -> float:
+    """Largest answer of a velocity feedforward to a step of the reference, V/m."""
+    return max(
+        (abs(law.velocity_feedforward) / law.velocity_time for law in laws if isinstance(law, Controller)), default=0.0
+    )
+
+
+def _centre_of(own: AnyGains, middle: dict[str, float], leave: float) -> AnyGains:
+    """Gains in the middle of a box, with the own integral gain and nothing fed forward."""
+    if isinstance(own, Gains):
+        return Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, leave)
+    centre = msgspec.structs.replace(own, **middle, enter=0.0, leave=leave, feedforward=0.0)
+    if isinstance(centre, CascadeGains):
+        time = centre.velocity_gain / own.integral_gain if own.integral_gain else 0.0
+        return msgspec.structs.replace(centre, integral_time=time)
+    return msgspec.structs.replace(centre, integral_share=own.integral_gain / centre.gain)
+
+
+def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[AnyController]:
     """Candidates for the stated ranges, and those for a plant that the twin has learnt exactly."""
     exact = policy.uncertainty.replace(
         **dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors(("k",), (0.0,), ((0.0,),))
@@ -204,19 +239,19 @@ def _range(values: list[float]) -> tuple[float, float]:
     return min(map(abs, values)), max(map(abs, values))
 
 
-def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, Gains]:
+def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, AnyGains]:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
-    own = policy.servo.pidf.replace(enter=policy.enter, leave=policy.leave)
-    patience = PATIENCE * scales(policy.servo).time
+    own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
+    gains, patience = gains_of(own), PATIENCE * scales(policy.servo).time
     limits = Limits(
         gain_factor=_ROUNDING,
-        feedforward=max(abs(own.feedforward), abs(own.friction_feedforward)),
-        notch_min_hz=own.notch_hz,
-        notch_max_hz=own.notch_hz,
-        notch_damping=own.notch_damping,
+        feedforward=max(abs(own.feedforward), abs(friction_feedforward(own))),
         patience_s=patience,
     )
-    return limits, gains_of(own)
+    if isinstance(gains, LinearGains):
+        return limits, gains
+    notch = gains.notch_hz
+    return dataclasses.replace(limits, notch_min_hz=notch, notch_max_hz=notch, notch_damping=gains.notch_damping), gains
 
 
 @dataclass(frozen=True)
@@ -227,7 +262,7 @@ class Commissioning:
     ----------
     servo : Servo or Axis
         Its own controller's gains are the middle of the box for updates.
-    law : Controller
+    law : Controller, Cascade or LinearLaw
         The controller that runs.
     twin : TwinSettings
     recording : Recording
@@ -238,7 +273,7 @@ class Commissioning:
     """
 
     servo: Plant
-    law: Controller
+    law: AnyController
     twin: TwinSettings
     recording: Recording = field(default_factory=Recording)
     supervision: Supervision | None = None
@@ -260,7 +295,7 @@ class Commissioning:
     @property
     def start(self) -> Parameters:
         """Parameters before the first update: the fallback set, or the controller and a dead zone by Eq 21."""
-        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.pidf)
+        guarded, own = self.guarding, gains_of(self.law) == gains_of(self.servo.controller)
         if self.twin.policy == "certified":
             fallback = guarded.supervision.fallback if guarded is not None and own else None
             return Parameters() if fallback is None else start_of(fallback)
@@ -269,7 +304,7 @@ class Commissioning:
     @property
     def calm(self) -> bool:
         """True for a loop with hardly any integral action, which therefore does not hunt through the gap."""
-        return self.law.Ki == 0.0 or self.twin.policy == "certified"
+        return not integrates(self.law) or self.twin.policy == "certified"
 
     @property
     def window(self) -> float:
@@ -335,7 +370,7 @@ class Commissioning:
             No fallback set is verified for the whole stated range.
         """
         agent = dataclasses.replace(self.recorder_settings(servo, boot), parameters=self.start)
-        own, guarded = gains_of(self.servo.pidf), self.guarding
+        own, guarded = gains_of(self.servo.controller), self.guarding
         if guarded is not None:
             open_limits = self.recording.limits == Limits()
             return dataclasses.replace(

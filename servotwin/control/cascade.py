@@ -47,7 +47,11 @@ class Cascade:
     ] = None
     integral_time: Annotated[
         float | None,
-        key("integral_time_s", above=0.0, help="Reset time of the velocity loop; no integral action where absent."),
+        key(
+            "integral_time_s",
+            minimum=0.0,
+            help="Reset time of the velocity loop; 0 or absent: no integral action.",
+        ),
     ] = None
     speed_filter: Annotated[
         float,
@@ -77,7 +81,7 @@ class Cascade:
         ),
     ] = 5e-3
     notch_hz: Annotated[
-        float | None, key("notch_hz", above=0.0, help="Centre of a notch on the command; none where absent.")
+        float | None, key("notch_hz", minimum=0.0, help="Centre of a notch on the command; 0 or absent: none.")
     ] = None
     notch_damping: Annotated[
         float, key("notch_damping", above=0.0, maximum=1.0, help="Damping ratio of its poles.")
@@ -93,14 +97,14 @@ class Cascade:
     leave: Annotated[
         float, key("leave_tolerances", minimum=0.0, help="Error above which it is left; at least enter_tolerances.")
     ] = 1.0
-    opens: Annotated[
+    integral_only: Annotated[
         bool,
         key(
-            help="Inside the dead zone the command is zero and the integral stops; otherwise the integral stops and "
-            "nothing else."
+            help="Inside the dead zone only the integral stops; otherwise the command is zero there too, and the loop "
+            "opens."
         ),
-    ] = False
-    limit: Annotated[
+    ] = True
+    voltage_limit: Annotated[
         float | None, key("voltage_limit_v", above=0.0, help="Largest command, either sign; no limit where absent.")
     ] = None
     rate_limit: Annotated[
@@ -126,8 +130,14 @@ class Cascade:
 
     def __post_init__(self) -> None:
         check(self)
+        for name in ("integral_time", "notch_hz"):
+            if getattr(self, name) == 0.0:
+                object.__setattr__(self, name, None)
         if self.leave < self.enter:
             raise InvalidInput(f"cascade leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
+        if self.notch_hz is not None and self.sample_rate is not None and not self.notch_hz < 0.5 * self.sample_rate:
+            allowed = f"must be below half of sample_rate = {self.sample_rate!r} Hz, or 0 for none"
+            raise InvalidInput(f"cascade notch_hz = {self.notch_hz!r} Hz: {allowed}")
         if self.velocity_gain is None:
             for name, given in (
                 ("integral_time", self.integral_time),
@@ -180,8 +190,8 @@ class Cascade:
             enter=self.enter,
             leave=self.leave,
             holds=("integral",) if "integral" in names else (),
-            opens=self.opens,
-            limit=self.limit,
+            integral_only=self.integral_only,
+            voltage_limit=self.voltage_limit,
             rate_limit=self.rate_limit,
             windup=tuple(back if name == "integral" else 0.0 for name in names),
             feedforward=self.feedforward,

@@ -1,35 +1,90 @@
-"""Gains: the part of a controller that crosses the link."""
+"""Gains: the numbers of a law, of each kind, that the twin may set; they cross the link."""
+
+from typing import overload
 
 import msgspec
 
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, changes, values_of
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.messages import Gains
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
+from servotwin.errors import InvalidInput
+from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains
+
+_KINDS: dict[type, type[AnyGains]] = {Controller: Gains, Cascade: CascadeGains, LinearLaw: LinearGains}
+# What a cascade lacks is None, and 0 in its gains.
+_MAY_LACK = ("velocity_gain", "integral_time", "notch_hz")
 
 
-def gains_of(controller: Controller) -> Gains:
+@overload
+def gains_of(controller: Controller) -> Gains: ...
+@overload
+def gains_of(controller: AnyController) -> AnyGains: ...
+def gains_of(controller: AnyController) -> AnyGains:
     """The part of a controller that updates may set."""
-    floats = {name: float(getattr(controller, name)) for name in Gains.__struct_fields__ if name != "integral_only"}
-    return msgspec.convert({**floats, "integral_only": controller.integral_only}, Gains)
+    kind = _KINDS[type(controller)]
+    values = {name: getattr(controller, name) for name in kind.__struct_fields__}
+    return msgspec.convert(
+        {name: each if name == "integral_only" else float(each or 0.0) for name, each in values.items()}, kind
+    )
 
 
-def with_gains(controller: Controller, gains: Gains | None) -> Controller:
-    """The controller with other gains; its limits, filters and rates stay."""
-    return controller if gains is None else controller.replace(**msgspec.structs.asdict(gains))
+@overload
+def with_gains(controller: Controller, gains: AnyGains | None) -> Controller: ...
+@overload
+def with_gains(controller: AnyController, gains: AnyGains | None) -> AnyController: ...
+def with_gains(controller: AnyController, gains: AnyGains | None) -> AnyController:
+    """The controller with other gains; its limits, filters and rates stay.
+
+    Raises
+    ------
+    InvalidInput
+        The gains are those of another kind of controller, or of another structure of the same kind.
+    """
+    if gains is None:
+        return controller
+    if not fits(controller, gains):
+        raise InvalidInput(f"gains = {gains!r}: must be those of a {type(controller).__name__}")
+    values = msgspec.structs.asdict(gains)
+    if isinstance(gains, CascadeGains):
+        values |= {name: values[name] or None for name in _MAY_LACK}
+    return controller.replace(**values)
 
 
-def read_gains(table: Table, running: Controller) -> Gains:
+def fits(controller: AnyController, gains: AnyGains) -> bool:
+    """True where the gains are those of a controller of this kind; a velocity loop neither appears nor goes."""
+    if isinstance(controller, Cascade) and isinstance(gains, CascadeGains):
+        return (gains.velocity_gain > 0.0) == (controller.velocity_gain is not None)
+    return isinstance(gains, _KINDS[type(controller)])
+
+
+def read_gains(table: Table, running: AnyController) -> AnyGains:
     """The gains that a table gives, with those of the running controller for the others."""
-    return gains_of(running.replace(**changes(table, Controller, only=Gains.__struct_fields__)))
+    if isinstance(running, LinearLaw):
+        return gains_of(running)
+    return gains_of(running.replace(**changes(table, type(running), only=settable(type(running)))))
 
 
-def has_gains(table: Table) -> bool:
+def has_gains(table: Table, kind: type = Controller) -> bool:
     """True when a table gives any gain."""
-    return bool(changes(table, Controller, only=Gains.__struct_fields__))
+    return kind is not LinearLaw and bool(changes(table, kind, only=settable(kind)))
 
 
-def written_gains(gains: Gains) -> Values:
+def written_gains(gains: AnyGains, running: AnyController | None = None) -> Values:
     """The keys and values of a table that `read_gains` reads as these gains."""
-    written = Controller(**msgspec.structs.asdict(gains))
-    return values_of(written, only=Gains.__struct_fields__)
+    if isinstance(gains, Gains):
+        written: AnyController = Controller(**msgspec.structs.asdict(gains))
+    else:
+        assert running is not None
+        written = with_gains(running, gains)
+    values = values_of(written, only=settable(type(written)))
+    # Where nothing is said of them, a reader takes those of the running law.
+    lacking = {"integral_time_s": 0.0, "notch_hz": 0.0} if isinstance(written, Cascade) else {}
+    return {**lacking, **values}
+
+
+def settable(kind: type) -> tuple[str, ...]:
+    """Names of the fields of a class of controllers that updates may set."""
+    return _KINDS[kind].__struct_fields__

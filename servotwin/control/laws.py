@@ -1,6 +1,7 @@
 """The kinds of controllers."""
 
-from typing import TypeAlias
+from abc import ABC
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
@@ -13,9 +14,30 @@ AnyController: TypeAlias = Controller | Cascade | LinearLaw
 """A controller that an axis can have; a cascade is a description of a linear law."""
 
 
+if TYPE_CHECKING:
+    StoredController: TypeAlias = AnyController
+else:
+
+    class StoredController(ABC):  # noqa: B024 - it has nothing of its own
+        """`AnyController` as a field of what files store; `kind_of_stored` tells a decoder which it is."""
+
+    for _kind in (Controller, Cascade, LinearLaw):
+        StoredController.register(_kind)
+
+
+FILTERED_PID, CASCADE = "filtered_pid", "cascade"
+CONTROLLERS: dict[str, type] = {FILTERED_PID: Controller, CASCADE: Cascade}
+"""Controllers that a file can describe, by their key `kind`."""
+
+
 def law_of(controller: AnyController) -> Law:
-    """The law that runs."""
-    return controller.linear() if isinstance(controller, Cascade) else controller
+    """The law that runs, its gains in its matrices."""
+    return controller if isinstance(controller, Controller) else controller.linear()
+
+
+def kind_of_stored(values: dict[str, Any]) -> type:
+    """The class of controllers that fields by name are of."""
+    return Controller if "Kp" in values else Cascade if "position_gain" in values else LinearLaw
 
 
 def filtered_pid(controller: AnyController) -> Controller:

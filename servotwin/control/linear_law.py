@@ -16,6 +16,8 @@ INPUTS = ("reference", "y_motor", "y_load")
 MOTOR, LOAD = "motor", "load"
 # Numba compiles the tick once for each number of states: a few numbers serve all laws.
 _MULTIPLE = 4
+# Relative: rates that differ by no more are one rate, given as a rate and as a time.
+_SAME_RATE = 1e-9
 
 
 @dataclass(frozen=True, repr=False)
@@ -44,9 +46,10 @@ class LinearLaw:
         Error at or below which the dead zone is entered and above which it is left, in tolerances.
     holds : tuple of str
         States that the dead zone stops: inside they keep their values. The others go on.
-    opens : bool
-        True: inside, the law has neither inputs nor a command; what is not stopped decays by itself.
-    limit, rate_limit : float, optional
+    integral_only : bool
+        True: inside, nothing else stops; otherwise the law has neither inputs nor a command there, and what is not
+        stopped decays by itself.
+    voltage_limit, rate_limit : float, optional
         Largest command (in its unit), and its largest change (unit per s; sampled laws only).
     windup : tuple of float
         Back-calculation: added to x' per unit of the command that the limits cut off; none by default.
@@ -54,6 +57,10 @@ class LinearLaw:
         Always added to the command.
     release_time : float
         Time constant with which the offset after a change of the law fades, s.
+    gain : float
+        Factor on the whole law.
+    integral_share : float
+        Factor on what the states in `holds` take in from the inputs and from other states.
 
     Raises
     ------
@@ -73,12 +80,14 @@ class LinearLaw:
     enter: float = 1.0
     leave: float = 1.0
     holds: tuple[str, ...] = ()
-    opens: bool = False
-    limit: float | None = None
+    integral_only: bool = True
+    voltage_limit: float | None = None
     rate_limit: float | None = None
     windup: tuple[float, ...] = ()
     feedforward: float = 0.0
     release_time: float = 0.5
+    gain: float = 1.0
+    integral_share: float = 1.0
 
     def __post_init__(self) -> None:
         n = len(self.C)
@@ -103,7 +112,7 @@ class LinearLaw:
             raise InvalidInput(f'law on = {self.on!r}: must be "load" or "motor"')
 
     def _check_numbers(self) -> None:
-        least = {"sample_rate": "Hz", "limit": "", "rate_limit": "1/s", "release_time": "s"}
+        least = {"sample_rate": "Hz", "voltage_limit": "", "rate_limit": "1/s", "release_time": "s", "gain": ""}
         for name, unit in least.items():
             value = getattr(self, name)
             if value is not None and not (isfinite(value) and value > 0.0):
@@ -116,6 +125,8 @@ class LinearLaw:
             raise InvalidInput(f"law leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
         if not (isfinite(self.ratio) and self.ratio != 0.0):
             raise InvalidInput(f"law ratio = {self.ratio!r} m/rad: must be finite and not 0")
+        if not (isfinite(self.integral_share) and self.integral_share >= 0.0):
+            raise InvalidInput(f"law integral_share = {self.integral_share!r}: must be finite and 0 or more")
         if not isfinite(self.feedforward):
             raise InvalidInput(f"law feedforward = {self.feedforward!r}: must be finite")
         if self.discrete and self.sample_rate is None:
@@ -158,6 +169,9 @@ class LinearLaw:
 
         B = [mapped(row) for row in B]
         rate = None if step is None else 1.0 / step
+        given = values.get("sample_rate", rate)
+        if rate is not None and (given is None or abs(given - rate) > _SAME_RATE * rate):
+            raise InvalidInput(f"law sample_rate = {given!r} Hz: the system is sampled at {rate!r} Hz; leave it out")
         values = {"sample_rate": rate, "discrete": rate is not None, **values}
         return cls(A, B, C[0], mapped(D[0]), on=on, ratio=ratio, **values)  # type: ignore[arg-type]
 
@@ -198,14 +212,45 @@ class LinearLaw:
         column = INPUTS.index(name)
         return any(row[column] != 0.0 for row in (*self.B, self.D)) or name == f"y_{self.on}"
 
+    @property
+    def answer(self) -> float:
+        """Command at rest per error of the position, the states in `holds` left at zero."""
+        resting = self.rest((1.0, 0.0, 0.0), dict.fromkeys(self.holds, 0.0))
+        return self.gain * (sum(c * x for c, x in zip(self.C, resting, strict=True)) + self.D[0])
+
+    def linear(self) -> LinearLaw:
+        """The law that runs: its matrices contain its gain and its integral share.
+
+        The states in `holds` are those of the own law times the gain, so that a change of the gain leaves what they
+        add to the command; without integral action they are left out.
+        """
+        if self.gain == 1.0 and self.integral_share == 1.0:
+            return self
+        held = [name in self.holds for name in self.names]
+        rows = [i for i in range(self.n) if self.integral_share or not held[i]]
+        unit = [self.gain if each else 1.0 for each in held]
+        taken = [unit[i] * (self.integral_share if held[i] else 1.0) for i in range(self.n)]
+        return replace(
+            self,
+            A=tuple(tuple(self.A[i][j] * (1.0 if i == j else taken[i] / unit[j]) for j in rows) for i in rows),
+            B=tuple(tuple(taken[i] * value for value in self.B[i]) for i in rows),
+            C=tuple(self.gain * self.C[i] / unit[i] for i in rows),
+            D=tuple(self.gain * value for value in self.D),
+            windup=tuple(self.windup[i] * unit[i] / self.gain for i in rows),
+            names=tuple(self.names[i] for i in rows),
+            holds=self.holds if self.integral_share else (),
+            gain=1.0,
+            integral_share=1.0,
+        )
+
     def inside(self) -> LinearLaw:
         """The law that runs inside the dead zone."""
         n, still = self.n, (0.0,) * len(INPUTS)
         own = [tuple(float(self.discrete and i == j) for j in range(n)) for i in range(n)]
         held = [name in self.holds for name in self.names]
         A = tuple(own[i] if held[i] else self.A[i] for i in range(n))
-        B = tuple(still if held[i] or self.opens else self.B[i] for i in range(n))
-        C, D = ((0.0,) * n, still) if self.opens else (self.C, self.D)
+        B = tuple(still if held[i] or not self.integral_only else self.B[i] for i in range(n))
+        C, D = (self.C, self.D) if self.integral_only else ((0.0,) * n, still)
         windup = tuple(0.0 if stopped else value for stopped, value in zip(held, self.windup, strict=True))
         return replace(self, A=A, B=B, C=C, D=D, windup=windup)
 
@@ -264,7 +309,7 @@ class LinearLaw:
             load=self.error[1],
             enter=enter,
             leave=leave,
-            limit=inf if self.limit is None else float(self.limit),
+            limit=inf if self.voltage_limit is None else float(self.voltage_limit),
             rate_step=inf if self.rate_limit is None else self.rate_limit / self.sample_rate,
             feedforward=float(self.feedforward),
             release_step=-expm1(-1.0 / (self.sample_rate * self.release_time)),

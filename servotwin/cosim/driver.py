@@ -176,7 +176,7 @@ class Cosimulation:
         self.clock = VirtualClock()
         self.machine = machine
         self.store = EvidenceLog()
-        start = Setting(scenario.start_tolerance, gains_of(scenario.start_law))
+        start = Setting.of(scenario.start_tolerance, gains_of(scenario.start_law))
         self.twin = twin or Twin(
             scenario.name, TwinModel.of(scenario.model, scenario.twin, start, estimator), self.store
         )

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
+from servotwin.control.laws import AnyController
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Floats
@@ -80,7 +80,7 @@ class SimulatedMachine:
         return self.simulation.run()
 
 
-def put_in_force(simulation: Simulation | UnboundedSimulation, law: Controller, setting: Setting) -> None:
+def put_in_force(simulation: Simulation | UnboundedSimulation, law: AnyController, setting: Setting) -> None:
     """Set the tolerance of a running simulation, and its gains where the setting has some; `law` has their limits."""
     if setting.gains is None:
         simulation.set_tolerance(setting.tolerance)

@@ -15,8 +15,8 @@ from servotwin.commissioning.edge_settings import Commissioning, Recording, chec
 from servotwin.config.keys import check, key
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import attribute, read
-from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
+from servotwin.control.laws import AnyController
 from servotwin.cosim.scenario_file import GAPS, OWN_UNITS, REFERENCES, gap_maker, read_parts
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
@@ -41,7 +41,7 @@ class Scenario:
     Parameters
     ----------
     servo : Servo or Axis
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         The servo's own by default.
     recording : Recording
         By default a window is 1 s long and begins with the change of the reference. A loop with little or no integral
@@ -82,7 +82,7 @@ class Scenario:
             help="Angle of the screw at the start; the motor starts at 0, so 0 is the middle of the backlash.",
         ),
     ] = 0.0
-    controller: Controller | None = None
+    controller: AnyController | None = None
     noise: Annotated[
         Noise | None, key(help="Noise on the measured position, which needs a sampled controller; none where absent.")
     ] = None
@@ -168,14 +168,19 @@ class Scenario:
         """Copy with another servo and its controller, changed as this scenario changes its servo's controller."""
         if self.controller is None:
             return self.replace(servo=servo)
-        own, default = dataclasses.asdict(self.controller), dataclasses.asdict(self.servo.pidf)
+        if type(self.controller) is not type(servo.controller):
+            return self.replace(servo=servo)
+        names = [each.name for each in dataclasses.fields(self.controller)]
+        own, default = (
+            {name: getattr(law, name) for name in names} for law in (self.controller, self.servo.controller)
+        )
         changes = {name: value for name, value in own.items() if value != default[name]}
-        return self.replace(servo=servo, controller=servo.pidf.replace(**changes))
+        return self.replace(servo=servo, controller=servo.controller.replace(**changes))
 
     @property
-    def law(self) -> Controller:
+    def law(self) -> AnyController:
         """The controller that runs."""
-        return self.servo.pidf if self.controller is None else self.controller
+        return self.servo.controller if self.controller is None else self.controller
 
     @property
     def model(self) -> Plant:
@@ -194,7 +199,7 @@ class Scenario:
         return self.commissioning.start
 
     @property
-    def start_law(self) -> Controller:
+    def start_law(self) -> AnyController:
         """The controller before the first update."""
         return with_gains(self.law, self.start.setting.gains)
 

@@ -14,11 +14,13 @@ from servotwin.config.table import Table, named, read_inner
 from servotwin.config.toml import changes, part, read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import read_gains
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
-from servotwin.messages import Gains
+from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.noise import Noise
 from servotwin.plant.own_units import own_controller
@@ -121,14 +123,14 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    law = own_controller(table, CONTROLLER, servo)
-    with named(law):
-        controller = _changed(law, servo.pidf)
-    law.done()
+    inner = own_controller(table, CONTROLLER, servo)
+    with named(inner):
+        controller = _changed(inner, servo.controller)
+    inner.done()
     edge = table.table(EDGE)
     edge.known(PROBE)
     probe = part(edge, PROBE, ProbeLimits) if PROBE in edge.values else None
-    supervision = _supervision(edge, controller or servo.pidf)
+    supervision = _supervision(edge, controller or servo.controller)
     edge.done()
     novelty = part(table, NOVELTY, NoveltyRules) if NOVELTY in table.values else None
     link = table.table(LINK)
@@ -146,13 +148,15 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     }
 
 
-def _changed(table: Table, controller: Controller) -> Controller | None:
+def _changed(table: Table, controller: AnyController) -> AnyController | None:
     """Read the changes of the servo's controller, keys as in a servo's file; None: there are none."""
-    changed = changes(table, Controller)
+    if isinstance(controller, LinearLaw):
+        return None
+    changed = changes(table, type(controller))
     return controller.replace(**changed) if changed else None
 
 
-def _supervision(edge: Table, controller: Controller) -> Supervision | None:
+def _supervision(edge: Table, controller: AnyController) -> Supervision | None:
     """Read [edge]: with it updates may set gains and the edge supervises the loop; without it they set the tolerance.
 
     Its table `probe` changes nothing of this.
@@ -160,7 +164,7 @@ def _supervision(edge: Table, controller: Controller) -> Supervision | None:
     if not edge.values.keys() - {PROBE}:
         return None
 
-    def gains(inner: Table) -> Gains:
+    def gains(inner: Table) -> AnyGains:
         return read_gains(inner, controller)
 
     with named(edge):

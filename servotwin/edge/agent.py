@@ -15,8 +15,8 @@ from dataclasses import replace
 from math import inf
 from typing import NamedTuple
 
-from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
+from servotwin.control.laws import AnyController
 from servotwin.edge.guard import Instant
 from servotwin.edge.outlet import CHANNELS, LocalOutlet, Outlet
 from servotwin.edge.parameters import Parameters
@@ -91,7 +91,7 @@ class Agent:
         return self._supervisor.parameters
 
     @property
-    def controller(self) -> Controller | None:
+    def controller(self) -> AnyController | None:
         """The controller with the gains in force; None where updates set the tolerance only."""
         configured = self.settings.controller
         return None if configured is None else with_gains(configured, self.parameters.setting.gains)
@@ -195,7 +195,7 @@ class Agent:
         """Make the message that introduces the edge: send it after a start or a reconnection."""
         s, p, law = self.settings, self.parameters, self.controller
         # The gains in force, which an earlier boot may have stored, and not the configured ones.
-        setting = Setting(p.setting.tolerance, None if law is None else gains_of(law))
+        setting = Setting.of(p.setting.tolerance, None if law is None else gains_of(law))
         return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
 
     def _stop(self, reference: "array[float]", done: int) -> int:

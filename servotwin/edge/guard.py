@@ -13,14 +13,10 @@ from dataclasses import dataclass
 from math import inf
 from typing import Annotated
 
-from msgspec.structs import replace
-
 from servotwin.config.keys import check, key, settings
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains, Reason, Receipt, Update
-
-_SCALED = ("Kp", "Ki", "Kd", "Tf")
+from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Reason, Receipt, Update
 
 
 @settings("limits")
@@ -65,7 +61,9 @@ class Limits:
             minimum=1.0,
             infinite=True,
             help="Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above. The "
-            "velocity feedforward answers a step of the reference by at most so many times the answer of the own Kp.",
+            "velocity feedforward answers a step of the reference by at most so many times the answer of the own Kp. "
+            "Of a cascade position_gain, velocity_gain and speed_filter stay within it, and the acceleration "
+            "feedforward from above; of a linear law its gain.",
         ),
     ] = 4.0
     integral_factor: Annotated[
@@ -74,7 +72,7 @@ class Limits:
             minimum=0.0,
             infinite=True,
             help="Largest Ki, as a multiple of the servo's own: integral action is what makes a loop with a gap cycle. "
-            "0: none.",
+            "0: none. Of a cascade velocity_gain / integral_time, of a linear law gain integral_share.",
         ),
     ] = 1.0
     gain_step: Annotated[
@@ -144,37 +142,59 @@ class Limits:
         """True where the tolerance (m) may change from old to new, `since` seconds after the last change."""
         return abs(new - old) <= self.max_step and (self.max_rate == inf or abs(new - old) <= self.max_rate * since)
 
-    def allows_gains(self, gains: Gains, own: Gains) -> bool:
-        """True where gains lie in the box around the servo's own."""
-        scaled = all(self._in_box(name, getattr(gains, name), getattr(own, name)) for name in _SCALED)
-        kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
-        voltages = max(abs(gains.feedforward), abs(gains.friction_feedforward))
-        fed = voltages <= self.feedforward and (kick or gains.velocity_feedforward == 0.0)
-        return scaled and gains.leave <= self.gain_factor * own.leave and fed and self._allows_notch(gains)
+    def allows_gains(self, gains: AnyGains, own: AnyGains) -> bool:
+        """True where gains lie in the box around the servo's own, which must be those of a law of the same kind."""
+        if type(gains) is not type(own):
+            return False
+        scaled = all(self._in_box(getattr(gains, name), getattr(own, name)) for name in gains.scaled)
+        integral = self._integral_in_box(getattr(gains, gains.integral), getattr(own, own.integral))
+        fed = max(abs(getattr(gains, name)) for name in gains.fed) <= self.feedforward
+        ahead = self._allows_motion(gains, own) and self._allows_notch(gains)
+        return scaled and integral and gains.leave <= self.gain_factor * own.leave and fed and ahead
 
-    def _allows_notch(self, gains: Gains) -> bool:
+    def _allows_motion(self, gains: AnyGains, own: AnyGains) -> bool:
+        """True where the feedforwards of the reference's motion are in bounds."""
+        if isinstance(gains, Gains) and isinstance(own, Gains):
+            kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
+            return kick or gains.velocity_feedforward == 0.0
+        if isinstance(gains, CascadeGains) and isinstance(own, CascadeGains):
+            # All of the reference's speed is fed forward by a share of one; more would overtake it.
+            speed = gains.velocity_feedforward <= max(1.0, own.velocity_feedforward)
+            return speed and gains.acceleration_feedforward <= self.gain_factor * own.acceleration_feedforward
+        return True
+
+    def _allows_notch(self, gains: AnyGains) -> bool:
+        if isinstance(gains, LinearGains):
+            return True
         within = self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
         return gains.notch_hz == 0.0 or (within and gains.notch_damping <= self.notch_damping)
 
-    def allows_gains_step(self, old: Gains, new: Gains, own: Gains, since: float) -> bool:
+    def allows_gains_step(self, old: AnyGains, new: AnyGains, own: AnyGains, since: float) -> bool:
         """True where gains may change from old to new, `since` seconds after the last change."""
         factor = self.gain_step if self.gain_rate == inf else min(self.gain_step, _power(self.gain_rate, since))
         if factor == inf:
             return True
         return all(
-            _in_step(name, getattr(old, name), getattr(new, name), abs(getattr(own, name)) / self.gain_factor, factor)
-            for name in _SCALED
+            _in_step(
+                getattr(old, name),
+                getattr(new, name),
+                abs(getattr(own, name)) / self.gain_factor,
+                factor,
+                falls_at_once=name == new.integral,
+            )
+            for name in (*new.scaled, new.integral)
         )
 
-    def _in_box(self, name: str, value: float, own: float) -> bool:
-        if name == "Ki":
-            return value * own >= 0.0 and abs(value) <= abs(own) * self.integral_factor
+    def _integral_in_box(self, value: float, own: float) -> bool:
+        return value * own >= 0.0 and abs(value) <= abs(own) * self.integral_factor
+
+    def _in_box(self, value: float, own: float) -> bool:
         return value * own >= 0.0 and abs(own) <= self.gain_factor * abs(value) <= self.gain_factor**2 * abs(own)
 
 
-def _in_step(name: str, old: float, new: float, smallest: float, factor: float) -> bool:
+def _in_step(old: float, new: float, smallest: float, factor: float, falls_at_once: bool) -> bool:
     rises_little = abs(new) <= factor * max(abs(old), smallest)
-    return rises_little and (name == "Ki" or abs(new) * factor >= abs(old))
+    return rises_little and (falls_at_once or abs(new) * factor >= abs(old))
 
 
 def _power(base: float, exponent: float) -> float:
@@ -208,11 +228,11 @@ def is_repeat(update: Update, current: Parameters, here: Instant) -> bool:
 def updated_parameters(update: Update, current: Parameters, sample: int) -> Parameters:
     """Make the parameters in force from `sample` on; an update without gains leaves the gains as they are."""
     gains = current.setting.gains if update.setting.gains is None else update.setting.gains
-    setting = replace(update.setting, gains=gains)
+    setting = update.setting.with_gains(gains)
     return Parameters(update.version, setting, update.data_time, update.window, sample, gap=update.gap)
 
 
-def judge(update: Update, current: Parameters, limits: Limits, here: Instant, own: Gains | None = None) -> Reason:
+def judge(update: Update, current: Parameters, limits: Limits, here: Instant, own: AnyGains | None = None) -> Reason:
     """Return the reason for which an update is refused, or `Reason.APPLIED`.
 
     Parameters
@@ -222,7 +242,7 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
         In force.
     limits : Limits
     here : Instant
-    own : Gains, optional
+    own : gains, optional
         The servo's own gains; None: the edge changes no gains.
     """
     samples = here.sample - current.sample
@@ -250,7 +270,7 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
     return Reason.NO_GAINS if own is None else _judge_gains(update.setting.gains, current, limits, own, since)
 
 
-def _judge_gains(gains: Gains, current: Parameters, limits: Limits, own: Gains, since: float) -> Reason:
+def _judge_gains(gains: AnyGains, current: Parameters, limits: Limits, own: AnyGains, since: float) -> Reason:
     if not limits.allows_gains(gains, own):
         return Reason.GAINS_OUT_OF_BOUNDS
     if not limits.allows_gains_step(current.setting.gains or own, gains, own, since):

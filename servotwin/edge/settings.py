@@ -6,14 +6,15 @@ from math import inf, isfinite
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
-from servotwin.control.controller import Controller
+from servotwin.control.cascade import Cascade
+from servotwin.control.laws import AnyController
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge.window_filter import WindowFilterSettings
 from servotwin.errors import InvalidInput
-from servotwin.messages import NAME_PATTERN, Gains
+from servotwin.messages import NAME_PATTERN, AnyGains
 from servotwin.runtime.retry import Retry
 
 
@@ -61,10 +62,10 @@ class AgentSettings:
         Name of the boot; a new one for each start of the edge.
     parameters : Parameters
         In force at the start.
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         As configured: what updates start from, and the limits and filters that they do not change. None: updates set
         the tolerance only.
-    own : Gains, optional
+    own : gains, optional
         The servo's own gains, in the middle of the box that updates must stay in; None: the controller's.
     supervision : Supervision
     window_filter : WindowFilterSettings, optional
@@ -100,8 +101,8 @@ class AgentSettings:
         ),
     ] = 0.0
     model_version: Annotated[str, key(help="Version of the servo's model, as `Servo.version`.")] = ""
-    controller: Controller | None = None
-    own: Gains | None = None
+    controller: AnyController | None = None
+    own: AnyGains | None = None
     supervision: Supervision = field(default_factory=Supervision)
     longest_window_s: Annotated[
         float | None,
@@ -130,11 +131,21 @@ class AgentSettings:
             allowed = f"must be below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
+        self._check_notch()
         if self.window_filter is not None:
             self.window_filter.check(self.sample_rate)
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.setting.gains is not None:
             raise InvalidInput("agent fallback has gains: the agent needs a controller to set them in")
+
+    def _check_notch(self) -> None:
+        """Check that no update may set a notch that the controller cannot have."""
+        law = self.controller
+        if not isinstance(law, Cascade) or law.sample_rate is None:
+            return
+        if not self.limits.notch_max_hz < 0.5 * law.sample_rate:
+            allowed = f"must be below half of the controller's {law.sample_rate!r} Hz"
+            raise InvalidInput(f"limits notch_max_hz = {self.limits.notch_max_hz!r} Hz: {allowed}")
 
     def _check_longest(self) -> None:
         """Check that the longest window and pre-trigger are at least the configured ones, and fit together."""

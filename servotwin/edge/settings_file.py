@@ -9,11 +9,12 @@ from servotwin.config.keys import key
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, read, values_of
 from servotwin.control.gains import written_gains
+from servotwin.control.laws import AnyController
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
-from servotwin.messages import Band, Gains, Setting
+from servotwin.messages import AnyGains, Band, Setting
 
-GainsReader = Callable[[Table], Gains | None]
+GainsReader = Callable[[Table], AnyGains | None]
 """Reads the gains that a table gives, with those of the running controller for the others; None: gains stay."""
 
 
@@ -30,7 +31,7 @@ def band_table(
 
 
 def setting_table(
-    gains: Gains | None = None,
+    gains: AnyGains | None = None,
     tolerance: Annotated[
         float, key("tolerance_mm", "tolerance_m", minimum=0.0, help="Half-width of the dead zone; 0: none.")
     ] = 0.0,
@@ -44,7 +45,7 @@ def setting_table(
     ] = None,
 ) -> Setting:
     """Dead zone, gains and band."""
-    return Setting(tolerance, gains, band)
+    return Setting.of(tolerance, gains, band)
 
 
 def gains_stay_table(
@@ -82,12 +83,12 @@ def _read_fallback(table: Table, gains: GainsReader) -> FallbackSet:
     return fallback
 
 
-def start_values(parameters: Parameters) -> Values:
+def start_values(parameters: Parameters, running: AnyController | None = None) -> Values:
     """Keys and values of [start]."""
-    return {**_setting_values(parameters.setting), **values_of(parameters, start_table)}
+    return {**_setting_values(parameters.setting, running), **values_of(parameters, start_table)}
 
 
-def supervision_values(supervision: Supervision) -> Values:
+def supervision_values(supervision: Supervision, running: AnyController | None = None) -> Values:
     """Keys and values of [supervision]."""
     fallback = supervision.fallback
     if fallback is None:
@@ -95,10 +96,10 @@ def supervision_values(supervision: Supervision) -> Values:
     stay: Values = {"gains_stay": True} if fallback.setting.gains is None else {}
     return {
         **values_of(supervision),
-        "fallback": {**_setting_values(fallback.setting), **stay, **values_of(fallback)},
+        "fallback": {**_setting_values(fallback.setting, running), **stay, **values_of(fallback)},
     }
 
 
-def _setting_values(setting: Setting) -> Values:
-    gains = {} if setting.gains is None else written_gains(setting.gains)
+def _setting_values(setting: Setting, running: AnyController | None) -> Values:
+    gains = {} if setting.gains is None else written_gains(setting.gains, running)
     return {**values_of(setting, setting_table), **gains}

@@ -21,17 +21,15 @@ from dataclasses import dataclass, replace
 from math import ceil, inf
 from typing import NamedTuple
 
-import msgspec
-
-from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
+from servotwin.control.laws import AnyController, law_of
 from servotwin.edge.guard import Instant, Limits, is_repeat, judge, receipt, updated_parameters
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.recorder import Recorder
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import ParameterStore
 from servotwin.edge.watch import Violation, Watch
-from servotwin.messages import Cause, Fallback, Gains, Reason, Receipt, Setting, Update
+from servotwin.messages import AnyGains, Cause, Fallback, Reason, Receipt, Setting, Update
 
 _MOST_DOUBLINGS = 6
 _REFUSE_AFTER_DRIVE_S = 10.0
@@ -45,18 +43,18 @@ class Rules:
     Parameters
     ----------
     limits : Limits
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Configured controller, with the limits that updates do not change. None: the edge knows no gains or thresholds.
-    own : Gains, optional
+    own : gains, optional
         The servo's own gains, in the middle of the box; None: the controller's.
     """
 
     limits: Limits
-    controller: Controller | None = None
-    own: Gains | None = None
+    controller: AnyController | None = None
+    own: AnyGains | None = None
 
     @property
-    def centre(self) -> Gains | None:
+    def centre(self) -> AnyGains | None:
         """Gains in the middle of the allowed box; None: no gains are accepted."""
         return self.own if self.own is not None or self.controller is None else gains_of(self.controller)
 
@@ -127,7 +125,7 @@ def apply_pending(state: Switch, rules: Rules, here: Instant, error: float | Non
 
 def fall_back(state: Switch, fallback: FallbackSet, violation: Violation, here: Instant) -> Transition:
     """Put the fallback set in force at the next sample, whatever the error is; refuse the pending update."""
-    setting = msgspec.structs.replace(fallback.setting, gains=fallback.setting.gains or state.current.setting.gains)
+    setting = fallback.setting.with_gains(fallback.setting.gains or state.current.setting.gains)
     # Data time now: updates from data recorded before the fallback are refused.
     new = Parameters(0, setting, here.time, fallback=True)
     return _replace(state, new, fallback.setting.gains, violation, fallback.refuse_s, here)
@@ -140,7 +138,7 @@ def restore(state: Switch, former: Parameters, here: Instant) -> Transition:
 
 
 def _replace(
-    state: Switch, new: Parameters, gains: Gains | None, violation: Violation, refuse_s: float, here: Instant
+    state: Switch, new: Parameters, gains: AnyGains | None, violation: Violation, refuse_s: float, here: Instant
 ) -> Transition:
     """Put other parameters in force at the next sample, under a new version, and refuse updates for a while."""
     old, pending = state.current, state.pending
@@ -149,19 +147,19 @@ def _replace(
     not_before = here.sample + round(refuse_s * 2.0 ** min(state.fallbacks, _MOST_DOUBLINGS) * here.rate)
     new = replace(new, version=version, sample=here.sample, not_before=not_before)
     message = Fallback(
-        here.servo, here.boot, here.sample, *violation, old.version, version, Setting(new.setting.tolerance, gains)
+        here.servo, here.boot, here.sample, *violation, old.version, version, Setting.of(new.setting.tolerance, gains)
     )
     refused = () if pending is None else (receipt(pending.update, Reason.AFTER_FALLBACK, here.sample, new, here),)
     return Transition(Switch(new, None, state.fallbacks + 1), (*refused, message))
 
 
-def is_safe(old: Parameters, new: Parameters, controller: Controller | None, error: float | None) -> bool:
+def is_safe(old: Parameters, new: Parameters, controller: AnyController | None, error: float | None) -> bool:
     """True where the change of the dead zone neither opens nor closes the loop (see the module).
 
     Parameters
     ----------
     old, new : Parameters
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Gives the thresholds; None: they are the tolerances.
     error : float, optional
         Last tracking error, m; None: there was no sample yet, so nothing can jump.
@@ -173,10 +171,10 @@ def is_safe(old: Parameters, new: Parameters, controller: Controller | None, err
     return abs(error) < low or abs(error) > high
 
 
-def _thresholds(parameters: Parameters, controller: Controller | None) -> tuple[float, float]:
+def _thresholds(parameters: Parameters, controller: AnyController | None) -> tuple[float, float]:
     if controller is None:
         return parameters.setting.tolerance, parameters.setting.tolerance
-    return with_gains(controller, parameters.setting.gains).thresholds(parameters.setting.tolerance)
+    return law_of(with_gains(controller, parameters.setting.gains)).thresholds(parameters.setting.tolerance)
 
 
 def _judge_with_pending(update: Update, state: Switch, rules: Rules, here: Instant) -> Reason:
@@ -292,7 +290,7 @@ class Supervisor:
         stored = None if self._store is None else self._store.load()
         first = self._settings.parameters if stored is None else stored
         if first.setting.gains is None and self._settings.controller is not None:
-            setting = msgspec.structs.replace(first.setting, gains=gains_of(self._settings.controller))
+            setting = first.setting.with_gains(gains_of(self._settings.controller))
             return replace(first, setting=setting)
         return first
 

@@ -11,8 +11,8 @@ from urllib.parse import urlsplit
 
 from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table
-from servotwin.control.controller import Controller
-from servotwin.control.law import LawParameters
+from servotwin.control.laws import AnyController
+from servotwin.control.running_law import RunningLaw
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import is_mqtt
@@ -113,7 +113,7 @@ class EdgeConfig:
     ----------
     agent : AgentSettings
         Settings for a boot without name; its `controller` is set where updates may set gains.
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Configured controller; required in the role control, and where updates may set gains. Its rate is that of the
         samples.
     drive : mapping of str to TOML value
@@ -129,7 +129,7 @@ class EdgeConfig:
         str,
         key(choices=ROLES, help="control: the edge ticks the law; supervise: the drive has a controller of its own."),
     ]
-    controller: Controller | None
+    controller: AnyController | None
     drive: Mapping[str, object]
     twin: Annotated[
         TwinLink | None, key(help="Address of the twin; where absent the edge runs without one and stores its windows.")
@@ -180,11 +180,11 @@ class EdgeConfig:
         """Settings of the agent for one boot."""
         return replace(self.agent, boot=boot)
 
-    def law(self, controller: Controller | None, tolerance: float) -> LawParameters:
+    def law(self, controller: AnyController | None, tolerance: float) -> RunningLaw:
         """Discretise a controller (None: the configured one) with a tolerance (m)."""
         chosen = controller or self.controller
         assert chosen is not None, "the role control needs a controller"
-        return chosen.law(tolerance)
+        return RunningLaw(chosen, tolerance)
 
 
 def token_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.environ) -> str:

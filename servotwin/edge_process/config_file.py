@@ -10,9 +10,10 @@ from typing import Annotated
 
 from servotwin.config.keys import key
 from servotwin.config.table import Table, named, read_toml
-from servotwin.config.toml import Values, attribute, dumps, part, read, values_of
-from servotwin.control.controller import Controller
+from servotwin.config.toml import Values, attribute, dumps, kind_of, part, read, values_of
+from servotwin.control.cascade import Cascade
 from servotwin.control.gains import has_gains, read_gains, written_gains
+from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, AnyController
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.settings_file import (
     gains_stay_table,
@@ -22,7 +23,7 @@ from servotwin.edge.settings_file import (
     supervision_values,
 )
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
-from servotwin.messages import Gains
+from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltySettings
 
 
@@ -59,23 +60,26 @@ def update_gains_table(
     return update_gains
 
 
-def _controller(table: Table) -> Controller:
-    """Read the controller; its sample rate is the recording's by default."""
-    controller: Controller = part(table, "controller", Controller)
+def _controller(table: Table) -> AnyController:
+    """Read the controller, a filtered PID or what its `kind` says; its sample rate is the recording's by default."""
+    inner = table.table("controller")
+    inner.known("kind")
+    controller: AnyController = read(inner, CONTROLLERS[kind_of(inner, CONTROLLERS, FILTERED_PID)])
+    inner.done()
     if controller.sample_rate is not None:
         return controller
     return controller.replace(sample_rate=attribute(table, AgentSettings, "sample_rate"))
 
 
-def _agent(table: Table, controller: Controller | None) -> AgentSettings:
+def _agent(table: Table, controller: AnyController | None) -> AgentSettings:
     settable = controller if read(table, update_gains_table) else None
 
-    def gains(inner: Table) -> Gains | None:
+    def gains(inner: Table) -> AnyGains | None:
         stay = read(inner, gains_stay_table)
         return None if stay or settable is None else read_gains(inner, settable)
 
-    def start_gains(inner: Table) -> Gains | None:
-        return read_gains(inner, settable) if has_gains(inner) and settable is not None else None
+    def start_gains(inner: Table) -> AnyGains | None:
+        return read_gains(inner, settable) if settable is not None and has_gains(inner, type(settable)) else None
 
     start, supervision = table.table("start"), table.table("supervision")
     agent: AgentSettings = read(
@@ -93,7 +97,7 @@ def _agent(table: Table, controller: Controller | None) -> AgentSettings:
     return agent
 
 
-def _own(table: Table, gains: Callable[[Table], Gains | None]) -> Gains | None:
+def _own(table: Table, gains: Callable[[Table], AnyGains | None]) -> AnyGains | None:
     own = gains(table)
     table.done()
     return own
@@ -113,13 +117,14 @@ def edge_toml(config: EdgeConfig) -> str:
         **values_of(config),
         "update_gains": agent.controller is not None,
         "drive": dict(config.drive),
-        "start": start_values(agent.parameters),
-        "supervision": supervision_values(agent.supervision),
+        "start": start_values(agent.parameters, agent.controller),
+        "supervision": supervision_values(agent.supervision, agent.controller),
     }
     if config.controller is not None:
-        values["controller"] = values_of(config.controller)
+        kind = {"kind": CASCADE} if isinstance(config.controller, Cascade) else {}
+        values["controller"] = {**kind, **values_of(config.controller)}
     if agent.own is not None:
-        values["own"] = written_gains(agent.own)
+        values["own"] = written_gains(agent.own, agent.controller)
     if isinstance(agent.window_filter, NoveltySettings):
         values["novelty"] = values_of(agent.window_filter)
     return dumps(values)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import isfinite
 
-from servotwin.control.law import LawParameters, LawState, start, tick, transfer
+from servotwin.control.running_law import RunningLaw, RunningState, command_of, is_finite
 from servotwin.edge.drive import ControlDrive, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process.edge import EdgeRuntime
@@ -18,35 +18,40 @@ class GuardedLaw:
 
     Parameters
     ----------
-    law : LawParameters
+    law : RunningLaw
     hold : int
         Number of bad samples in a row during which the last voltage is held.
     safe : float
         V.
     """
 
-    def __init__(self, law: LawParameters, hold: int, safe: float) -> None:
+    def __init__(self, law: RunningLaw, hold: int, safe: float) -> None:
         self.law = law
-        self.state: LawState | None = None
+        self.state: RunningState | None = None
         self.bad = 0
         self._hold, self._safe, self.voltage = hold, safe, safe
 
-    def change(self, law: LawParameters, reference: float, position: float) -> None:
+    def change(self, law: RunningLaw, reference: float, theta_m: float, position: float) -> None:
         """Change the law from the next tick on; the voltage does not jump."""
         if self.state is not None:
-            self.state = transfer(self.law, law, self.state, reference, position)
+            self.state = law.take_over(self.law, self.state, reference, theta_m, position)
         self.law = law
 
-    def tick(self, reference: float, position: float) -> float:
-        """Return the voltage (V) for a sample (m, m)."""
-        if not isfinite(reference + position):
+    def is_good(self, theta_m: float, position: float) -> bool:
+        """True for a sample on which the law can act: what it reads is finite."""
+        return isfinite(position if self.law.reads_load_only else theta_m + position)
+
+    def tick(self, reference: float, theta_m: float, position: float) -> float:
+        """Return the voltage (V) for a sample (m, rad, m)."""
+        if not (isfinite(reference) and self.is_good(theta_m, position)):
             return self._bad_sample()
-        state = tick(self.law, start(position) if self.state is None else self.state, reference, position)
-        if not isfinite(state.voltage + state.integral + state.derivative):
+        before = self.law.start(theta_m, position) if self.state is None else self.state
+        state = self.law.tick(before, reference, theta_m, position)
+        if not is_finite(state):
             self.state, self.voltage = None, self._safe
             return self._safe
-        self.bad, self.state, self.voltage = 0, state, state.voltage
-        return state.voltage
+        self.bad, self.state, self.voltage = 0, state, command_of(state)
+        return self.voltage
 
     def _bad_sample(self) -> float:
         self.bad += 1
@@ -106,9 +111,9 @@ class ControlRole:
             self._reference = sample.reference  # the last one holds where this one is bad
         reference = self._reference + agent.offset
         # The transfer between two laws needs the measurement of this tick, so it waits for a good sample.
-        if agent.parameters is not self._applied and isfinite(sample.position):
-            self._apply(agent.parameters, reference, sample.position)
-        voltage = self.law.tick(reference, sample.position)
+        if agent.parameters is not self._applied and self.law.is_good(sample.theta_m, sample.position):
+            self._apply(agent.parameters, reference, sample)
+        voltage = self.law.tick(reference, sample.theta_m, sample.position)
         # Before anything is recorded or sent: the voltage must not wait for that.
         self._drive.write(voltage)
         if not isfinite(sample.reference + sample.theta_m + sample.position):
@@ -125,11 +130,11 @@ class ControlRole:
             missing = number - self._edge.due if same else -1
             self._edge.skip(missing, self._reference + self._edge.agent.offset, self.law.voltage)
 
-    def _apply(self, parameters: Parameters, reference: float, position: float) -> None:
+    def _apply(self, parameters: Parameters, reference: float, sample: DriveSample) -> None:
         """Change the law to these parameters, unless it has them already, as after a new boot."""
         self._applied, law = parameters, self._law(parameters)
         if law != self.law.law:
-            self.law.change(law, reference, position)
+            self.law.change(law, reference, sample.theta_m, sample.position)
 
-    def _law(self, parameters: Parameters) -> LawParameters:
+    def _law(self, parameters: Parameters) -> RunningLaw:
         return self._edge.config.law(self._edge.agent.controller, parameters.setting.tolerance)

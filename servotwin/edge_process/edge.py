@@ -9,7 +9,11 @@ from dataclasses import replace
 from math import nan
 from typing import Protocol
 
+import msgspec
+
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.control.laws import AnyController
 from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.store import StoredParameters
@@ -197,10 +201,12 @@ class EdgeRuntime:
         return StatusFrame(agent.settings.boot, agent.samples, values, dict(self._outlet.lost), self.ticks.dumps())
 
 
-def _gains(law: Controller | None) -> dict[str, Value]:
+def _gains(law: AnyController | None) -> dict[str, Value]:
     """Gains of the controller in force, for the status; empty where the drive's own controller is not known."""
     if law is None:
         return {}
+    if not isinstance(law, Controller):
+        return {name: float(value) for name, value in msgspec.structs.asdict(gains_of(law)).items()}
     return {
         "kp_v_per_m": law.Kp,
         "ki_v_per_m_s": law.Ki,

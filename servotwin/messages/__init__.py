@@ -11,7 +11,7 @@ from servotwin.messages.claims import PROTOCOL, EdgeClaim, Standing
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
-from servotwin.messages.setting import Band, Gains, Setting
+from servotwin.messages.setting import AnyGains, Band, CascadeGains, Gains, LinearGains, Setting
 from servotwin.messages.updates import Cause, Fallback, Reason, Receipt, Update, Verification
 from servotwin.messages.windows import (
     FINE,
@@ -33,8 +33,10 @@ __all__ = [
     "PROTOCOL",
     "Acknowledge",
     "Answer",
+    "AnyGains",
     "Ask",
     "Band",
+    "CascadeGains",
     "Cause",
     "Channel",
     "EdgeClaim",
@@ -44,6 +46,7 @@ __all__ = [
     "InvalidMessage",
     "LearntResponse",
     "LetterAcknowledge",
+    "LinearGains",
     "LongerWindow",
     "Message",
     "ParameterMessage",

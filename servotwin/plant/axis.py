@@ -22,7 +22,7 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, ShaftMatrices, static_torque
-from servotwin.plant.axis_file import Parts, read_parts, values_of_parts
+from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
 from servotwin.plant.basis import Guide, Play, Stribeck
 from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
 from servotwin.plant.law_loop import LawLoop, check_encoders
@@ -38,15 +38,8 @@ from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
 AXES = (
-    "two-mass-drive",
-    "ball-screw",
-    "robot-joint",
-    "telescope",
-    "stepper-stage",
-    "micro-positioner",
-    "gantry",
-    "emps",
-)
+    "two-mass-drive", "ball-screw", "robot-joint", "telescope", "stepper-stage", "micro-positioner", "gantry", "emps",
+)  # fmt: skip
 """Names of the presets of axes."""
 
 
@@ -358,10 +351,16 @@ class Axis:
         shaft = self.actuator.polynomials()
         return loop.axis_system(self.shaft(), shaft, self._structure, self.p, self.at_motor)
 
+    def plants(self) -> tuple[LinearSystem, LinearSystem]:
+        """Command to the motor's angle and to the load's position, without a gap, with the same states."""
+        shaft, polynomials = self.shaft(), self.actuator.polynomials()
+        load = loop.axis_system(shaft, polynomials, self._structure, self.p, at_motor=False)
+        row, unknown = np.eye(load.B.size)[len(shaft.names) - 1], np.array([math.nan])
+        return replace(load, C=row, numerator=unknown, denominator=unknown), load
+
     def _law_loop(self, law: LinearLaw) -> LawLoop:
         check_encoders(self, law)
-        load = loop.axis_system(self.shaft(), self.actuator.polynomials(), self._structure, self.p, at_motor=False)
-        return LawLoop(replace(load, C=np.eye(load.B.size)[len(self.shaft().names) - 1]), load, law)
+        return LawLoop(*self.plants(), law)
 
     def loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""
@@ -390,7 +389,9 @@ class Axis:
         """
         law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
-            self._law_loop(law).check("axis")
+            self._law_loop(law).check(
+                described_law(controller or self.controller, self.actuator.unit, self.load.motion)
+            )
             return
         if self.rigid and self.at_motor:
             check_damped(self.load, self.chain())

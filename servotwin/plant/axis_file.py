@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, NamedTuple
 
@@ -13,6 +13,8 @@ from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
 from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
+from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, AnyController
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
 from servotwin.plant.load import LINEAR, ROTARY, Load
@@ -127,8 +129,6 @@ def rotary_load(
     return Load(m, k, c, ROTARY, friction, force, static, stribeck)
 
 
-FILTERED_PID, CASCADE = "filtered_pid", "cascade"
-CONTROLLERS: dict[str, type] = {FILTERED_PID: Controller, CASCADE: Cascade}
 TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
 LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
@@ -208,6 +208,24 @@ def controller_keys(unit: str, motion: str, described: type = Controller) -> Map
     return names
 
 
+def file_values(
+    controller: Controller | Cascade, unit: str, motion: str, only: Collection[str] | None = None
+) -> Values:
+    """Keys and values of a controller, as the file of an axis has them; `only` of some attributes."""
+    shown = {name: key for key, name in controller_keys(unit, motion, type(controller)).items()}
+    return {shown.get(name, name): value for name, value in values_of(controller, only=only).items()}
+
+
+def described_law(controller: AnyController, unit: str, motion: str) -> str:
+    """Kind, keys and values of a controller that are not their defaults, as the file of an axis has them."""
+    if isinstance(controller, LinearLaw):
+        return repr(controller)
+    names = [item.name for item in items_of(type(controller)) if getattr(controller, item.name) != item.default]
+    values = file_values(controller, unit, motion, names)
+    kind = CASCADE if isinstance(controller, Cascade) else FILTERED_PID
+    return f"{kind} ({', '.join(f'{key} = {value!r}' for key, value in values.items())})"
+
+
 def _keys_with_units(described: type) -> list[str]:
     """Keys of a controller whose units contain volts or metres."""
     names = [item.exact_name for item in items_of(described)]
@@ -228,9 +246,8 @@ def values_of_parts(axis: Parts) -> Values:
     kind = next(kind for kind, moves in _MOTIONS.items() if moves == motion)
     actuator = next(name for name, maker in ACTUATORS.items() if isinstance(axis.actuator, maker))
     law = type(axis.controller)
-    keys = {name: shown for shown, name in controller_keys(axis.actuator.unit, motion, law).items()}
-    named = {} if law is Controller else {"kind": CASCADE}
-    controller = named | {keys.get(name, name): value for name, value in values_of(axis.controller).items()}
+    named: Values = {} if law is Controller else {"kind": CASCADE}
+    controller = named | file_values(axis.controller, axis.actuator.unit, motion)
     return {
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
         "transmission": {"kind": kind, **_transmission_values(axis.transmission, kind)},

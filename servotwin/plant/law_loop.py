@@ -41,7 +41,7 @@ def ticked_law(law: LinearLaw) -> LawMatrices:
     InvalidInput
         The law is continuous.
     """
-    parameters = law.replace(limit=None, rate_limit=None, feedforward=0.0).parameters()
+    parameters = law.replace(voltage_limit=None, rate_limit=None, feedforward=0.0).parameters()
     size = len(parameters.output) // 2 - len(_INPUTS)
     still = LinearState((0.0,) * size, 0.0, 1.0, 0.0)
     starts = [still._replace(states=tuple(row)) for row in np.eye(size).tolist()]
@@ -58,6 +58,16 @@ def law_matrices(law: LinearLaw) -> LawMatrices:
     return LawMatrices(
         np.array(law.A).reshape(n, n), np.array(law.B).reshape(n, len(_INPUTS)), np.array(law.C), np.array(law.D)
     )
+
+
+def law_response(law: LinearLaw, omega: float) -> Complex:
+    """(3,) response of the command to reference, y_motor and y_load at one frequency, rad/s."""
+    if law.sample_rate is None:
+        matrices, point = law_matrices(law), 1j * omega
+    else:
+        matrices, point = ticked_law(law), np.exp(1j * omega / law.sample_rate)
+    A, B, C, D = matrices
+    return np.asarray(C @ np.linalg.solve(point * np.eye(len(A)) - A, B.astype(complex)) + D)
 
 
 @dataclass(frozen=True, eq=False)
@@ -182,7 +192,7 @@ class LawLoop:
         )
 
     def check(self, described: str) -> None:
-        """Refuse a law that does not stabilise the plant, at its sample rate if it has one.
+        """Refuse a law, as described, that does not stabilise the plant, at its sample rate if it has one.
 
         Raises
         ------
@@ -192,7 +202,7 @@ class LawLoop:
         worst = self.slowest_pole()
         if not worst.real < 0.0:
             raise InvalidInput(
-                f"the controller {self.law!r} is unstable on this {described} even without a gap: its closed loop has "
+                f"the controller {described} is unstable on this axis even without a gap: its closed loop has "
                 f"a pole at {worst.real:.3g}{worst.imag:+.3g}j 1/s, and every pole must have a negative real part"
             )
 

@@ -63,7 +63,7 @@ def linear_parts(servo: Plant, law: LinearLaw, shape: Shape) -> LoopParts:
 def _names(servo: Plant, law: LinearLaw, shape: Shape) -> list[str]:
     names = plant_names(servo) + [law_state(name) for name in law.names]
     names += [name for key in INPUTS for name in input_names(key, getattr(shape, key))]
-    names += ["voltage limit"] if law.limit is not None else []
+    names += ["voltage limit"] if law.voltage_limit is not None else []
     names += ["noise"] if shape.noise else []
     names += [name for name in ("feedforward", "offset") if getattr(shape, name)]
     return names + constants(servo, shape.bias, shape.friction)

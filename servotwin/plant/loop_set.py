@@ -16,7 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController, filtered_pid
+from servotwin.control.retuning import integrates
 from servotwin.hybrid.exponential import expm1
 from servotwin.plant.frequency_curves import distances, encirclements, least_values, squares
 from servotwin.plant.linear import Complex, LinearSystem
@@ -92,13 +93,18 @@ class PlantSet:
         return PlantSet(A, B, C, rate)
 
     @property
+    def count(self) -> int:
+        """Number of plants."""
+        return len(self.A)
+
+    @property
     def omega(self) -> Array:
         """(P, F) rad/s, ascending: frequencies that resolve the poles of each plant."""
         return self._grid.omega
 
     @cached_property
     def _grid(self) -> FrequencyGrid:
-        poles = self._frequencies(_eigenvalues(self.A))
+        poles = self.frequencies(eigenvalues(self.A))
         sizes = np.abs(poles)
         # The integrator's pole is zero only to within rounding.
         real = sizes > _ZERO * sizes.max(axis=1, keepdims=True)
@@ -106,7 +112,7 @@ class PlantSet:
         high = high if self.rate is None else math.pi * self.rate
         low = min(low, 1e-3 * high)
         common = np.geomspace(low, high, int(_PER_DECADE * math.log10(high / low)) + 2)
-        about = np.clip(_about(poles), low, high)
+        about = np.clip(about_poles(poles), low, high)
         both = np.concatenate([np.broadcast_to(common, (len(poles), common.size)), about], axis=1)
         order = np.argsort(both, axis=1, kind="stable")
         omega = np.take_along_axis(both, order, axis=1)
@@ -133,15 +139,16 @@ class PlantSet:
             return np.asarray(1j * omega, dtype=np.complex128)
         return np.asarray(self.rate * np.expm1(1j * np.asarray(omega) / self.rate), dtype=np.complex128)
 
-    def loop(self, law: Controller, delay: int, omega: Array) -> Complex:
+    def loop(self, law: AnyController, delay: int, omega: Array) -> Complex:
         """(P, K) response of the open loop at (P, K) frequencies, rad/s."""
         return np.asarray(self.at(omega) * self._law_response(law, delay, omega))
 
     @cached_property
-    def _law(self) -> Callable[[Controller], LawForms]:
+    def _law(self) -> Callable[[AnyController], LawForms]:
         return lru_cache(maxsize=8)(self._forms_of)
 
-    def _forms_of(self, law: Controller) -> LawForms:
+    def _forms_of(self, law: AnyController) -> LawForms:
+        law = filtered_pid(law)
         A, B, C, D = continuous_law(law) if self.rate is None else sampled_law(law)
         if self.rate is not None:
             A, B = self.rate * (A - np.eye(len(A))), self.rate * B
@@ -151,46 +158,46 @@ class PlantSet:
         return LawForms(StateMatrices(A, B, C, D), forms)
 
     @cached_property
-    def _stored(self) -> dict[tuple[str, Controller | None, int], NDArray[Any]]:
+    def _stored(self) -> dict[tuple[str, AnyController | None, int], NDArray[Any]]:
         """Results that are asked for more than once."""
         return {}
 
-    def _once(self, name: str, law: Controller | None, delay: int, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+    def _once(self, name: str, law: AnyController | None, delay: int, make: Callable[[], NDArray[Any]]) -> NDArray[Any]:
         key = name, law, delay
         if key not in self._stored:
             self._stored[key] = make()
         return self._stored[key]
 
-    def _returned(self, law: Controller, delay: int) -> Complex:
+    def _returned(self, law: AnyController, delay: int) -> Complex:
         """(P, F) return difference 1 + L at `omega`."""
         loop = self.response * self._law_on_grid(law)
         if delay:
-            loop *= self._once("late", None, delay, lambda: self._late(delay, self.omega))
+            loop *= self._once("late", None, delay, lambda: self.late(delay, self.omega))
         loop += 1.0
         return np.asarray(loop)
 
     @cached_property
-    def _law_on_grid(self) -> Callable[[Controller], Complex]:
+    def _law_on_grid(self) -> Callable[[AnyController], Complex]:
         # One law is asked for with several delays, and never again.
         return lru_cache(maxsize=1)(self._at_grid)
 
-    def _at_grid(self, law: Controller) -> Complex:
+    def _at_grid(self, law: AnyController) -> Complex:
         grid, (matrices, forms) = self._grid, self._law(law)
         # The frequencies that all plants share are most of them.
         common = _response(forms, matrices.D, grid.common[None])
         about = _response(forms, matrices.D, grid.about.reshape(1, -1)).reshape(grid.about.shape)
         return grid.sorted(np.broadcast_to(common, (len(self.A), common.shape[1])), about)
 
-    def peaks(self, law: Controller, delay: int = 0) -> Array:
+    def peaks(self, law: AnyController, delay: int = 0) -> Array:
         """(P,) sensitivity peaks on the stored frequencies: at most what `margins` finds, and much cheaper."""
         return self._once("peak", law, delay, lambda: 1.0 / np.sqrt(squares(self._returned(law, delay)).min(axis=1)))
 
-    def stable(self, law: Controller, delay: int = 0) -> NDArray[np.bool_]:
+    def stable(self, law: AnyController, delay: int = 0) -> NDArray[np.bool_]:
         """(P,) stability of the closed loop, from the turns of 1 + L about zero (Nyquist); by its poles where a plant's
         frequencies do not resolve them."""
         if ("decay", law, delay) in self._stored:
             return np.asarray(self.decays(law, delay) > 0.0)
-        integrators = self._grid.integrators + (law.Ki != 0.0)
+        integrators = self._grid.integrators + integrates(law)
         circled, resolved = encirclements(self._returned(law, delay), integrators)
         stable = circled == 0
         if not resolved.all():
@@ -198,14 +205,14 @@ class PlantSet:
             stable[~resolved] = few.decays(law, delay) > 0.0
         return np.asarray(stable)
 
-    def decays(self, law: Controller, delay: int = 0) -> Array:
+    def decays(self, law: AnyController, delay: int = 0) -> Array:
         """(P,) 1/s, rate at which the slowest closed-loop mode decays; negative: it grows."""
         return self._once("decay", law, delay, lambda: self._decays(law, delay))
 
-    def _decays(self, law: Controller, delay: int) -> Array:
-        return np.asarray(-self._frequencies(_eigenvalues(self._closed(law, delay))).real.max(axis=1))
+    def _decays(self, law: AnyController, delay: int) -> Array:
+        return np.asarray(-self.frequencies(eigenvalues(self._closed(law, delay))).real.max(axis=1))
 
-    def margins(self, law: Controller, delay: int = 0) -> SetMargins:
+    def margins(self, law: AnyController, delay: int = 0) -> SetMargins:
         """Margins of the loop with a law.
 
         Parameters
@@ -215,28 +222,23 @@ class PlantSet:
         delay : int
             Whole samples between a measurement and its voltage; 0 for a continuous law.
         """
-        poles = _eigenvalues(self._closed(law, delay))
-        growth = self._frequencies(poles).real.max(axis=1)
+        poles = eigenvalues(self._closed(law, delay))
+        growth = self.frequencies(poles).real.max(axis=1)
         # Closed-loop resonances are not those of the plant alone.
-        extra = _about(self._frequencies(poles))
+        extra = about_poles(self.frequencies(poles))
         extra = np.clip(extra, self.omega[:, :1], self.omega[:, -1:])
         omega = np.concatenate([self.omega, extra], axis=1)
         order = np.argsort(omega, axis=1, kind="stable")
         omega = np.take_along_axis(omega, order, axis=1)
         plant = np.take_along_axis(np.concatenate([self.response, self.at(extra)], axis=1), order, axis=1)
         loop = plant * self._law_response(law, delay, omega)
-        stable = growth < 0.0
 
         def value(omega: Array) -> Complex:
             return self.loop(law, delay, omega)
 
-        gain, phase, late = distances(omega, loop, value)
-        closest = least_values(omega, np.abs(1.0 + loop), lambda w: np.abs(1.0 + value(w)))
-        peak = np.where(stable, 1.0 / closest, np.inf)
-        passivity = 1.0 + least_values(omega, loop.real, lambda w: value(w).real)
-        return SetMargins(stable, peak, gain, phase, late, -growth, passivity)
+        return margins_of_responses(omega, loop, value, growth)
 
-    def _frequencies(self, poles: Complex) -> Complex:
+    def frequencies(self, poles: Complex) -> Complex:
         """Poles in 1/s."""
         if self.rate is None:
             return np.asarray(poles)
@@ -245,27 +247,35 @@ class PlantSet:
         # A pole z = 0 decays at once; the clip keeps its infinity out of the arithmetic.
         return np.asarray(self.rate * (np.maximum(logarithm.real, -_AT_ONCE) + 1j * logarithm.imag))
 
-    def _law_response(self, law: Controller, delay: int, omega: Array) -> Complex:
+    def _law_response(self, law: AnyController, delay: int, omega: Array) -> Complex:
         """Response of law and delay from measurement to minus the voltage."""
         matrices, forms = self._law(law)
         value = _response(forms, matrices.D, self.points(omega).reshape(1, -1)).reshape(omega.shape)
-        return value if delay == 0 else np.asarray(value * self._late(delay, omega))
+        return value if delay == 0 else np.asarray(value * self.late(delay, omega))
 
-    def _late(self, delay: int, omega: Array) -> Complex:
+    def late(self, delay: int, omega: Array) -> Complex:
         """Response of a delay of so many samples."""
         assert self.rate is not None
         return np.asarray(np.exp(-1j * delay * omega / self.rate))
 
-    def _closed(self, law: Controller, delay: int) -> Array:
+    def _closed(self, law: AnyController, delay: int) -> Array:
         """(P, N, N) closed loop of plant, law and delayed voltages; the delta operator's where there is a rate."""
         A, B, C, D = self._law(law).matrices
+        return self.closed_by(A, B[:, None] * self.C[:, None, :], -D * self.C, -C, delay)
+
+    def closed_by(self, A: Array, inputs: Array, direct: Array, C: Array, delay: int) -> Array:
+        """(P, N, N) loop closed by a law of k states.
+
+        Its states advance by A and `inputs` (P, k, n) times the plant's states; the command is `direct` (P, n) times
+        the plant's states and C times its own.
+        """
         n, k = self.B.shape[1], len(A)
         closed = np.zeros((len(self.A), n + k + delay, n + k + delay))
         closed[:, :n, :n] = self.A
         closed[:, n : n + k, n : n + k] = A
-        closed[:, n : n + k, :n] = B[:, None] * self.C[:, None, :]
+        closed[:, n : n + k, :n] = inputs
         output = np.zeros((len(self.A), n + k + delay))
-        output[:, :n], output[:, n : n + k] = -D * self.C, -C
+        output[:, :n], output[:, n : n + k] = direct, C
         if delay == 0:
             closed[:, :n] += self.B[:, :, None] * output[:, None, :]
             return closed
@@ -277,6 +287,19 @@ class PlantSet:
         closed[:, line[1:], line[:-1]] = self.rate
         closed[:, line[0]] += self.rate * output
         return closed
+
+
+def margins_of_responses(omega: Array, loop: Complex, value: Callable[[Array], Complex], growth: Array) -> SetMargins:
+    """Margins of loops from their (P, F) responses at (P, F) frequencies, and of their slowest modes' growth, 1/s.
+
+    `value` gives the responses at other (P, K) frequencies.
+    """
+    stable = growth < 0.0
+    gain, phase, late = distances(omega, loop, value)
+    closest = least_values(omega, np.abs(1.0 + loop), lambda w: np.abs(1.0 + value(w)))
+    peak = np.where(stable, 1.0 / closest, np.inf)
+    passivity = 1.0 + least_values(omega, loop.real, lambda w: value(w).real)
+    return SetMargins(stable, peak, gain, phase, late, -growth, passivity)
 
 
 class FrequencyGrid(NamedTuple):
@@ -346,11 +369,17 @@ def _response(forms: SchurForms, direct: float, points: Complex) -> Complex:
     return value
 
 
-def _eigenvalues(matrices: Array) -> Complex:
+def response_of(A: Array, B: Array, C: Array, D: float, points: Complex) -> Complex:
+    """(1, K) response of one system of a single input at (1, K) points."""
+    return _response(_schur_forms(A[None], B[None], C[None]), D, points)
+
+
+def eigenvalues(matrices: Array) -> Complex:
+    """(P, N) eigenvalues of (P, N, N) matrices."""
     return np.asarray(np.linalg.eigvals(matrices), dtype=np.complex128)
 
 
-def _about(poles: Complex) -> Array:
+def about_poles(poles: Complex) -> Array:
     """(P, K) rad/s: frequencies about poles (1/s)."""
     poles = np.where(np.isfinite(poles), poles, 0.0)
     width = np.maximum(np.abs(poles.real), _NARROWEST * np.abs(poles))

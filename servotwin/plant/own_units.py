@@ -8,6 +8,7 @@ from typing import Any
 from servotwin.config.keys import Maker, items_of
 from servotwin.config.table import Table
 from servotwin.config.units import unit_of
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.axis_file import controller_keys
@@ -58,9 +59,9 @@ def own_controller(table: Table, name: str, plant: Plant) -> Table:
         A key has another unit.
     """
     inner = table.table(name)
-    if not isinstance(plant, Axis):
+    if not isinstance(plant, Axis) or isinstance(plant.controller, LinearLaw):
         return inner
-    return inner.renamed(controller_keys(plant.actuator.unit, plant.load.motion))
+    return inner.renamed(controller_keys(plant.actuator.unit, plant.load.motion, type(plant.controller)))
 
 
 def _inner(values: Mapping[str, Any], path: str) -> Mapping[str, Any]:

@@ -19,6 +19,7 @@ from servotwin.config.keys import check, items_of, key, settings
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps, read, values_of
 from servotwin.control.controller import Controller, ControllerChanges
+from servotwin.control.laws import AnyController, filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import ShaftMatrices
@@ -62,7 +63,7 @@ class ServoChanges(ControllerChanges, total=False):
     R: float
     k_T: float
     k_B: float
-    controller: Controller
+    controller: AnyController
     n: int
     k_d: float
     encoder_resolution: float
@@ -367,7 +368,7 @@ class Servo:
         """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
         return margins(self.loop(controller), self.closed_loop(controller))
 
-    def check_loop(self, controller: Controller | None = None) -> None:
+    def check_loop(self, controller: AnyController | None = None) -> None:
         """Refuse a controller that does not stabilise the servo even without a gap, at its sample rate if it has one.
 
         Raises
@@ -375,7 +376,7 @@ class Servo:
         InvalidInput
             With the fastest growing pole.
         """
-        loop.check_stable(self.plant(), controller or self.controller, "servo")
+        loop.check_stable(self.plant(), filtered_pid(controller or self.controller), "servo")
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""

@@ -94,5 +94,5 @@ class HysteresisPolicy:
         if evidence.unusable:
             return Redesign(None, math.nan, evidence.unusable)
         estimate = evidence.estimate
-        law = self.servo.pidf.replace(enter=self.enter, leave=self.leave)
-        return Redesign(Setting(self.servo.p * estimate.gap, gains_of(law)), estimate.gap, "")
+        law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
+        return Redesign(Setting.of(self.servo.p * estimate.gap, gains_of(law)), estimate.gap, "")

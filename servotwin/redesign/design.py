@@ -5,12 +5,16 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
+import msgspec
 import numpy as np
 
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
+from servotwin.control.laws import AnyController, StoredController, filtered_pid, kind_of_stored, law_of
 from servotwin.messages import Band, Setting
+from servotwin.plant.law_loop import law_response
 
 _GRID = 512
 
@@ -21,17 +25,28 @@ class Design:
 
     Attributes
     ----------
-    controller : Controller
+    controller : Controller, Cascade or LinearLaw
     tolerance : float
         m; 0: no dead zone.
     """
 
-    controller: Controller
+    controller: StoredController
     tolerance: float = 0.0
+
+    @property
+    def pid(self) -> Controller:
+        """The controller, where it is a filtered PID.
+
+        Raises
+        ------
+        InvalidInput
+            It is another one.
+        """
+        return filtered_pid(self.controller)
 
     def setting(self, band: Band | None = None) -> Setting:
         """Setting of an update: tolerance and gains, with the band predicted for them."""
-        return Setting(self.tolerance, gains_of(self.controller), band)
+        return Setting.of(self.tolerance, gains_of(self.controller), band)
 
     @property
     def simulated(self) -> Design:
@@ -51,9 +66,12 @@ class Design:
 
 
 @lru_cache(maxsize=1024)
-def _noise_gain(law: Controller, band: tuple[float, float]) -> float:
+def _noise_gain(controller: AnyController, band: tuple[float, float]) -> float:
     """Root mean square of a law's gain (V/m) within a band (Hz)."""
-    hertz = np.geomspace(*band, _GRID)
+    hertz, law = np.geomspace(*band, _GRID), law_of(controller)
+    if not isinstance(law, Controller):
+        gain = np.array([law_response(law, 2.0 * math.pi * each)[2] for each in hertz.tolist()])
+        return float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))
     s = 2j * math.pi * hertz
     gain = law.Kp + law.Ki / s + law.Kd * s / (law.Tf * s + 1.0)
     if law.notch_hz:
@@ -62,3 +80,16 @@ def _noise_gain(law: Controller, band: tuple[float, float]) -> float:
     if law.loop_filter_hz is not None:
         gain = gain / (s / (2.0 * math.pi * law.loop_filter_hz) + 1.0)
     return float(np.sqrt(np.trapezoid(np.abs(gain) ** 2, hertz) / (band[1] - band[0])))
+
+
+def decoded_part(kind: type, values: Any) -> Any:
+    """Hook of decoders: the controller of a design, of the class that its fields name.
+
+    Raises
+    ------
+    NotImplementedError
+        For any other type.
+    """
+    if kind is StoredController:  # type: ignore[comparison-overlap]
+        return msgspec.convert(values, kind_of_stored(values))
+    raise NotImplementedError(f"{kind} is not stored")

@@ -12,7 +12,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior
-from servotwin.messages import Gains, Setting
+from servotwin.messages import AnyGains, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.uncertainty import Region
@@ -60,7 +60,7 @@ class Evidence:
     steps: tuple[float, ...] = ()
 
     @property
-    def gains(self) -> Gains | None:
+    def gains(self) -> AnyGains | None:
         """Gains in force; None: not known."""
         return None if self.setting is None else self.setting.gains
 

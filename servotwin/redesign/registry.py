@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from servotwin.control.controller import Controller
+from servotwin.control.retuning import answer
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import Plant, check_homogeneous
 from servotwin.redesign.certified.certificate import Demands
@@ -62,18 +65,48 @@ def policy_of(servo: Plant, options: PolicyOptions) -> Policy:
 
 def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
     """Make the certified policy; its largest feedforward cancels the largest stated input bias."""
+    check_verifiable(servo)
     low, high = options.uncertainty.input_bias
     return CertifiedPolicy(servo, options.uncertainty, options.demands, feedforward_limit=max(abs(low), abs(high)))
+
+
+def check_verifiable(servo: Plant) -> None:
+    """Refuse a controller whose settings cannot be verified.
+
+    Raises
+    ------
+    InvalidInput
+        A cascade or a linear law without a sample rate, or one that does not answer to a constant error.
+    """
+    law = servo.controller
+    if isinstance(law, Controller):
+        return
+    if law.sample_rate is None:
+        raise InvalidInput(
+            f"controller sample_rate = None: settings of a {type(law).__name__} are verified at its rate; give it in Hz"
+        )
+    if not math.isfinite(answer(law)) or answer(law) == 0.0:
+        raise InvalidInput(
+            f"controller {law!r}: has no proportional action, without which no setting is verified; "
+            "integrators belong in holds"
+        )
 
 
 def _certified(servo: Plant, options: PolicyOptions) -> Policy:
     """Make the policy that verifies before every update or, with a table, looks settings up."""
     policy = certified_policy(servo, options)
+    if options.table is not None and not isinstance(servo.controller, Controller):
+        raise InvalidInput(f"table = {options.table!r}: tables hold settings of a filtered PID; leave the table out")
     return policy if options.table is None else TablePolicy(policy, load(Path(options.table), policy))
 
 
 def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
     check_homogeneous(servo, 'policy = "margin"')
+    if not isinstance(servo.controller, Controller):
+        raise InvalidInput(
+            "policy 'margin' reads its dead zone from a map, and maps are computed with the filtered PID: give another "
+            "policy"
+        )
     if servo.pidf.voltage_limit is not None:
         raise InvalidInput(
             "policy 'margin' reads its dead zone from a map that serves every gap, which no map does for a controller "

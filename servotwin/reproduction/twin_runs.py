@@ -13,6 +13,7 @@ import numpy as np
 import servotwin as st
 from servotwin import messages
 from servotwin.control.gains import gains_of
+from servotwin.control.laws import filtered_pid
 from servotwin.cosim import Loop
 from servotwin.estimation import paper, whitened
 from servotwin.estimation.estimate import GapStatus
@@ -228,7 +229,11 @@ def _window_bytes(loop: Loop) -> tuple[int, ...]:
 def _setting_changes(loop: Loop) -> tuple[SettingChange, ...]:
     """List every setting that was in force, in order; an update without gains leaves those in force before it."""
     start = loop.scenario.start
-    changes = [SettingChange(0.0, SettingOrigin.START, start.setting.tolerance, gains_of(loop.scenario.start_law))]
+    changes = [
+        SettingChange(
+            0.0, SettingOrigin.START, start.setting.tolerance, gains_of(filtered_pid(loop.scenario.start_law))
+        )
+    ]
     for begin, origin, tolerance, gains in sorted(_later_settings(loop), key=lambda change: change[0]):
         changes.append(SettingChange(begin, origin, tolerance, gains or changes[-1].gains))
     return tuple(changes)
@@ -239,9 +244,9 @@ def _later_settings(loop: Loop) -> Iterator[tuple[float, SettingOrigin, float, m
     sent = {update.version: update for update in loop.updates}
     for receipt in loop.applied:
         update = sent[receipt.version]
-        yield receipt.sample / rate, SettingOrigin.UPDATE, update.setting.tolerance, update.setting.gains
+        yield receipt.sample / rate, SettingOrigin.UPDATE, update.setting.tolerance, update.setting.pid
     for fallback in loop.fallbacks:
-        yield fallback.sample / rate, SettingOrigin.FALLBACK, fallback.setting.tolerance, fallback.setting.gains
+        yield fallback.sample / rate, SettingOrigin.FALLBACK, fallback.setting.tolerance, fallback.setting.pid
 
 
 _WINDOW_GAPS_DEG, _WINDOW_STEPS = (3.0, 10.0, 18.0), 6

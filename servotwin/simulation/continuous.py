@@ -209,7 +209,7 @@ def start_zone(error: float, enter: float) -> str:
 
 def controller_constants(controller: Law) -> dict[str, float]:
     """States of the automaton that are constants of the controller, by name."""
-    most = controller.limit if isinstance(controller, LinearLaw) else controller.voltage_limit
+    most = controller.voltage_limit
     limit = {} if most is None else {"voltage limit": most}
     return {"feedforward": controller.feedforward, **limit}
 

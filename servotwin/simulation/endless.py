@@ -9,8 +9,8 @@ from math import inf
 
 import numpy as np
 
-from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters, start
+from servotwin.control.laws import AnyController
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, SquareWave, as_pieces
@@ -83,7 +83,7 @@ class UnboundedSimulation:
         self.simulation.set_tolerance(tolerance)
         self._forget()
 
-    def set_controller(self, controller: Controller, tolerance: float) -> None:
+    def set_controller(self, controller: AnyController, tolerance: float) -> None:
         """Change controller and dead zone (m) from the present sample on, without a jump of the voltage."""
         self.simulation.set_controller(controller, tolerance)
         self._forget()

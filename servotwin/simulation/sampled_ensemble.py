@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import law_of
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures, figures_of
@@ -19,6 +20,7 @@ from servotwin.simulation.ensemble import Cases, check_constants, samples_of
 from servotwin.simulation.inputs import RunInputs, with_forces
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.sampled_groups import SampledMembers, SampledSpan, groups_of, in_blocks, run_group
+from servotwin.simulation.sampled_law import SampledLawEngine
 from servotwin.simulation.sampled_members import SampledResults
 
 LARGEST_DELAY = 64
@@ -67,7 +69,7 @@ def summarise_sampled(
     Parameters
     ----------
     servos : Servo or array_like of Servo
-    controllers : Controller or array_like of Controller, or None
+    controllers : Controller, Cascade or LinearLaw or array_like of them, or None
         Sampled; None: the servo's own.
     duration : float
         s.
@@ -183,10 +185,10 @@ def sampled_members(servos: Any, controllers: Any, cases: SampledCases) -> Sampl
         raise InvalidInput("resolution: every value of an ensemble must be finite and 0 m or more")
     every_servo = list(np.broadcast_to(plants, shape).ravel())
     given = np.broadcast_to(laws, shape).ravel()
-    every_law = [
-        filtered_pid(servo.controller if law is None else law) for servo, law in zip(every_servo, given, strict=True)
-    ]
-    for law in {id(law): law for law in every_law}.values():
+    described = [servo.controller if law is None else law for servo, law in zip(every_servo, given, strict=True)]
+    running = {id(law): law_of(law) for law in described}
+    every_law = [running[id(law)] for law in described]
+    for law in running.values():
         if law.sample_rate is None:
             raise InvalidInput("a sampled ensemble needs controllers with a sample_rate")
     return SampledMembers(shape, every_servo, every_law, with_forces(constants, every_servo))
@@ -221,9 +223,11 @@ def _run(members: SampledMembers, member: int, span: SampledSpan) -> Array:
         here["input_bias"],
         here["friction"] - servo.motor_friction,
     )
-    engine = SampledEngine(
+    law = members.controllers[member]
+    kind = SampledLawEngine if isinstance(law, LinearLaw) else SampledEngine
+    engine = kind(
         servo.with_position_resolution(here["resolution"]),
-        members.controllers[member],
+        law,  # type: ignore[arg-type]
         inputs,
         here["theta_d0"],
         span.samples,

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
+from servotwin.control.laws import Law, filtered_pid
 from servotwin.hybrid.automaton import Array, shared_flows, speeds
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
@@ -44,7 +45,7 @@ class SampledMembers:
 
     shape: tuple[int, ...]
     servos: list[Plant]
-    controllers: list[Controller]
+    controllers: list[Law]
     constants: dict[str, Array]
 
 
@@ -73,14 +74,15 @@ class SampledGroup:
 
 
 def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
-    """True for members that advance in blocks: an ideal sensor, and ticks at every sample of the output; with a
-    friction feedforward a reference that is constant in every piece."""
-    if members.controllers[member].friction_feedforward != 0.0 and degree(span.shape) > 0:
+    """True for members that advance in blocks: a filtered PID, an ideal sensor, and ticks at every sample of the
+    output; with a friction feedforward a reference that is constant in every piece."""
+    law = members.controllers[member]
+    if not isinstance(law, Controller) or (law.friction_feedforward != 0.0 and degree(span.shape) > 0):
         return False
     servo = members.servos[member]
     if servo.at_motor and servo.guide.force:
         return False  # the flank on which its load hangs depends on the gap
-    ratio = (members.controllers[member].sample_rate or 0.0) / span.rate
+    ratio = (law.sample_rate or 0.0) / span.rate
     whole = round(ratio)
     return members.constants["resolution"][member] == 0.0 and whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
 
@@ -95,7 +97,7 @@ def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
 
 
 def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
-    servo, law = members.servos[member], members.controllers[member]
+    servo, law = members.servos[member], filtered_pid(members.controllers[member])
     here = {name: float(values[member]) for name, values in members.constants.items()}
     limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None
     always = law.feedforward == 0.0 and law.friction_feedforward == 0.0
@@ -108,7 +110,8 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     constants = {name: values[which] for name, values in members.constants.items()}
     bias, friction = constants["input_bias"][0] != 0.0, constants["friction"][0] > 0.0
     dead_zone, delay = bool(constants["tolerance"][0] > 0.0), int(constants["delay"][0])
-    servos, laws = ([values[member] for member in which] for values in (members.servos, members.controllers))
+    servos = [members.servos[member] for member in which]
+    laws = [filtered_pid(members.controllers[member]) for member in which]
     law_places: dict[Controller, int] = {}
     law = np.array([law_places.setdefault(each, len(law_places)) for each in laws])
     plant_places: dict[tuple[Plant, float], int] = {}

@@ -19,7 +19,7 @@ from servotwin.messages import Setting, Update
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.uncertainty import Region
-from servotwin.redesign.design import Design
+from servotwin.redesign.design import Design, decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 
 
@@ -146,7 +146,7 @@ def decode_request(data: bytes) -> VerificationRequest:
         document = msgspec.msgpack.decode(data)
         if isinstance(document, dict) and document.get("type") == "proof/1":
             document["type"] = VerificationRequest.__struct_config__.tag
-        return msgspec.convert(document, VerificationRequest)
+        return msgspec.convert(document, VerificationRequest, dec_hook=decoded_part)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         raise InvalidInput(f"the verification request is not understood: {error}") from None
 

@@ -97,7 +97,7 @@ class TwinModel:
             triage=None if settings.triage is None else Triage(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
-            controller=servo.pidf,
+            controller=servo.controller if isinstance(servo.controller, Controller) else None,
         )
 
     def initial_state(self, servo: str) -> TwinState:

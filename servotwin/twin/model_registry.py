@@ -28,8 +28,9 @@ from typing import Annotated
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_inner
 from servotwin.config.toml import changes, read
-from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
 from servotwin.plant.own_units import check_own_units, own_controller
@@ -172,12 +173,12 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     servo: Plant = read(table, servo_table, folder)
     inner = own_controller(table, "controller", servo)
     with named(inner):
-        law = servo.pidf.replace(**changes(inner, Controller))
+        law = _changed(inner, servo.controller)
     inner.done()
     check_own_units(table, servo, {f"twin.{path}": makers for path, makers in TWIN_UNITS.items()})
     settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder, plant=servo))
     servo.check_loop(law)
-    own = gains_of(law) == gains_of(servo.pidf)
+    own = gains_of(law) == gains_of(servo.controller)
     if checked:
         policy_of(servo.replace(controller=law), settings)
     return ServoModel(name, servo.replace(controller=law), settings, _start(servo, law, settings, own))
@@ -188,11 +189,16 @@ def servo_table(servo: Annotated[Plant, PLANT_KEY]) -> Plant:
     return servo
 
 
-def _start(servo: Plant, law: Controller, settings: TwinSettings, own: bool) -> Setting | None:
+def _changed(table: Table, controller: AnyController) -> AnyController:
+    """The controller with the changes of a table; a linear law has no keys."""
+    return controller if isinstance(controller, LinearLaw) else controller.replace(**changes(table, type(controller)))
+
+
+def _start(servo: Plant, law: AnyController, settings: TwinSettings, own: bool) -> Setting | None:
     """Setting with which an edge begins, as in `Commissioning.start`; `own`: the gains are the servo's own."""
     if settings.policy == "certified":
-        return None if own else Setting(0.0, gains_of(law))
-    return Setting(settings.initial_tolerance(servo), gains_of(law))
+        return None if own else Setting.of(0.0, gains_of(law))
+    return Setting.of(settings.initial_tolerance(servo), gains_of(law))
 
 
 @lru_cache(maxsize=2 * MAX_MODELS)

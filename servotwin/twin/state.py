@@ -19,6 +19,7 @@ from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite
 from servotwin.messages.legacy import upgrade
 from servotwin.redesign.certified.certificate import verification_of
+from servotwin.redesign.design import decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.requests import Attempts, RequestState
@@ -147,7 +148,7 @@ def noted_setting(known: Settings, version: int, setting: Setting, base: int, in
     """
     before = known.get(base)
     if setting.gains is None and before is not None:
-        setting = replace(setting, gains=before.gains)
+        setting = setting.with_gains(before.gains)
     after = {**known, version: setting}
     # The edge starts with version 0: later updates without gains go back to its gains.
     keep = {0, version, in_force, *sorted(after)[-MAX_SETTINGS:]}
@@ -215,7 +216,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(TwinState)
+_decoder = msgspec.msgpack.Decoder(TwinState, dec_hook=decoded_part)
 
 
 def encode_state(state: TwinState) -> bytes:
@@ -238,7 +239,7 @@ def decode_state(servo: str, data: bytes) -> TwinState:
             document = msgspec.msgpack.decode(data)
             if not isinstance(document, dict) or document.get("type") != "twin-state/1":
                 raise
-            state = msgspec.convert(_upgraded(document), TwinState)
+            state = msgspec.convert(_upgraded(document), TwinState, dec_hook=decoded_part)
     except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError, LookupError, TypeError) as error:
         raise InvalidInput(f"the state of servo {servo!r} is not understood: {error}") from None
     if state.servo != servo:

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.config.table import parse_toml
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
@@ -73,6 +74,21 @@ def test_every_number_comes_back_bit_for_bit(a: float, b: float, c: float, text:
     files, sensor = StoredFiles("o.db", "p.json", "s.json", "b", 9, 2_500_000), SensorGuard(0.003, -0.5)
     drive = {"kind": "opcua", "list": [1, 2.5], "flag": True, "map": {"text": text}}
     config = EdgeConfig(agent, "supervise", LAW, drive, twin, files, sensor)
+    assert again(config) == config
+
+
+CASCADE = Cascade(20.0, 0.1, velocity_gain=3.0, integral_time=0.1, notch_hz=40.0, sample_rate=1000.0)
+
+
+def test_a_cascade_and_its_sets_come_back_bit_for_bit() -> None:
+    """A fallback set without the integral action and the notch that the configured cascade has, too."""
+    bare = gains_of(CASCADE.replace(integral_time=None, notch_hz=None, velocity_gain=1.0 / 3.0, integral_only=False))
+    fallback = FallbackSet(Setting.of(1e-4, bare, Band(1e-4, 1e-5, 0.1, 1.0)))
+    agent = AgentSettings(
+        "axis-1", UNBOOTED, 1000.0, controller=CASCADE, own=gains_of(CASCADE.replace(position_gain=7.0)),
+        parameters=Parameters(setting=fallback.setting, fallback=True), supervision=Supervision(fallback),
+    )  # fmt: skip
+    config = EdgeConfig(agent, "control", CASCADE, {"kind": "simulated"})
     assert again(config) == config
 
 

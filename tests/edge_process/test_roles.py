@@ -10,8 +10,12 @@ from edge_process_parts import CONFIG, LAW, RATE, LinkEnd, cut, exchange_all
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.control.cascade import Cascade
+from servotwin.control.gains import gains_of
 from servotwin.control.law import start, tick
+from servotwin.control.running_law import RunningLaw, command_of
 from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
+from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
 from servotwin.edge_process.config import EdgeConfig
@@ -48,23 +52,55 @@ POSITIONS = st.sampled_from([0.0, 1e-3, -1e-3, math.nan, math.inf, -math.inf, 1e
 @given(st.lists(st.tuples(POSITIONS, POSITIONS), max_size=30), st.booleans())
 def test_the_law_never_gives_a_voltage_that_is_not_finite(samples: list[tuple[float, float]], limited: bool) -> None:
     controller = LAW if limited else LAW.replace(voltage_limit=None, Ki=1e3, Kd=10.0)
-    guarded = GuardedLaw(controller.law(1e-5), 2, 0.0)
+    guarded = GuardedLaw(RunningLaw(controller, 1e-5), 2, 0.0)
     for reference, position in samples:
-        assert math.isfinite(guarded.tick(reference, position))
+        assert math.isfinite(guarded.tick(reference, 0.0, position))
     for _ in range(4):
-        guarded.tick(0.0, math.nan)
-    assert guarded.tick(1e-3, 0.0) == tick(controller.law(1e-5), start(0.0), 1e-3, 0.0).voltage
+        guarded.tick(0.0, 0.0, math.nan)
+    assert guarded.tick(1e-3, math.nan, 0.0) == tick(controller.law(1e-5), start(0.0), 1e-3, 0.0).voltage
 
 
 def test_a_few_bad_samples_hold_the_voltage_and_the_law_goes_on() -> None:
     law = LAW.replace(Ki=500.0).law()
-    guarded, plain = GuardedLaw(law, 2, 0.5), start(0.0)
+    guarded, plain = GuardedLaw(RunningLaw(LAW.replace(Ki=500.0)), 2, 0.5), start(0.0)
     for k in range(5):
         plain = tick(law, plain, 1e-3, 1e-4 * k)
-        assert guarded.tick(1e-3, 1e-4 * k) == plain.voltage
-    assert [guarded.tick(1e-3, math.nan) for _ in range(2)] == [plain.voltage] * 2
-    assert guarded.tick(1e-3, 6e-4) == tick(law, plain, 1e-3, 6e-4).voltage
-    assert [guarded.tick(1e-3, math.nan) for _ in range(3)][-1] == 0.5
+        assert guarded.tick(1e-3, 0.0, 1e-4 * k) == plain.voltage
+    assert [guarded.tick(1e-3, 0.0, math.nan) for _ in range(2)] == [plain.voltage] * 2
+    assert guarded.tick(1e-3, 0.0, 6e-4) == tick(law, plain, 1e-3, 6e-4).voltage
+    assert [guarded.tick(1e-3, 0.0, math.nan) for _ in range(3)][-1] == 0.5
+
+
+CASCADE = Cascade(20.0, 0.1, velocity_gain=3.0, integral_time=0.1, voltage_limit=10.0, sample_rate=RATE)
+
+
+def test_a_cascade_runs_at_the_edge_and_takes_new_numbers_without_a_bump(far: "LinkEnd") -> None:
+    """Both encoders reach the tick; a sample without the motor's angle is bad."""
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    agent = replace(CONFIG.agent, controller=CASCADE, limits=Limits(maximum=1e-3))
+    edge = edge_of(box, replace(CONFIG, agent=agent, controller=CASCADE))
+    given = [DriveSample(k, 1e-3, 1e-3 * k, 1e-5 * k) for k in range(20)]
+    drive = ScriptedDrive([*given[:10], given[10]._replace(theta_m=math.nan), *given[11:]])
+    role = ControlRole(edge, drive)
+    running = RunningLaw(CASCADE, 0.0)
+    state = running.start(given[0].theta_m, given[0].position)
+    for k in range(10):
+        role.step()
+        state = running.tick(state, *given[k][1:])
+        assert role.law.voltage == command_of(state)
+    far.send(frames.MessageFrame(1, encode(law_update(1, CASCADE.replace(velocity_gain=2.0, integral_time=None)))))
+    role.step()
+    assert role.law.voltage == command_of(state)
+    assert edge.counts["bad samples"] == 1
+    role.step()
+    assert edge.agent.parameters.version == 1
+    assert role.law.voltage == pytest.approx(command_of(running.tick(state, *given[11][1:])), abs=1e-12)
+
+
+def law_update(version: int, law: Cascade) -> Update:
+    known = (None, None, (None, None))
+    return Update("axis-1", version, 0, ("b0", 0), 0.0, *known, "OK", Setting.of(0.0, gains_of(law)), 60.0)
 
 
 class ScriptedDrive:

@@ -176,6 +176,19 @@ def test_identify_from_a_log_to_json(tmp_path, made):
     assert len(found["segments"]) > 10
 
 
+def test_a_page_of_the_gap(tmp_path, made):
+    log = csv(tmp_path / "log <b>.csv", rows(made))
+    result = CliRunner().invoke(app, ["identify", str(log), "--page", str(tmp_path / "gap.html")])
+    assert result.exit_code == 0, result.output
+    text = (tmp_path / "gap.html").read_text()
+    assert "log &lt;b&gt;.csv" in text
+    assert "<b>" not in text
+    assert "data:image/svg+xml" in text
+    wrong = CliRunner().invoke(app, ["identify", str(log), "--page", str(tmp_path / "gap.pdf")])
+    assert wrong.exit_code == 2
+    assert ".html" in wrong.stderr
+
+
 def test_the_change_between_two_logs(tmp_path, made):
     first = csv(tmp_path / "old.csv", rows(made))
     worn = recording(gap=0.06, ratio=RATIO, seconds=12.0, rate=200.0, seed=2)

@@ -16,6 +16,7 @@ from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import (
     Uncertainty,
 )
+from servotwin.redesign.design import decoded_part
 
 DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")
@@ -71,6 +72,6 @@ def test_a_certificate_of_the_version_before_is_read() -> None:
     assert isinstance(found, Certificate)
     new = ("settled_least", "confidence", "loop", "beyond", "ramp", "rate", "delay", "error_per_volt", "lag")
     document = {name: value for name, value in msgspec.to_builtins(found).items() if name not in new}
-    read = msgspec.convert(document, Certificate)
+    read = msgspec.convert(document, Certificate, dec_hook=decoded_part)
     assert read.loop is None
     assert all(getattr(read, f.name) == getattr(found, f.name) for f in fields(read) if f.compare and f.name not in new)

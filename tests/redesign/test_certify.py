@@ -12,13 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.control.law import start, tick
+from servotwin.control.retuning import unfed
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess, joined, nearness, stillness
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify
-from servotwin.redesign.certified.margins import loop_margins, margins_in_every_zone, unfed, widened
+from servotwin.redesign.certified.margins import loop_margins, margins_in_every_zone, widened
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently, drawn_plants
 from servotwin.redesign.design import Design

@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from servotwin.control.retuning import unfed
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.attempt import Question
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
 from servotwin.redesign.certified.certify import candidates_of, certify, confirm
-from servotwin.redesign.certified.margins import loop_margins, unfed
+from servotwin.redesign.certified.margins import loop_margins
 from servotwin.redesign.certified.screening import Screening
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty

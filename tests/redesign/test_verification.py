@@ -12,6 +12,7 @@ from exploration import extent
 from scipy import stats
 
 from servotwin.commissioning.edge_settings import guarding
+from servotwin.control.retuning import unfed
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -24,7 +25,7 @@ from servotwin.redesign.certified.assess import assess, stillness
 from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify, confirm
-from servotwin.redesign.certified.margins import loop_margins, unfed, widened
+from servotwin.redesign.certified.margins import loop_margins, widened
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import (

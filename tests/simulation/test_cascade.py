@@ -30,7 +30,7 @@ AXES = {
         TWO_MASS.replace(
             controller=Cascade(
                 2.0, 1.0, velocity_gain=30.0, integral_time=0.5, speed_filter=2e-3, velocity_feedforward=0.5,
-                acceleration_feedforward=2.0, reference_filter=0.02, limit=60.0,
+                acceleration_feedforward=2.0, reference_filter=0.02, voltage_limit=60.0,
             )
         ),
         0.2,
@@ -51,7 +51,7 @@ AXES = {
             VelocityDrive(5e-3),
             Transmission(P),
             Load((20.0,)),
-            Cascade(6.0, P, velocity_feedforward=0.8, reference_filter=0.01, notch_hz=30.0, limit=40.0),
+            Cascade(6.0, P, velocity_feedforward=0.8, reference_filter=0.01, notch_hz=30.0, voltage_limit=40.0),
         ),
         1e-3,
         0.3,
@@ -85,7 +85,7 @@ class HandWritten:
         c = self.cascade
         assert c.velocity_gain is not None
         assert c.integral_time is not None
-        assert c.limit is not None
+        assert c.voltage_limit is not None
         assert c.sample_rate is not None
         step, error = 1.0 / c.sample_rate, reference - y_load
         self.active = abs(error) > tolerance
@@ -95,7 +95,7 @@ class HandWritten:
         self.speed = decay * self.speed + (1.0 - decay) * (y_motor - self.before) / step
         self.before = y_motor
         unlimited = c.velocity_gain * (wanted - self.speed) + self.integral
-        command = min(max(unlimited, -c.limit), c.limit)
+        command = min(max(unlimited, -c.voltage_limit), c.voltage_limit)
         if self.active:
             self.integral += step / c.integral_time * c.velocity_gain * (wanted - self.speed)
             self.integral += step / c.integral_time * (command - unlimited)
@@ -104,7 +104,9 @@ class HandWritten:
 
 @pytest.mark.slow
 def test_a_sampled_cascade_agrees_with_one_written_by_hand() -> None:
-    cascade = Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5, speed_filter=2e-3, limit=10.0, sample_rate=200.0)
+    cascade = Cascade(
+        2.0, 1.0, velocity_gain=30.0, integral_time=0.5, speed_filter=2e-3, voltage_limit=10.0, sample_rate=200.0
+    )
     axis, gap, rate, tolerance, count = TWO_MASS.replace(controller=cascade), 0.03, 200.0, 0.05, 500
     axis.check_loop()
     oracle, law = HeldOracle(axis.replace(controller=IDLE), gap), HandWritten(cascade)
@@ -169,7 +171,7 @@ def test_the_compiled_loop_gives_the_edge_s_bits() -> None:
     """The interpreted law, fed with what was measured in the compiled loop, gives the same commands."""
     axis, amplitude, gap = AXES["two masses"]
     axis = axis.replace(sensors=Sensors(encoder_resolution=1e-4, position_resolution=2e-5))
-    law, tolerance = axis.controller.replace(sample_rate=2e3, limit=20.0, leave=1.5), 5e-3
+    law, tolerance = axis.controller.replace(sample_rate=2e3, voltage_limit=20.0, leave=1.5), 5e-3
     signals = {"reference": SquareWave(amplitude, 2.0), "gap": gap, "tolerance": tolerance, "noise": Noise(std=1e-4)}
     run = simulate(axis, 4.0, controller=law, sample_rate=2e3, **signals)
     parameters, state, commands = law.linear().parameters(tolerance), law.linear().start(0.0, 0.0), []
@@ -185,7 +187,7 @@ def test_the_compiled_loop_gives_the_edge_s_bits() -> None:
 @pytest.mark.parametrize("sample_rate", [None, 1e3])
 def test_a_change_of_gains_in_the_run_does_not_bump(sample_rate: float | None) -> None:
     axis = AXES["two masses"][0]
-    first = axis.controller.replace(sample_rate=sample_rate, limit=None)
+    first = axis.controller.replace(sample_rate=sample_rate, voltage_limit=None)
     simulation = Simulation(axis, 1.0, first, reference=0.1, gap=0.03, tolerance=0.0, sample_rate=1e3)
     simulation.advance(300)
     simulation.set_controller(first.replace(position_gain=1.0, velocity_gain=20.0), 0.01)
@@ -263,7 +265,9 @@ def test_friction_and_gravity_act_under_a_cascade_too(in_gap: str) -> None:
 def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
     """Position on the load around a velocity loop with integral action: the gap swings."""
     axis, _, gap = AXES["two masses"]
-    law = axis.controller.replace(limit=None, position_gain=4.0, velocity_feedforward=0.0, acceleration_feedforward=0.0)
+    law = axis.controller.replace(
+        voltage_limit=None, position_gain=4.0, velocity_feedforward=0.0, acceleration_feedforward=0.0
+    )
     result = limit_cycle(axis, gap, controller=law, step=0.1)
     assert result.orbit is not None
     run = simulate(axis, 120.0, controller=law, reference=0.1, gap=gap, sample_rate=200.0)
@@ -278,7 +282,7 @@ def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
 def test_a_continuous_cascade_is_replaced_within_rounding() -> None:
     """Another structure too: the notch is new, the integral is gone."""
     axis = AXES["two masses"][0]
-    first = axis.controller.replace(limit=None)
+    first = axis.controller.replace(voltage_limit=None)
     for second in (first.replace(position_gain=1.0, notch_hz=8.0), first.replace(integral_time=None, low_pass_hz=50.0)):
         simulation = Simulation(axis, 1.0, first, reference=0.1, gap=0.03, sample_rate=1e3)
         simulation.advance(300)

@@ -39,8 +39,8 @@ def pieces(law: LinearLaw) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ..
 LAWS = {
     "plain": (position_and_speed(20.0), None),
     "dead zone": (position_and_speed(20.0).replace(enter=0.6, leave=1.4), 0.2),
-    "limits": (position_and_speed(20.0).replace(limit=8.0, rate_limit=300.0), None),
-    "all": (position_and_speed(20.0).replace(limit=8.0, rate_limit=300.0, enter=0.6, leave=1.4), 0.2),
+    "limits": (position_and_speed(20.0).replace(voltage_limit=8.0, rate_limit=300.0), None),
+    "all": (position_and_speed(20.0).replace(voltage_limit=8.0, rate_limit=300.0, enter=0.6, leave=1.4), 0.2),
 }
 
 
@@ -74,9 +74,9 @@ CONTINUOUS = LinearLaw(
 ZONED = {
     "plain": (CONTINUOUS, None),
     "dead zone": (CONTINUOUS.replace(enter=0.6, leave=1.4), 0.02),
-    "dead zone that opens the loop, on the motor": (CONTINUOUS.replace(on="motor", opens=True), 0.05),
-    "limit": (CONTINUOUS.replace(limit=8.0), None),
-    "both": (CONTINUOUS.replace(limit=8.0, enter=0.6, leave=1.4), 0.02),
+    "dead zone that opens the loop, on the motor": (CONTINUOUS.replace(on="motor", integral_only=False), 0.05),
+    "limit": (CONTINUOUS.replace(voltage_limit=8.0), None),
+    "both": (CONTINUOUS.replace(voltage_limit=8.0, enter=0.6, leave=1.4), 0.02),
 }
 
 
@@ -90,7 +90,7 @@ def test_a_continuous_law_agrees_with_an_independent_integrator(name: str) -> No
     oracle = ContinuousOracle(axis, gap, law=law, tolerance=tolerance)
     expected = continuous_positions(oracle, 0.2, 3.0, run.time[:-1])
     assert np.abs(run.position[:-1] - expected).max() < 1e-8 * np.ptp(expected)
-    assert oracle.seen >= {"contact"} | ({"zone"} if tolerance else set()) | ({"limit"} if law.limit else set())
+    assert oracle.seen >= {"contact"} | ({"zone"} if tolerance else set()) | ({"limit"} if law.voltage_limit else set())
 
 
 @pytest.mark.parametrize("name", ZONED)

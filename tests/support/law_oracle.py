@@ -61,7 +61,7 @@ def numpy_law(law: LinearLaw, tolerance: float | None, pieces: tuple[tuple[Array
     """The law with its own numbers, and matrices that the test made."""
     factor = -1.0 if tolerance is None else tolerance
     assert law.sample_rate is not None
-    limit, step = law.limit or np.inf, (law.rate_limit or np.inf) / law.sample_rate
+    limit, step = law.voltage_limit or np.inf, (law.rate_limit or np.inf) / law.sample_rate
     zone = (factor * law.enter, factor * law.leave) if tolerance is not None else (-1.0, -1.0)
     return NumpyLaw(*pieces, *zone, (law.ratio, 0.0) if law.on == "motor" else (0.0, 1.0), limit, step)  # type: ignore[arg-type]
 
@@ -105,7 +105,7 @@ class ContinuousOracle(AxisOracle):
         """Command before the limit."""
         assert self.law is not None
         _, states, y = self.split(x)
-        if self.law.opens and not self.active:
+        if not self.law.integral_only and not self.active:
             return 0.0
         return float(np.dot(self.law.C, states) + np.dot(self.law.D, y))
 
@@ -117,14 +117,16 @@ class ContinuousOracle(AxisOracle):
 
     def command(self, x: Array) -> tuple[float, float]:
         assert self.law is not None
-        return (self.limited * self.law.limit if self.limited and self.law.limit else self.wanted(x)), 0.0
+        return (
+            self.limited * self.law.voltage_limit if self.limited and self.law.voltage_limit else self.wanted(x)
+        ), 0.0
 
     def rates(self, t: float, x: Array) -> Array:
         assert self.law is not None
         _, states, y = self.split(x)
         n = self.law.n
         A, B = np.array(self.law.A).reshape(n, n), np.array(self.law.B).reshape(n, 3)
-        driven = A @ states + (0.0 if self.law.opens and not self.active else B @ y)
+        driven = A @ states + (0.0 if not self.law.integral_only and not self.active else B @ y)
         driven = driven + np.array(self.law.windup) * (self.command(x)[0] - self.wanted(x))
         if not self.active:
             driven[[name in self.law.holds for name in self.law.names]] = 0.0
@@ -148,10 +150,14 @@ class ContinuousOracle(AxisOracle):
             return law.leave * self.tolerance - abs(self.error(x))
 
         def limit(_t: float, x: Array) -> float:
-            assert law.limit is not None
-            return self.limited * self.wanted(x) - law.limit if self.limited else law.limit - abs(self.wanted(x))
+            assert law.voltage_limit is not None
+            return (
+                self.limited * self.wanted(x) - law.voltage_limit
+                if self.limited
+                else law.voltage_limit - abs(self.wanted(x))
+            )
 
-        wanted = ([zone] if self.tolerance is not None else []) + ([limit] if law.limit is not None else [])
+        wanted = ([zone] if self.tolerance is not None else []) + ([limit] if law.voltage_limit is not None else [])
         for each in wanted:
             each.terminal, each.direction = True, -1.0  # type: ignore[attr-defined]
         self.kinds = [*(["contact"] * len(found)), *(each.__name__ for each in wanted)]
@@ -168,9 +174,9 @@ class ContinuousOracle(AxisOracle):
     def limit_again(self, x: Array) -> None:
         """Saturation that fits the state."""
         assert self.law is not None
-        if self.law.limit is not None:
+        if self.law.voltage_limit is not None:
             wanted = self.wanted(x)
-            self.limited = int(np.sign(wanted)) if abs(wanted) > self.law.limit else 0
+            self.limited = int(np.sign(wanted)) if abs(wanted) > self.law.voltage_limit else 0
 
     def run(self, x: Array, begin: float, end: float, times: Array) -> tuple[Array, Array]:
         self.settle(x)

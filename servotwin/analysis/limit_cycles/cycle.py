@@ -102,7 +102,7 @@ def limit_cycle(
         raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
     loop = scaled_loop(servo, gap, tolerance, controller, step)
     law = law_of(servo.controller if controller is None else controller)
-    limit = law.limit if isinstance(law, LinearLaw) else law.voltage_limit
+    limit = law.voltage_limit
     if gap == 0.0 and not tolerance and limit is None and servo.command_limit is None:
         return _linear(servo, law)
     try:

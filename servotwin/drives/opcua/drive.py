@@ -87,7 +87,9 @@ class OpcUaDrive:
     def write(self, parameters: Parameters) -> None:
         """Write all, commit, and wait for the drive's decision."""
         session = self._connected
-        gains = parameters.setting.gains or Gains(0.0, 0.0, 0.0, 1.0)
+        if parameters.setting.law is not None:
+            raise DriveRefused(f"drive {self._settings.url}: takes the gains of a filtered PID only")
+        gains = parameters.setting.pid or Gains(0.0, 0.0, 0.0, 1.0)
         needed = [model.INTEGRAL_ONLY] if gains.integral_only else []
         needed += model.VELOCITY if gains.velocity_feedforward else ()
         needed += [model.FRICTION] if gains.friction_feedforward else []

@@ -207,7 +207,9 @@ class SimulatedSupervised:
 
     def write(self, parameters: Parameters) -> None:
         """Put parameters in force from the next sample on."""
-        gains = _NO_GAINS if parameters.setting.gains is None else msgspec.structs.astuple(parameters.setting.gains)
+        if parameters.setting.law is not None:
+            raise DriveRefused("the simulated machine takes the gains of a filtered PID only")
+        gains = _NO_GAINS if parameters.setting.pid is None else msgspec.structs.astuple(parameters.setting.pid)
         numbers = parameters.setting.tolerance, *gains
         has_gains = parameters.setting.gains is not None
         status, count, _, _ = self._request(wire.WRITE, parameters.version, numbers, has_gains)

@@ -144,7 +144,7 @@ class SupervisedPlant:
         InvalidInput
             The controller does not allow them.
         """
-        machine.put_in_force(self._machine, self._law, Setting(tolerance, gains))
+        machine.put_in_force(self._machine, self._law, Setting.of(tolerance, gains))
         self.version = version
 
     def move(self, offset: float) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -27,6 +28,26 @@ _ROUNDS = 4
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
 _CHANCE = 0.025  # on either side of a 95 % interval
+
+
+class FittedCurves(NamedTuple):
+    """What a picture of the fit shows.
+
+    Attributes
+    ----------
+    time, load, lead, residual : (k,) array
+        Times in s, positions of the load, by how much the motor leads it (the motor's unit), and what the model leaves
+        (the load's).
+    gaps, rms : (g,) array
+        Error of the model, the load's unit, for other gaps.
+    """
+
+    time: Array
+    load: Array
+    lead: Array
+    residual: Array
+    gaps: Array
+    rms: Array
 
 
 @dataclass(frozen=True)
@@ -56,6 +77,7 @@ class LostMotion:
         What the model leaves, the load's unit.
     local : tuple of LocalGap
         One for each reversal.
+    curves : FittedCurves or None
     """
 
     gap_motor: float
@@ -70,6 +92,7 @@ class LostMotion:
     cycles: tuple[float, ...] = ()
     rms: float = np.nan
     local: tuple[LocalGap, ...] = ()
+    curves: FittedCurves | None = None
 
     @property
     def gap_load(self) -> float:
@@ -117,7 +140,10 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
     comparisons = compared(prepared, grid, tensor, counts)
     best = chosen(comparisons[:-1])
-    return _answer(recording, prepared, best, comparisons, least)
+    errors = solved(tensor.sum(axis=1), best.model.places(prepared)).squares
+    found = _answer(recording, prepared, best, comparisons, least)
+    rms = np.sqrt(errors / prepared.rows.size)
+    return replace(found, curves=_curves(recording, prepared, best.model, found, grid, rms))
 
 
 def _least_motion(recording: EncoderRecording) -> float:
@@ -192,6 +218,26 @@ def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tup
             break
         width = wanted
     return gap, other, spread
+
+
+def _curves(
+    recording: EncoderRecording, prepared: Regression, model: Model, found: LostMotion, grid: Array, rms: Array
+) -> FittedCurves:
+    gap = found.gap_motor if math.isfinite(found.gap_motor) else 0.0
+    values, _ = columns(prepared._replace(lag=found.lag), gap)
+    places = model.places(prepared)
+    fit = solved(values @ values.T, places).coefficients
+    load, rows = values[0], prepared.rows
+    # What is neither ratio nor gap, such as an offset, is taken off: the rest is the motor's lead.
+    others = fit @ values[places] - fit[0] * values[1]
+    return FittedCurves(
+        time=recording.time[rows],
+        load=load,
+        lead=recording.motor[rows] - (load - others) / fit[0],
+        residual=load - fit @ values[places],
+        gaps=grid,
+        rms=rms,
+    )
 
 
 def _travel(prepared: Regression) -> Array:

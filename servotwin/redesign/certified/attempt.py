@@ -9,7 +9,10 @@ from functools import cached_property
 
 import numpy as np
 
-from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController, law_of
+from servotwin.control.linear_law import LinearLaw
+from servotwin.control.retuning import answer, filter_time, integrates, unfed
+from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
@@ -21,7 +24,7 @@ from servotwin.redesign.certified.certificate import (
     LoopMargins,
     RampResult,
 )
-from servotwin.redesign.certified.margins import margins_in_every_zone, unfed, widened
+from servotwin.redesign.certified.margins import margins_in_every_zone, widened
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
@@ -89,10 +92,11 @@ class Question:
         law = setting.controller
         if not self.noise:
             return 0.0
-        begin, end = (edge / (2.0 * math.pi * self.servo.pidf.Tf) for edge in _NOISE_BAND)
+        time = filter_time(self.servo.controller) or self.trial.unit
+        begin, end = (edge / (2.0 * math.pi * time) for edge in _NOISE_BAND)
         end = end if law.sample_rate is None else 0.5 * law.sample_rate
         effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
-        authority = abs(self.servo.pidf.Kp) * self.uncertainty.step[1]
+        authority = abs(answer(self.servo.controller)) * self.uncertainty.step[1]
         return self.demands.effort_weight * self.trial.unit * effort / authority
 
 
@@ -160,7 +164,7 @@ class Attempt:
             ramp=self._ramp,
             rate=law.sample_rate,
             delay=0 if law.sample_rate is None else known.delay,
-            error_per_volt=0.0 if law.Ki else 1.0 / abs(law.Kp),
+            error_per_volt=0.0 if integrates(law) else 1.0 / abs(answer(law)),
             lag=_lag(question.servo, setting.controller),
         )
 
@@ -198,7 +202,7 @@ class Attempt:
         beyond, servo, known = question.demands.beyond, question.servo, question.uncertainty
         if beyond.machines == 0:
             return None
-        force = servo.torque_of(beyond.friction * abs(servo.pidf.Kp) * known.step[0])
+        force = servo.torque_of(beyond.friction * abs(answer(servo.controller)) * known.step[0])
         force = max(known.friction[1], force) if servo.takes_friction else known.friction[1]
         wide = widened(known, question.demands)
         ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))
@@ -233,15 +237,24 @@ def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> 
     return ""
 
 
-def _lag(servo: Plant, law: Controller) -> float:
+def _lag(servo: Plant, law: AnyController) -> float:
     """s: steady error behind a ramp, per speed; the motor integrates, so a law without integral action lags."""
-    if law.Ki:
+    if integrates(law):
         return 0.0
     plant = servo.plant()
     corners = np.abs(plant.poles())
     slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
     needed = 1.0 / (slow * float(np.abs(plant.response(slow))))
-    return abs(needed - law.velocity_feedforward) / abs(law.Kp)
+    return abs(needed - _fed_forward(servo, law, slow)) / abs(answer(law))
+
+
+def _fed_forward(servo: Plant, law: AnyController, slow: float) -> float:
+    """Command per speed of a reference that the machine follows without error; `slow` in rad/s."""
+    running = law_of(law)
+    if not isinstance(running, LinearLaw):
+        return running.velocity_feedforward
+    reference, motor, load = law_response(running, slow)
+    return float(((reference + motor / servo.p + load) / (1j * slow)).real)
 
 
 def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) -> int:

@@ -16,21 +16,26 @@ from itertools import islice
 from time import perf_counter
 
 from servotwin.control.controller import Controller
+from servotwin.control.gains import gains_of
+from servotwin.control.laws import AnyController
+from servotwin.control.retuning import answer, integrates
 from servotwin.plant.plants import Plant, check_load_encoder
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
-from servotwin.redesign.certified.margins import laws_within, widened, with_margins
+from servotwin.redesign.certified.margins import integral_shares, laws_within, widened, with_margins
 from servotwin.redesign.certified.screening import Screening, is_plain, stops_widest
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
-_Gains = tuple[float, float, float, float]
+_Gains = tuple[float, ...]
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
 # Time constant of a velocity feedforward's filter, in units of 1 / crossover of a motor that Kp alone moves.
 _VELOCITY_TIME = 0.5
+# Tolerances at which an integral that stops within the lost motion begins again.
+_LEAVES = 2.0
 # Candidates that are compared on a machine that was observed.
 _MOVED = 12
 # Cost of the running setting over that of the cheapest one, up to which the running one stays.
@@ -153,7 +158,7 @@ def _any_of(kinds: Sequence[Callable[[Design], bool]]) -> Callable[[Design], boo
 def known_bias(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> float:
     """V: an input bias up to this counts as known, since the error that it leaves is a small share of the smallest
     step."""
-    return demands.known * abs(servo.pidf.Kp) * uncertainty.step[0]
+    return demands.known * abs(answer(servo.controller)) * uncertainty.step[0]
 
 
 def is_disturbed(servo: Plant, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
@@ -188,13 +193,14 @@ def candidates_of(
     InvalidInput
         No scaled controller is within the bounds on Ms.
     """
-    integral = demands.integral if disturbed else (0.0,)
+    integral = integral_shares(servo.controller, demands) if disturbed else (0.0,)
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]
     plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0] + servo.own_friction, demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
-    if not (0.0 < zone <= demands.tolerance and noisy):
+    plain += _zones_in_gap(servo, within, zone, demands)
+    if not (0.0 < zone <= demands.tolerance and noisy and isinstance(servo.controller, Controller)):
         return plain
     laws = [each.controller for each in plain if not each.tolerance]
     return plain + [
@@ -203,32 +209,35 @@ def candidates_of(
 
 
 @lru_cache(maxsize=16)
-def _without_zone(servo: Plant, within: tuple[Controller, ...], demands: Demands, step: float) -> tuple[Design, ...]:
+def _without_zone(servo: Plant, within: tuple[AnyController, ...], demands: Demands, step: float) -> tuple[Design, ...]:
     """Candidates without a dead zone that stops the whole law, the same for every gap, for a smallest step (m)."""
     laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
-    stopped = [each for law in laws if law.Ki for each in _stopped(servo, law, step, demands)]
+    stopped = [each for law in laws if integrates(law) for each in _stopped(servo, law, step, demands)]
     return (*(Design(law) for law in laws), *stopped)
 
 
-def _with_velocity(servo: Plant, law: Controller, demands: Demands) -> list[Controller]:
-    """A law as it is, and with velocity feedforwards."""
+def _with_velocity(servo: Plant, law: AnyController, demands: Demands) -> list[AnyController]:
+    """A law as it is, and a filtered PID with velocity feedforwards; others keep their own."""
+    if not isinstance(law, Controller):
+        return [law]
     needed, own = servo.command_per_speed / servo.p, abs(servo.pidf.Kp)
     shares = demands.velocity if demands.velocity_feedforward and own > 0.0 and needed > 0.0 else ()
     time = _VELOCITY_TIME * needed / own if shares else law.velocity_time
     return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
 
 
-def _with_friction(servo: Plant, laws: list[Controller], friction: float, demands: Demands) -> list[Controller]:
+def _with_friction(servo: Plant, laws: list[AnyController], friction: float, demands: Demands) -> list[AnyController]:
     """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
     every reversal what it holds against it."""
     fed = min(float(servo.command_of(friction)), demands.friction_limit)
     if not demands.friction_feedforward or not fed:
         return []
-    fed = math.copysign(fed, servo.pidf.Kp)
-    return [law.replace(friction_feedforward=fed) for law in laws if not law.Ki]
+    fed = math.copysign(fed, answer(servo.controller))
+    pids = [law for law in laws if isinstance(law, Controller) and not law.Ki]
+    return [law.replace(friction_feedforward=fed) for law in pids]
 
 
-def _stopped(servo: Plant, law: Controller, step: float, demands: Demands) -> list[Design]:
+def _stopped(servo: Plant, law: AnyController, step: float, demands: Demands) -> list[Design]:
     """A law with dead zones that stop its integral only, for a smallest step (m)."""
     counts = COUNTS * servo.position_resolution
     zones = [(share * step + counts, leave) for share, leave in demands.stops]
@@ -239,8 +248,28 @@ def _stopped(servo: Plant, law: Controller, step: float, demands: Demands) -> li
     ]
 
 
-def _gains(law: Controller) -> _Gains:
-    return law.Kp, law.Kd, law.Tf, law.notch_hz
+def _zones_in_gap(servo: Plant, laws: tuple[AnyController, ...], zone: float, demands: Demands) -> list[Design]:
+    """Laws other than the filtered PID with a dead zone over the lost motion (m), noise or not.
+
+    It stops the integral, which would wind up there, or opens the loop: a velocity loop in the motor holds the motor in
+    the middle of a gap only where the position loop asks for nothing.
+    """
+    if isinstance(servo.controller, Controller) or not 0.0 < zone <= demands.tolerance:
+        return []
+    stopped = [law.replace(integral_only=True, enter=1.0, leave=_LEAVES) for law in laws if integrates(law)]
+    opening = [law.replace(integral_only=False) for law in laws]
+    opened = [law.replace(enter=enter, leave=leave) for law in opening for enter, leave in demands.hysteresis]
+    return [Design(law, zone) for law in (*stopped, *opened)]
+
+
+def _gains(law: AnyController) -> _Gains:
+    """What tells laws with and without integral action apart from others."""
+    gains = gains_of(law)
+    return (*(getattr(gains, name) for name in gains.scaled), getattr(gains, "notch_hz", 0.0))
+
+
+def _velocity(law: AnyController) -> float:
+    return law.velocity_feedforward if isinstance(law, Controller) else 0.0
 
 
 def _ranked_in_stages(
@@ -251,14 +280,14 @@ def _ranked_in_stages(
     The running setting comes first, unless it fails or another one is worth the change: two settings that are as good
     would otherwise take turns, whenever the evidence moves a little.
     """
-    own = _gains(question.servo.pidf)
-    plain = [setting for setting in candidates if not setting.controller.Ki]
+    own = _gains(question.servo.controller)
+    plain = [setting for setting in candidates if not integrates(setting.controller)]
     if plain and len(plain) < len(candidates):
         fed = _velocities(screening.ranked(plain), own)
         candidates = plain + [
             each
             for each in candidates
-            if each.controller.Ki and fed.get(_gains(each.controller)) == each.controller.velocity_feedforward
+            if integrates(each.controller) and fed.get(_gains(each.controller)) == _velocity(each.controller)
         ]
     if question.uncertainty.usual_step is None:
         return _with_running(screening, candidates, running)
@@ -272,8 +301,8 @@ def _velocities(ranked: Iterator[Design], own: _Gains) -> dict[_Gains, float]:
     fed, best = dict[_Gains, float](), math.nan
     for setting in ranked:
         law = setting.controller
-        best = law.velocity_feedforward if math.isnan(best) else best
-        fed.setdefault(_gains(law), law.velocity_feedforward)
+        best = _velocity(law) if math.isnan(best) else best
+        fed.setdefault(_gains(law), _velocity(law))
         if len(fed) == _GAINS_WITH_INTEGRAL:
             break
     return {own: best} | fed

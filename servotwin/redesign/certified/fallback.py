@@ -28,6 +28,7 @@ from servotwin.redesign.certified.certificate import Certificate, Demands, NotVe
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.design import decoded_part
 from servotwin.runtime.files import atomic_output
 from servotwin.runtime.user_cache import cache_folder, source_digest
 
@@ -54,7 +55,7 @@ class CertificateFile(Struct, frozen=True, tag="fallback-certificate/1"):
 
 # MessagePack and not JSON, which has no infinity.
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(CertificateFile)
+_decoder = msgspec.msgpack.Decoder(CertificateFile, dec_hook=decoded_part)
 
 
 @lru_cache(maxsize=16)

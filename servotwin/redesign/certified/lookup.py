@@ -202,7 +202,7 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
     """
     stated, bias = policy.uncertainty.gap, grid.biases[key.bias]
     known = policy.uncertainty.replace(gap=cell_range(grid, stated, key), input_bias=(-bias, bias))
-    limit = policy.servo.pidf.voltage_limit
+    limit = policy.servo.controller.voltage_limit
     servo = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
     demands = policy.demands_within_band()
     certificate = certify(servo, known, demands, policy.simulations, 0.0, grid.noises[key.noise], policy.clock)

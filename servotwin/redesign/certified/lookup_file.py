@@ -15,6 +15,7 @@ from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.fallback import flattened
 from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, cells_of, certify_cell, table_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.design import decoded_part
 from servotwin.runtime import files
 
 SUFFIX = ".table"
@@ -43,7 +44,7 @@ class TableFile(Struct, frozen=True, tag="certified-table/1"):
 
 
 _encoder = msgspec.msgpack.Encoder()
-_decoder = msgspec.msgpack.Decoder(TableFile)
+_decoder = msgspec.msgpack.Decoder(TableFile, dec_hook=decoded_part)
 
 
 def load(path: Path, policy: CertifiedPolicy) -> CertifiedTable:

@@ -6,17 +6,27 @@ import math
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import lru_cache
+from typing import TypeAlias
 
 import numpy as np
 
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController, law_of
+from servotwin.control.linear_law import LinearLaw
+from servotwin.control.retuning import answer, integrates, scaled, unfed, without_integral
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Axis
+from servotwin.plant.law_set import LawSet
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 
+# Shares of the integral action of laws other than the filtered PID.
+_LAW_INTEGRAL = (0.0, 0.1, 0.3, 1.0)
+AnyPlantSet: TypeAlias = PlantSet | LawSet
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
 _WORTH_TRYING = 0.5
@@ -37,19 +47,21 @@ def widened(uncertainty: Uncertainty, demands: Demands) -> Uncertainty:
 
 
 @lru_cache(maxsize=16)
-def plant_set(servo: Plant, uncertainty: Uncertainty, rate: float | None) -> PlantSet:
-    """The model, the corners of the uncertainty and plants within, for a law with this rate."""
+def plant_set(servo: Plant, uncertainty: Uncertainty, rate: float | None) -> AnyPlantSet:
+    """The model, the corners of the uncertainty and plants within, for a law like the servo's own with this rate."""
     servos = extreme_plants(servo, uncertainty, _WITHIN, seed=0)
-    return PlantSet.of([each.plant() for each in servos], rate)
+    if isinstance(servo.controller, Controller):
+        return PlantSet.of([each.plant() for each in servos], rate)
+    return LawSet.of([each for each in servos if isinstance(each, Axis)], rate)
 
 
-def delays_of(law: Controller, uncertainty: Uncertainty) -> tuple[int, ...]:
+def delays_of(law: AnyController, uncertainty: Uncertainty) -> tuple[int, ...]:
     """Shortest and longest delay in samples."""
     return (0,) if law.sample_rate is None or uncertainty.delay == 0 else (0, uncertainty.delay)
 
 
 @lru_cache(maxsize=256)
-def loop_margins(servo: Plant, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
+def loop_margins(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> LoopMargins:
     """Margins of a law on the model and over all plants of an uncertainty.
 
     Parameters
@@ -57,14 +69,14 @@ def loop_margins(servo: Plant, uncertainty: Uncertainty, law: Controller) -> Loo
     servo : Servo or Axis
     uncertainty : Uncertainty
         Of the plant alone, as `widened` makes it: equal ones share a stored result.
-    law : Controller
+    law : Controller, Cascade or LinearLaw
     """
     plants = plant_set(servo, uncertainty, law.sample_rate)
     found = [plants.margins(law, delay) for delay in delays_of(law, uncertainty)]
     nominal = nominal_margins(servo, law)
     crossover = nominal.gain_crossovers[-1] if nominal.gain_crossovers else GainCrossover(0.0, math.pi)
     return LoopMargins(
-        plants=len(plants.A),
+        plants=plants.count,
         delay=delays_of(law, uncertainty)[-1],
         Ms=nominal.Ms,
         crossover=crossover.omega,
@@ -79,10 +91,20 @@ def loop_margins(servo: Plant, uncertainty: Uncertainty, law: Controller) -> Loo
 
 
 @lru_cache(maxsize=256)
-def nominal_margins(servo: Plant, law: Controller) -> Margins:
+def nominal_margins(servo: Plant, law: AnyController) -> Margins:
     """Margins of a law on the model itself, at the law's own rate."""
-    if law.sample_rate is None:
-        return servo.margins(law)
+    if isinstance(law, Controller) and law.sample_rate is not None:
+        return _sampled_margins(servo, law)
+    running = law_of(law)
+    if isinstance(servo, Axis):
+        if isinstance(running, LinearLaw) and running.sample_rate is not None:
+            running = running.held()
+        return servo.margins(running)
+    assert isinstance(running, Controller)
+    return servo.margins(running)
+
+
+def _sampled_margins(servo: Plant, law: Controller) -> Margins:
     plants = PlantSet.of([servo.plant()], law.sample_rate)
     return margins_of_response(
         lambda omega: plants.loop(law, 0, np.atleast_1d(omega)[None])[0],
@@ -94,7 +116,7 @@ def nominal_margins(servo: Plant, law: Controller) -> Margins:
 @lru_cache(maxsize=16)
 def laws_within(
     servo: Plant, uncertainty: Uncertainty, demands: Demands, integral: tuple[float, ...]
-) -> tuple[Controller, ...]:
+) -> tuple[AnyController, ...]:
     """Scaled controllers that are stable on all plants and keep to the bounds on Ms.
 
     Parameters
@@ -111,16 +133,16 @@ def laws_within(
     InvalidInput
         There is none.
     """
-    plants = plant_set(servo, uncertainty, servo.pidf.sample_rate)
-    delays = delays_of(servo.pidf, uncertainty)
-    own = servo.pidf
+    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
+    delays = delays_of(servo.controller, uncertainty)
+    own = servo.controller
     notched = with_notch(servo) if demands.notch else None
-    known: dict[Controller, bool] = {}
+    known: dict[AnyController, bool] = {}
 
-    def passes(law: Controller) -> bool:
+    def passes(law: AnyController) -> bool:
         if law not in known:
             # A dead zone may stop the integral: the law without it must be within the bounds too.
-            stopped = law.replace(Ki=0.0) if law.Ki and 0.0 in integral else law
+            stopped = without_integral(law) if integrates(law) and 0.0 in integral else law
             # A small peak alone says nothing: that of an unstable loop may be small.
             known[law] = (
                 (stopped is law or passes(stopped))
@@ -131,7 +153,7 @@ def laws_within(
 
     laws = _scaled_laws(own, demands, demands.shapes, integral)
     laws += _scaled_laws(own, demands, demands.learnt_shapes, integral) if uncertainty.learnt is not None else []
-    always = {scaled_law(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
+    always = {scaled(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
     within = _lively(laws, passes, always)
     if notched is not None and (uncertainty.learnt is not None or not within):
         with_it = _scaled_laws(notched, demands, demands.notch_shapes, integral)
@@ -143,23 +165,28 @@ def laws_within(
 
 
 def _scaled_laws(
-    own: Controller, demands: Demands, shapes: tuple[tuple[float, float], ...], integral: tuple[float, ...]
-) -> list[Controller]:
-    laws = [scaled_law(own, scale, shape, share) for share in integral for shape in shapes for scale in demands.scales]
+    own: AnyController, demands: Demands, shapes: tuple[tuple[float, float], ...], integral: tuple[float, ...]
+) -> list[AnyController]:
+    laws = [scaled(own, scale, shape, share) for share in integral for shape in shapes for scale in demands.scales]
     return list(dict.fromkeys(laws))
 
 
-def _lively(laws: list[Controller], passes: Callable[[Controller], bool], always: set[Controller]) -> list[Controller]:
+def _lively(
+    laws: list[AnyController], passes: Callable[[AnyController], bool], always: set[AnyController]
+) -> list[AnyController]:
     """Laws that pass and are of `always`, or have at least half of the gain of the fastest that passes: the others are
     slower, at every gap of the presets."""
-    fastest = next((law for law in sorted(laws, key=lambda law: -abs(law.Kp)) if passes(law)), None)
-    least = math.inf if fastest is None else _WORTH_TRYING * abs(fastest.Kp)
-    return [law for law in laws if (abs(law.Kp) >= least or law in always) and passes(law)]
+    fastest = next((law for law in sorted(laws, key=lambda law: -abs(answer(law))) if passes(law)), None)
+    least = math.inf if fastest is None else _WORTH_TRYING * abs(answer(fastest))
+    return [law for law in laws if (abs(answer(law)) >= least or law in always) and passes(law)]
 
 
-def with_notch(servo: Plant) -> Controller | None:
+def with_notch(servo: Plant) -> Controller | Cascade | None:
     """The servo's controller with a notch at the first resonance of its structure; None: nothing resonates, or at a
-    frequency that a sampled law hardly resolves."""
+    frequency that a sampled law hardly resolves; or the law has no place for one."""
+    own = servo.controller
+    if isinstance(own, LinearLaw) or (isinstance(own, Cascade) and own.notch_hz is not None):
+        return None
     poles = servo.plant().poles()
     # The angle from the imaginary axis is the damping ratio's arcsine.
     resonant = poles[(poles.imag > 0.0) & (-poles.real < _NOTCH_DAMPING * np.abs(poles))]
@@ -167,16 +194,24 @@ def with_notch(servo: Plant) -> Controller | None:
         return None
     first = complex(resonant[np.argmin(np.abs(resonant))])
     hertz, damping = abs(first) / (2.0 * math.pi), -first.real / abs(first)
-    rate = servo.pidf.sample_rate
+    rate = own.sample_rate
     if rate is not None and hertz > _RESOLVED * rate:
         return None
     # Rounded: what a window adds to a learnt resonance is not worth another notch.
     hertz = 2.0 ** (round(_PER_OCTAVE * math.log2(hertz)) / _PER_OCTAVE)
     depth = min(0.9, round(max(damping, _LEAST_DAMPING) / _NOTCH_DAMPING, 1))
-    return servo.pidf.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
+    return own.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
-def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demands: Demands) -> bool:
+def integral_shares(own: AnyController, demands: Demands) -> tuple[float, ...]:
+    """Factors on the own integral action that are tried.
+
+    That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it.
+    """
+    return demands.integral if isinstance(own, Controller) else _LAW_INTEGRAL
+
+
+def _keeps_to(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...], demands: Demands) -> bool:
     """True where no peak is beyond the bounds; what fails on the model itself is not tried elsewhere."""
     first = plants.peaks(law, delays[0])
     if first[0] > demands.Ms * _ROUNDED:
@@ -185,10 +220,10 @@ def _keeps_to(plants: PlantSet, law: Controller, delays: tuple[int, ...], demand
 
 
 def _none_within(
-    servo: Plant, uncertainty: Uncertainty, demands: Demands, plants: PlantSet, laws: list[Controller]
+    servo: Plant, uncertainty: Uncertainty, demands: Demands, plants: AnyPlantSet, laws: list[AnyController]
 ) -> str:
     """Reason why none of the laws is within the bounds."""
-    rate, delays = servo.pidf.sample_rate, delays_of(servo.pidf, uncertainty)
+    rate, delays = servo.controller.sample_rate, delays_of(servo.controller, uncertainty)
     at = "" if rate is None else f" at {rate:g} Hz with up to {uncertainty.delay} samples of delay"
     stable = [law for law in laws if _stable(plants, law, delays)]
     peaks = [max(float(plants.peaks(law, delay).max()) for delay in delays) for law in stable]
@@ -200,28 +235,16 @@ def _none_within(
     )
 
 
-def _stable(plants: PlantSet, law: Controller, delays: tuple[int, ...]) -> bool:
+def _stable(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...]) -> bool:
     return all(bool(plants.stable(law, delay).all()) for delay in delays)
 
 
-def scaled_law(own: Controller, scale: float, shape: tuple[float, float], share: float) -> Controller:
-    """The controller with Kp and Kd scaled, its derivative action moved by a shape, and a share of its Ki."""
-    lead, slower = shape
-    return own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share)
-
-
-def unfed(law: Controller) -> Controller:
-    """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
-    plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
-    return plain.replace(velocity_feedforward=0.0, velocity_time=1.0, friction_feedforward=0.0)
-
-
-def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: Controller) -> LoopMargins:
+def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> LoopMargins:
     """`loop_margins`, for a dead zone that stops the integral only the worse of those with and without the integral."""
     acting = loop_margins(servo, uncertainty, unfed(law))
     if not law.integral_only:
         return acting
-    stopped = loop_margins(servo, uncertainty, unfed(law).replace(Ki=0.0))
+    stopped = loop_margins(servo, uncertainty, without_integral(unfed(law)))
     most = {name: max(getattr(acting, name), getattr(stopped, name)) for name in ("Ms", "Ms_worst")}
     names = [field.name for field in fields(LoopMargins) if field.name.endswith("margin_worst")]
     least = {name: min(getattr(acting, name), getattr(stopped, name)) for name in (*names, "phase_margin", "passivity")}

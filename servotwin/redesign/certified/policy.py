@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import ClassVar, Protocol
 
-from servotwin.control.gains import with_gains
+from servotwin.control.gains import gains_of, with_gains
+from servotwin.control.retuning import answer
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
@@ -104,7 +105,7 @@ class CertifiedPolicy:
     @property
     def smallest_answer(self) -> float:
         """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
-        return abs(self.servo.pidf.Kp) * self.uncertainty.step[0]
+        return abs(answer(self.servo.controller)) * self.uncertainty.step[0]
 
     @property
     def bias_floor(self) -> float:
@@ -156,7 +157,7 @@ class CertifiedPolicy:
         demands, trial = self.demands_within_band(), self.simulations
         fed, in_force = region.feedforward, None
         if running is not None and running.gains is not None:
-            in_force = Design(with_gains(servo.pidf, running.gains), running.tolerance)
+            in_force = Design(with_gains(servo.controller, running.gains), running.tolerance)
         return certify(servo, known, demands, trial, fed, region.noise, self.clock, in_force)
 
     def confirm(
@@ -275,11 +276,15 @@ class CertifiedPolicy:
             return True
         low, high = self._friction(evidence)
         sticks = high > 0.0
-        if sticks and self._motor(evidence) is not None and (evidence.tuned_for is None or (low > 0.0 and gains.Ki)):
+        if (
+            sticks
+            and self._motor(evidence) is not None
+            and (evidence.tuned_for is None or (low > 0.0 and getattr(gains, gains.integral)))
+        ):
             # The fallback set is verified for the stated friction only, and an integral is not all that friction allows
             # once it is known.
             return True
-        return (gains.Ki != 0.0) != sticks and len(evidence.rests) > 0
+        return (getattr(gains, gains.integral) != 0.0) != sticks and len(evidence.rests) > 0
 
     def _motor(self, evidence: Evidence) -> LearntMotor | None:
         """The learnt motor, where it tells friction and bias well enough to act on them: to a small voltage, or to a
@@ -349,19 +354,21 @@ def alike(one: Design, other: Setting | None) -> bool:
     """True when two settings are the same but for what they feed forward against bias and friction."""
     if other is None or other.gains is None:
         return False
-    names = ["Kp", "Ki", "Kd", "Tf", "enter", "leave", "integral_only", "velocity_feedforward", "velocity_time"]
-    names += ["notch_hz", "notch_damping", "notch_depth"]
-    gains = ((getattr(other.gains, name), getattr(one.controller, name)) for name in names)
+    now, new = other.gains, gains_of(one.controller)
+    if type(now) is not type(new):
+        return False
+    names = [name for name in new.__struct_fields__ if name not in new.fed]
+    gains = ((getattr(now, name), getattr(new, name)) for name in names)
     pairs = (*gains, (other.tolerance, one.tolerance))
     return all(math.isclose(a, b, rel_tol=_SAME, abs_tol=0.0) for a, b in pairs)
 
 
 def _in_force(setting: Design, evidence: Evidence, small: float) -> bool:
     """True when the edge runs the setting already, by its last report, but for a `small` (V) change of feedforwards."""
-    now, new = evidence.gains, setting.controller
-    if now is None:
+    now, new = evidence.gains, gains_of(setting.controller)
+    if now is None or type(now) is not type(new):
         return False
-    changes = (now.feedforward - new.feedforward, now.friction_feedforward - new.friction_feedforward)
+    changes = [getattr(now, name) - getattr(new, name) for name in new.fed]
     return max(map(abs, changes)) <= small and alike(setting, evidence.setting)
 
 
@@ -371,7 +378,7 @@ def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
     The simulated machines are a sample: the real one may need half as long again as the slowest of them.
     """
     error = max(certificate.within, certificate.tail) + noise
-    effort = certificate.effort + abs(certificate.setting.controller.Kp) * (NEAR * certificate.step[1] + noise)
+    effort = certificate.effort + abs(answer(certificate.setting.controller)) * (NEAR * certificate.step[1] + noise)
     return Band(error, error, effort, math.ceil(1.5 * certificate.settling_worst))
 
 

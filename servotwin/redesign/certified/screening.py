@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.control.controller import Controller
+from servotwin.control.retuning import answer, friction_feedforward, integrates
 from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined
 from servotwin.redesign.certified.attempt import ROUNDED, Question
 from servotwin.redesign.certified.uncertainty import draw
@@ -31,14 +33,19 @@ _LARGEST = 0.8
 
 def is_plain(setting: Design) -> bool:
     """True without integral action and dead zone."""
-    return not setting.controller.Ki and not setting.tolerance
+    return not integrates(setting.controller) and not setting.tolerance
 
 
 def stops_widest(candidates: Sequence[Design]) -> Callable[[Design], bool]:
     """Predicate of the settings whose integral stops the furthest from the reference: of those with integral action
     they settle most surely."""
-    widest = max((each.tolerance for each in candidates if each.controller.integral_only), default=math.inf)
-    return lambda each: each.controller.integral_only and each.tolerance >= widest
+    widest = max((each.tolerance for each in candidates if _stops(each)), default=math.inf)
+    return lambda each: _stops(each) and each.tolerance >= widest
+
+
+def _stops(setting: Design) -> bool:
+    """True where a dead zone stops the integral only."""
+    return setting.controller.integral_only and (setting.tolerance > 0.0 or isinstance(setting.controller, Controller))
 
 
 def leaves_too_much(question: Question, setting: Design) -> bool:
@@ -48,9 +55,9 @@ def leaves_too_much(question: Question, setting: Design) -> bool:
     """
     known, servo, law = question.uncertainty, question.servo, setting.controller
     bias = max(abs(end + law.feedforward) for end in known.input_bias)
-    held = max(0.0, servo.command_of(known.friction[1] + servo.own_friction) - abs(law.friction_feedforward))
-    left = (bias + held) / abs(law.Kp)
-    return law.Ki == 0.0 and left > ROUNDED * question.largest_error(setting)
+    held = max(0.0, servo.command_of(known.friction[1] + servo.own_friction) - abs(friction_feedforward(law)))
+    left = (bias + held) / abs(answer(law))
+    return not integrates(law) and left > ROUNDED * question.largest_error(setting)
 
 
 @dataclass(frozen=True, order=True)
@@ -153,7 +160,7 @@ class Screening:
         Friction holds what they overshoot, which grows with the step.
         """
         question, known = self.question, self.question.uncertainty
-        pushed = [each for each in settings if each.controller.friction_feedforward]
+        pushed = [each for each in settings if friction_feedforward(each.controller)]
         if not pushed or known.usual_step is None:
             return
         largest = known.replace(step=(_LARGEST * known.step[1], known.step[1]))
@@ -197,10 +204,14 @@ class Screening:
 
         The verification is at the rate in any case.
         """
-        rate = setting.controller.sample_rate
+        law = setting.controller
+        # Only the filtered PID is simulated faster in continuous time.
+        if not isinstance(law, Controller):
+            return setting
+        rate = law.sample_rate
         if rate is None or rate < _FAST * self.question.trial.rate:
             return setting
-        return Design(setting.controller.replace(sample_rate=None), setting.tolerance)
+        return Design(law.replace(sample_rate=None), setting.tolerance)
 
     def _is_whole(self, setting: Design) -> bool:
         return self._known[setting].cost.size == self._members.count

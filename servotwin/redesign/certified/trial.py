@@ -7,6 +7,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController
+from servotwin.control.retuning import answer, unfed
+from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
@@ -14,7 +17,6 @@ from servotwin.redesign.certified.margins import (
     laws_within,
     nominal_margins,
     plant_set,
-    unfed,
     widened,
     with_margins,
 )
@@ -77,19 +79,26 @@ def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial
 @lru_cache(maxsize=16)
 def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
     laws = laws_within(servo, uncertainty, demands, (0.0,))
-    plants = plant_set(servo, uncertainty, servo.pidf.sample_rate)
+    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
-    loop = nominal_margins(servo, unfed(_reference(servo.pidf, laws)))
-    crossover = loop.gain_crossovers[-1].omega if loop.gain_crossovers else slowest
+    loop = nominal_margins(servo, unfed(_reference(servo.controller, laws)))
+    crossover = _speed(loop, servo, slowest)
     duration = max(_LENGTH / crossover, _DECAYS / slowest)
     resonance = loop.Ms_omega if loop.Ms_omega < math.inf else 0.0
     rate = min(max(_SAMPLING * crossover, _RESONANCE * resonance), _MOST_SAMPLES / duration)
-    sampled = servo.pidf.sample_rate
+    sampled = servo.controller.sample_rate
     if sampled is not None:
         rate = sampled / max(1, round(sampled / rate))
     return Trial(duration, _JUDGED * duration, rate, None, 1.0 / crossover)
 
 
-def _reference(own: Controller, laws: tuple[Controller, ...]) -> Controller:
+def _speed(loop: Margins, servo: Plant, slowest: float) -> float:
+    """rad/s: the highest crossover; behind a velocity loop, which crosses over first, the bandwidth of the position."""
+    if isinstance(servo.controller, Controller):
+        return loop.gain_crossovers[-1].omega if loop.gain_crossovers else slowest
+    return loop.bandwidth if math.isfinite(loop.bandwidth) else slowest
+
+
+def _reference(own: AnyController, laws: tuple[AnyController, ...]) -> AnyController:
     """The candidate whose gain is the nearest to the servo's own: the crossover is its."""
-    return min(laws, key=lambda law: abs(law.Kp / own.Kp - 1.0) if own.Kp else 0.0)
+    return min(laws, key=lambda law: abs(answer(law) / answer(own) - 1.0) if answer(own) else 0.0)

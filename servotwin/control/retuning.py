@@ -1,0 +1,78 @@
+"""One notion for laws of every kind of what a redesign does to them: scale, stop the integral, take feedforwards away.
+
+Kp of the filtered PID is velocity_gain position_gain / ratio of a cascade, its Kd is velocity_gain, its Tf the filter
+of the speed. A linear law has one factor on everything, and no shapes.
+"""
+
+from servotwin.control.cascade import Cascade
+from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
+
+
+def answer(law: AnyController) -> float:
+    """Command at rest per error of the position (V/m) without integral action."""
+    if isinstance(law, Controller):
+        return law.Kp
+    if isinstance(law, Cascade):
+        return (law.velocity_gain or 1.0) * law.position_gain / law.ratio
+    return law.answer
+
+
+def integrates(law: AnyController) -> bool:
+    """True where a law has integral action."""
+    if isinstance(law, Controller):
+        return law.Ki != 0.0
+    if isinstance(law, Cascade):
+        return law.integral_time is not None
+    return bool(law.holds) and law.integral_share != 0.0
+
+
+def without_integral(law: AnyController) -> AnyController:
+    """The law without its integral action, as a dead zone leaves it that stops the integral only."""
+    if isinstance(law, Controller):
+        return law.replace(Ki=0.0)
+    if isinstance(law, Cascade):
+        return law.replace(integral_time=None)
+    return law.replace(integral_share=0.0)
+
+
+def friction_feedforward(law: AnyController) -> float:
+    """Command added with the sign of the reference's last change; only the filtered PID has it."""
+    return law.friction_feedforward if isinstance(law, Controller) else 0.0
+
+
+def filter_time(law: AnyController) -> float | None:
+    """Time constant with which a law differentiates, s; None: not known."""
+    return law.Tf if isinstance(law, Controller) else law.speed_filter if isinstance(law, Cascade) else None
+
+
+def scaled(own: AnyController, scale: float, shape: tuple[float, float], share: float) -> AnyController:
+    """The law with its gain scaled, its derivative action moved by a shape (lead, slower), and a share of its integral
+    gain."""
+    lead, slower = shape
+    if isinstance(own, Controller):
+        return own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share)
+    if isinstance(own, LinearLaw):
+        # A share counts over the own integral gain, which the gain scales too.
+        return own.replace(gain=own.gain * scale, integral_share=own.integral_share * share / scale)
+    if own.velocity_gain is None:
+        return own.replace(position_gain=own.position_gain * scale)
+    gain = own.velocity_gain * scale * lead * slower
+    time = None if own.integral_time is None or share == 0.0 else own.integral_time * (gain / own.velocity_gain) / share
+    return own.replace(
+        velocity_gain=gain,
+        position_gain=own.position_gain / (lead * slower),
+        speed_filter=own.speed_filter * slower,
+        integral_time=time,
+    )
+
+
+def unfed(law: AnyController) -> AnyController:
+    """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
+    plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
+    if isinstance(plain, Controller):
+        return plain.replace(velocity_feedforward=0.0, velocity_time=1.0, friction_feedforward=0.0)
+    if isinstance(plain, Cascade):
+        return plain.replace(velocity_feedforward=0.0, acceleration_feedforward=0.0)
+    return plain

@@ -1,0 +1,86 @@
+"""A cascade tuned from inside outwards has the crossovers and margins that were asked for."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servotwin as st
+from servotwin.analysis.tuning.cascade import tune_cascade
+from servotwin.cli.tune import TuneOptions, print_tuning
+from servotwin.plant.linear import Complex
+from servotwin.plant.signals import Array
+
+SCREW = st.Axis.preset("ball-screw")
+OWN = st.Cascade(1.0, SCREW.p, velocity_gain=1e-2, integral_time=0.1, notch_hz=250.0, low_pass_hz=600.0)
+AXIS = SCREW.replace(controller=OWN)
+
+
+def velocity_loop(law: st.Cascade, omega: Array) -> Complex:
+    """PI, filter of the speed, notch and low-pass in closed form, on the motor."""
+    s = 1j * omega
+    assert law.velocity_gain is not None
+    pi = law.velocity_gain * (1.0 + (1.0 / (law.integral_time * s) if law.integral_time else 0.0))
+    notch = 2.0 * math.pi * 250.0
+    band = 2.0 * 0.5 * s / notch
+    shaped = (1.0 + (s / notch) ** 2 + 0.1 * band) / (1.0 + (s / notch) ** 2 + band)
+    shaped = shaped / (1.0 + s / (2.0 * math.pi * 600.0))
+    return np.asarray(pi * shaped * s / (law.speed_filter * s + 1.0) * AXIS.plants()[0].response(omega))
+
+
+@pytest.mark.parametrize("integral", [True, False])
+def test_both_loops_have_their_crossovers(integral: bool) -> None:
+    """The position loop in closed form too: the load's position per angle behind the closed velocity loop."""
+    margin = math.radians(40.0 if integral else 20.0)
+    tuned = tune_cascade(AXIS, 300.0, margin, position_crossover=40.0, integral=integral)
+    law = tuned.controller
+    inner = complex(velocity_loop(law, np.array([300.0]))[0])
+    assert abs(inner) == pytest.approx(1.0, rel=1e-9)
+    if integral:
+        assert math.pi + math.atan2(inner.imag, inner.real) == pytest.approx(margin, rel=1e-9)
+    else:
+        assert law.integral_time is None
+    omega = np.array([40.0])
+    motor, load = (plant.response(omega) for plant in AXIS.plants())
+    loop = velocity_loop(law, omega)
+    # Without the filter of the speed in the way forward.
+    ahead = loop * (law.speed_filter * 1j * omega + 1.0) / (1j * omega)
+    outer = complex((law.position_gain / law.ratio * ahead * load / motor / (1.0 + loop))[0])
+    assert abs(outer) == pytest.approx(1.0, rel=1e-9)
+    assert math.pi + math.atan2(outer.imag, outer.real) == pytest.approx(tuned.position_margin, rel=1e-9)
+    assert tuned.margins.stable
+
+
+def test_a_margin_that_no_pi_reaches_is_refused_with_what_can_be() -> None:
+    with pytest.raises(st.InvalidInput, match=r"phase margin = 120 deg: a PI velocity loop reaches .* at 300 rad/s"):
+        tune_cascade(AXIS, 300.0, math.radians(120.0))
+
+
+def test_other_controllers_are_refused() -> None:
+    with pytest.raises(st.InvalidInput, match="must be a cascade with a velocity_gain"):
+        tune_cascade(SCREW, 300.0, 1.0)
+
+
+def test_an_unstable_result_names_the_gains_as_the_file_does() -> None:
+    with pytest.raises(
+        st.InvalidInput, match=r"cascade \(position_gain_per_s = .*velocity_gain_n_m_s_per_rad = .*unst"
+    ):
+        tune_cascade(AXIS, 200.0, math.radians(60.0), position_crossover=1500.0)
+
+
+def test_the_command_shows_the_keys_of_the_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "axis.toml"
+    path.write_text(AXIS.dumps())
+    options = TuneOptions(str(path), "PIDF", 300.0, 40.0, math.inf, "Ms", 0.0, 1.0, None)
+    print_tuning(options, as_json=True)
+    shown = json.loads(capsys.readouterr().out)["gains"]
+    law = tune_cascade(AXIS, 300.0, math.radians(40.0)).controller
+    assert shown == {
+        "position_gain_per_s": law.position_gain,
+        "velocity_gain_n_m_s_per_rad": law.velocity_gain,
+        "integral_time_s": law.integral_time,
+    }
+    print_tuning(options, as_json=False)
+    assert "position_gain_per_s" in capsys.readouterr().out

@@ -1,0 +1,115 @@
+"""The edge bounds the numbers of every kind of law, and carries them over a restart."""
+
+from pathlib import Path
+
+import pytest
+from msgspec.structs import replace
+
+from servotwin.control.cascade import Cascade
+from servotwin.control.gains import gains_of
+from servotwin.control.linear_law import LinearLaw
+from servotwin.edge.guard import Instant, Limits, judge
+from servotwin.edge.parameters import Parameters
+from servotwin.edge.settings import AgentSettings
+from servotwin.edge.store import FileParameterStore
+from servotwin.edge_process.startup import permitted
+from servotwin.errors import InvalidInput
+from servotwin.messages import AnyGains, Gains, Reason, Setting, Update
+
+CASCADE = Cascade(
+    20.0,
+    0.1,
+    velocity_gain=3.0,
+    integral_time=0.1,
+    velocity_feedforward=0.5,
+    acceleration_feedforward=0.2,
+    sample_rate=1e3,
+)  # fmt: skip
+LINEAR = LinearLaw([[0.0]], [[2.0, 0.0, -2.0]], [1.0], [3.0, 0.0, -3.0], 1e3, names=("integral",), holds=("integral",))
+OWN, LINEAR_OWN = gains_of(CASCADE), gains_of(LINEAR)
+
+
+def judged(gains: AnyGains, limits: Limits, own: AnyGains = OWN, seconds: float = 10.0) -> Reason:
+    known = (None, None, (None, None))
+    update = Update("axis-1", 1, 0, ("b0", 0), 9.0, *known, "OK", Setting.of(1e-4, gains), 60.0)
+    current = Parameters(setting=Setting.of(1e-4, own))
+    return judge(update, current, limits, Instant("axis-1", "b0", round(seconds * 1000), 1000.0), own)
+
+
+@pytest.mark.parametrize(
+    ("changes", "inside"),
+    [
+        ({}, True),
+        ({"position_gain": 80.0}, True),
+        ({"position_gain": 80.1}, False),
+        ({"position_gain": 4.9}, False),
+        ({"velocity_gain": 12.1}, False),
+        ({"velocity_gain": 0.0}, False),
+        ({"speed_filter": 4.1e-3}, False),
+        ({"integral_time": 0.0}, True),
+        ({"integral_time": 0.0999}, False),
+        ({"velocity_gain": 6.0, "integral_time": 0.2}, True),
+        ({"velocity_gain": 6.0, "integral_time": 0.199}, False),
+        ({"velocity_feedforward": 1.0}, True),
+        ({"velocity_feedforward": 1.01}, False),
+        ({"acceleration_feedforward": 0.8}, True),
+        ({"acceleration_feedforward": 0.81}, False),
+        ({"leave": 4.1}, False),
+        ({"feedforward": -0.26}, False),
+        ({"notch_hz": 4.0}, False),
+    ],
+)
+def test_the_numbers_of_a_cascade_stay_in_the_box(changes: dict[str, float], inside: bool) -> None:
+    expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(OWN, **changes), Limits()) is expected
+
+
+@pytest.mark.parametrize(
+    ("changes", "inside"),
+    [
+        ({"gain": 4.0, "integral_share": 0.25}, True),
+        ({"gain": 4.0, "integral_share": 0.26}, False),
+        ({"gain": 4.1, "integral_share": 0.0}, False),
+        ({"gain": 0.24}, False),
+        ({"leave": 4.1}, False),
+        ({"feedforward": 0.26}, False),
+    ],
+)
+def test_the_numbers_of_a_linear_law_stay_in_the_box(changes: dict[str, float], inside: bool) -> None:
+    expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(LINEAR_OWN, **changes), Limits(), LINEAR_OWN) is expected
+
+
+def test_gains_of_another_kind_of_law_are_refused() -> None:
+    for gains in (Gains(1.0, 1.0, 1.0, 1.0), LINEAR_OWN):
+        assert judged(gains, Limits(gain_factor=1e9)) is Reason.GAINS_OUT_OF_BOUNDS
+
+
+def test_a_velocity_loop_changes_no_faster_than_allowed() -> None:
+    limits = Limits(gain_step=1.5)
+    assert judged(replace(OWN, velocity_gain=4.5, integral_time=0.15), limits) is Reason.APPLIED
+    assert judged(replace(OWN, velocity_gain=4.6, integral_time=0.2), limits) is Reason.GAINS_STEP_TOO_LARGE
+    assert judged(replace(OWN, velocity_gain=3.0, integral_time=0.0), limits) is Reason.APPLIED
+
+
+@pytest.mark.parametrize("own", [OWN, LINEAR_OWN])
+def test_the_numbers_of_a_law_outlive_a_restart(tmp_path: Path, own: AnyGains) -> None:
+    store = FileParameterStore(tmp_path / "parameters.json")
+    parameters = Parameters(version=7, setting=Setting.of(2e-4, own))
+    store.save(parameters)
+    assert store.load() == parameters
+
+
+def test_stored_numbers_of_another_law_are_dropped_at_a_restart() -> None:
+    """The file of an edge whose drive was tuned anew as a cascade."""
+    agent = AgentSettings("axis-1", "b1", 1e3, controller=CASCADE)
+    kept = Parameters(version=7, setting=Setting.of(2e-4, OWN))
+    assert permitted(kept, agent) is kept
+    assert permitted(Parameters(version=7, setting=Setting.of(2e-4, Gains(1.0, 0.0, 0.0, 1.0))), agent) is None
+
+
+def test_limits_on_a_notch_fit_the_rate_of_a_cascade() -> None:
+    with pytest.raises(
+        InvalidInput, match=r"notch_max_hz = 500.0 Hz: must be below half of the controller's 1000.0 Hz"
+    ):
+        AgentSettings("axis-1", "b1", 1e3, controller=CASCADE, limits=Limits(notch_max_hz=500.0))
