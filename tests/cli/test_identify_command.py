@@ -93,8 +93,8 @@ def test_json_is_for_machines(folder):
 
 @pytest.mark.slow
 def test_a_log_of_another_maker_needs_a_servo(folder, tmp_path):
-    result = run(folder / "plain.csv")
-    assert (result.exit_code, "give --servo" in result.stderr) == (2, True)
+    with pytest.raises(InvalidInput, match="give --servo"):
+        identify(IdentifyOptions(folder / "plain.csv"))
     (tmp_path / "mine.toml").write_text(Servo.preset("paper").dumps())
     ours, named = (
         identify(IdentifyOptions(folder / "plain.csv", servo=s)) for s in (str(tmp_path / "mine.toml"), "paper")
