@@ -47,6 +47,9 @@ def plant_of(text: str, source: str) -> Plant:
 
 def structure_of(plant: Plant) -> tuple[object, ...]:
     """Make the key that plants share whose automata have the same states and modes."""
+    if isinstance(plant, Servo):
+        # Machines are drawn by the hundred: their matrices are not made for this.
+        return type(plant), plant.n, plant.play
     guide, damped = plant.guide, bool(np.any(plant.chain().reaction_velocity))
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction), plant.command_limit is not None
     falling = bool(plant.motor_stribeck.slope), bool(guide.stribeck.slope)
