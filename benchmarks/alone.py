@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import accuracy, certificates, compensation, endurance, friction_feedforward, glances, tick
+from benchmarks import accuracy, certificates, compensation, endurance, friction_feedforward, glances, overload, tick
 from benchmarks import windows as from_windows
 from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
@@ -38,6 +38,7 @@ ALONE: Mapping[str, QualityBenchmark] = {
     accuracy.NAME: QualityBenchmark(accuracy.accuracy, QUICK_SIZE, 1.0),
     endurance.NAME: QualityBenchmark(endurance.endurance, endurance.QUICK, endurance.MACHINES),
     whole.NAME: QualityBenchmark(whole.fleet, QUICK, FleetScale()),
+    overload.NAME: QualityBenchmark(overload.overload, overload.QUICK, overload.SMALL),
     glances.NAME: QualityBenchmark(glances.triage, glances.QUICK, glances.GAPS),
     side_by_side.NAME: QualityBenchmark(side_by_side.policies, side_by_side.QUICK, side_by_side.MACHINES),
     in_the_loop.NAME: QualityBenchmark(in_the_loop.loops, in_the_loop.QUICK, in_the_loop.MACHINES),
@@ -51,6 +52,8 @@ ALONE: Mapping[str, QualityBenchmark] = {
     worth_sending.NAME: QualityBenchmark(worth_sending.novelty, worth_sending.QUICK, None),
 }
 
+FULL: Mapping[str, Any] = {whole.NAME: FleetScale().full(), overload.NAME: overload.OverloadScale()}
+"""Scale of the full length, for benchmarks that have one."""
 SEEDED = (from_windows.NAME, in_the_loop.NAME, certificates.NAME)
 """Benchmarks whose machines follow a seed that can be chosen."""
 
@@ -66,7 +69,7 @@ def run_alone(
 ) -> bool:
     """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
-    `full` applies to the fleet only: the full length of the documented figures. `seed` applies to those of `SEEDED`.
+    `full` applies to those of `FULL`: the full length of the documented figures. `seed` applies to those of `SEEDED`.
 
     Raises
     ------
@@ -74,8 +77,8 @@ def run_alone(
         Other names or options beside it.
     """
     name = next((name for name in names if name in ALONE), None)
-    if full and (tuple(names) != (whole.NAME,) or quick):
-        raise InvalidInput(f"--full: only bench {whole.NAME} takes it, and not with --quick")
+    if full and (len(names) != 1 or names[0] not in FULL or quick):
+        raise InvalidInput(f"--full: only bench {' or '.join(FULL)} takes it, and not with --quick")
     if seed is not None and not (len(names) == 1 and names[0] in SEEDED):
         raise InvalidInput(f"--seed: only bench {', '.join(SEEDED[:-1])} or {SEEDED[-1]} takes it")
     if name is None:
@@ -83,7 +86,7 @@ def run_alone(
     if len(names) > 1 or others:
         raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
     chosen = ALONE[name]
-    scale = FleetScale().full() if full else chosen.quick if quick else chosen.whole
+    scale = FULL[name] if full else chosen.quick if quick else chosen.whole
     if seed is None:
         chosen.run(date, output, scale)
     else:

@@ -16,13 +16,15 @@ def bench(
         list[str] | None,
         typer.Argument(
             help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, hostile, "
-            "policies, loops, certificates, compensation, friction, tick, novelty, triage, fleet."
+            "policies, loops, certificates, compensation, friction, tick, novelty, triage, fleet, overload."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
     runs: Annotated[int | None, typer.Option(min=1, help="Rounds; 7 by default.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Small workloads, as a check.")] = False,
-    full: Annotated[bool, typer.Option("--full", help="fleet: five minutes, and an outage of ten.")] = False,
+    full: Annotated[
+        bool, typer.Option("--full", help="fleet: five minutes, and an outage of ten; overload: ten minutes.")
+    ] = False,
     seed: Annotated[int | None, typer.Option(min=0, help="windows, loops, certificates: seed of the machines.")] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Add jobs of many seconds: scipy, compilation.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,

@@ -18,6 +18,7 @@ from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 KNOWN_BIAS, UNKNOWN_BIAS = (-2e-4, 2e-4), (-0.1, 0.1)  # V
 NARROW, WIDE, WHOLE = (9.9, 10.1), (39.9, 40.1), (0.0, 60.0)  # deg
 RATE, COUNTS = 5e3, 1e-6  # Hz, m rms of the encoder
+COUNT = 1e-6  # m, of a position sensor that counts
 # Posterior of a machine that has been learnt, and the step that it makes to and fro.
 LEARNT = LearntFactors(("k", "c"), (0.01, 0.1), ((9e-6, 0.0), (0.0, 9e-4)))
 USUAL_STEP = (1e-3, 1e-3)  # m
@@ -28,7 +29,8 @@ def decisions(quick: bool) -> tuple[Contestant, ...]:
     """Narrow gaps with a known input bias and the whole stated range, continuous and at 5 kHz; `quick`: fewer and
     shorter runs.
 
-    At 5 kHz also a machine that has been learnt and moves to and fro, an input bias that is not known, and friction.
+    At 5 kHz also a machine that has been learnt and moves to and fro, an input bias that is not known, friction, and a
+    position sensor that counts.
     """
     servo = Servo.preset("paper")
     fast = servo.replace(controller=servo.controller.replace(sample_rate=RATE))
@@ -43,6 +45,7 @@ def decisions(quick: bool) -> tuple[Contestant, ...]:
         _decision("bias not known, 5 kHz", fast, _known(NARROW, UNKNOWN_BIAS), quick, COUNTS),
         _decision("friction, 5 kHz", fast, narrow.replace(friction=(0.4 * torque, torque)), quick),
         _decision("fallback set, 5 kHz", fast, whole, quick),
+        _decision("counts of 1 um, 5 kHz", fast.replace(position_resolution=COUNT), narrow, quick),
     )
 
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks import report
+from benchmarks.batch import Batch
 from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachine, worn_machines
 from servotwin.analysis.maps.pool import shared, workplace
 from servotwin.control.laws import filtered_pid
@@ -133,7 +134,11 @@ def _block(block: str, count: int, seed: int) -> list[LoopRow]:
     """Rows of the twin, of the constant that is verified, of two others, and of the best constant with hindsight."""
     tasks = [_Task(place, machine) for place, machine in enumerate(worn_machines(block, count, seed))]
     found = dict(sorted((task.place, scores) for task, scores in shared(_compared, tasks)))
-    rows = {name: LoopRow(block, name, tuple(scores[name] for scores in found.values())) for name in found[0]}
+    return _rows(block, list(found.values()))
+
+
+def _rows(block: str, found: Sequence[Mapping[str, LoopScores]]) -> list[LoopRow]:
+    rows = {name: LoopRow(block, name, tuple(scores[name] for scores in found)) for name in found[0]}
     constants = [row for row in rows.values() if row.name not in (TWIN, FALLBACK)]
     best = min(constants, key=lambda row: row.at("cost", 95.0))
     best = best._replace(name=f"best constant: {best.name}")
@@ -197,6 +202,30 @@ def scored(machine: WornMachine, run: Run) -> LoopScores:
         settled=float(0.5 * np.ptp(last) <= still),
         tail=float(np.abs(last).max()),
     )
+
+
+def _units(blocks: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, _Task]]:
+    """Machines of all blocks by turns, so that a run that ends early has as many of each."""
+    drawn = {block: worn_machines(block, count, seed) for block in blocks}
+    for place in range(count):
+        yield from ((f"{seed}/{block}/{place}", _Task(place, machines[place])) for block, machines in drawn.items())
+
+
+def _numbers(task: _Task) -> dict[str, dict[str, float]]:
+    return {name: scores._asdict() for name, scores in _compared(task).items()}
+
+
+def _show(found: Mapping[str, Any], console: Console) -> None:
+    """A table for each block, of all its machines of whatever seed."""
+    for block in BLOCKS:
+        those = [numbers for key, numbers in sorted(found.items()) if key.split("/")[1] == block]
+        if those:
+            scores = [{name: LoopScores(**each) for name, each in numbers.items()} for numbers in those]
+            console.print(shown(_rows(block, scores)))
+
+
+BATCH = Batch(_units, _numbers, _show, BLOCKS)
+"""For `benchmarks.batch`."""
 
 
 def shown(rows: Sequence[LoopRow]) -> Table:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -35,13 +36,27 @@ def up(
     run(folder, speed, seconds)
 
 
+class TwinAction(StrEnum):
+    """What `servotwin twin` does instead of serving."""
+
+    CHECK = "check"
+
+
 def twin(
+    action: Annotated[
+        TwinAction | None, typer.Argument(help="check: check the whole store, also while the twin runs, and end.")
+    ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
     port: Annotated[
         int | None, typer.Option(min=0, max=65535, help="Port instead of the file's; 0: any free port.")
     ] = None,
 ) -> None:
     """Run the twin as a service: it receives windows, stores estimates and sends updates."""
+    if action is TwinAction.CHECK:
+        from servotwin.cli.check import check_store
+
+        check_store(config)
+        return
     from servotwin.twin_service.command import run
 
     run(config, port)

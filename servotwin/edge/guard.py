@@ -255,9 +255,11 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
         (update.window[0] == here.boot, Reason.OTHER_BOOT),
         (update.version > current.version, Reason.OLD_VERSION),
         (update.data_time > current.data_time, Reason.OLD_DATA),
-        (update.base_version == current.version, Reason.BASE_MISMATCH),
         (update.data_time <= here.time, Reason.FUTURE_DATA),
+        # Before the base: an update that is too late fails for that, whatever else was applied meanwhile, and the twin
+        # would send one with another base again.
         (here.time < update.not_after and here.time - update.data_time <= limits.lifetime_s, Reason.EXPIRED),
+        (update.base_version == current.version, Reason.BASE_MISMATCH),
         (limits.allows_tolerance(new), Reason.OUT_OF_BOUNDS),
         (limits.allows_tolerance_step(old, new, since), Reason.STEP_TOO_LARGE),
         # Without a window the parameters are those of the start or a fallback, from which no interval counts.

@@ -46,6 +46,9 @@ def plant_of(text: str, source: str) -> Plant:
 
 def structure_of(plant: Plant) -> tuple[object, ...]:
     """Make the key that plants share whose automata have the same states and modes."""
+    if isinstance(plant, Servo):
+        # Machines are drawn by the hundred: their matrices are not made for this.
+        return type(plant), plant.n, plant.play
     guide, damped = plant.guide, bool(np.any(plant.chain().reaction_velocity))
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
     return type(plant), plant.n, plant.play, damped, plant.shaft().names, plant.at_motor, *forces

@@ -34,6 +34,8 @@ UNFILLED = 3
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
+# Ticks that a count must last before a block pays: the next ones are likely to last as long, this one as long again.
+_LASTS = 16
 TICKED = -1
 """Slot of a segment that is one tick, its state taken after it."""
 VAST = -2
@@ -115,6 +117,10 @@ def with_feedforward_of(parameters: LawParameters, places: Places, z: Array) -> 
 def take_tick(loop: LiftedLoop, places: Places, z: Array, place: Place) -> float:
     """The edge's tick on the state; return the error that was measured."""
     p, y = with_feedforward_of(loop.parameters, places, z), z[places.position]
+    if places.counted >= 0:
+        y = np.round(y / loop.resolution) * loop.resolution
+        place.at[7] = 1 if y == z[places.counted] else 0
+        z[places.counted] = y
     last = z[places.waiting + places.delay - 1] if places.delay > 0 else z[places.voltage]
     filtered = z[places.filtered] if places.filtered >= 0 else y
     active = 1.0 if place.at[2] == 1 else 0.0
@@ -184,6 +190,9 @@ def set_bounds(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory
         elif kind == LIMITED:
             low[count], high[count] = -np.inf, np.inf
         count += 2
+    if places.counted >= 0:
+        low[count], high[count], slack[count] = -0.5 * loop.resolution, 0.5 * loop.resolution, -1.0
+        count += 1
     return count
 
 
@@ -290,7 +299,8 @@ def run_lifted(
         if record.size[1] > room:
             return FULL
         set_reference(places, coefficients, at[0] / rate - origin, z)
-        if at[5] > 0 and end - at[0] >= 2:
+        least = _LASTS if places.counted >= 0 and at[8] < _LASTS else 1
+        if at[5] >= least and end - at[0] >= 2:
             filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
             at[6] = 1 if deepens(place, end, filled) else 0
             if filled == 0 or at[6] == 1:
@@ -320,6 +330,8 @@ def run_lifted(
                 return ZENO
         # Another branch may hold for one tick only: blocks begin after two alike.
         alike = at[1] == mode and at[2] == active and at[4] == side and at[3] == kind and place.sign[0] == sign
+        if places.counted >= 0 and at[7] == 0:
+            alike, at[8] = False, at[5]
         at[5] = at[5] + 1 if alike else 0
         at[0] += 1
     return DONE

@@ -62,8 +62,10 @@ def advances_in_blocks(servo: Plant, controller: Controller, inputs: RunInputs, 
     return (samples - 1) * round(ratio) >= max(pieces * _TICKS_PER_PIECE, _TICKS_PER_RUN)
 
 
-def places_of(plant: ServoAutomaton, controller: Controller, delay: int, reference_degree: int) -> Places:
-    """Indices of the plant's, the law's and the inputs' states.
+def places_of(
+    plant: ServoAutomaton, controller: Controller, delay: int, reference_degree: int, counts: bool = False
+) -> Places:
+    """Indices of the plant's, the law's and the inputs' states; `counts`: of a position sensor with a resolution.
 
     Spare states of the plant, which nothing moves and nothing reads, hold the law's first ones: with the paper's servo
     there are 16 then instead of 20, and products take a third of the time less.
@@ -81,6 +83,7 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
         ("ahead", controller.velocity_feedforward != 0.0),
         ("notch", controller.notch_hz != 0.0),
         ("notch_low", controller.notch_hz != 0.0),
+        ("counted", counts),
     ):
         places[name] = -1
         if exists and spare:
@@ -102,11 +105,11 @@ def places_of(plant: ServoAutomaton, controller: Controller, delay: int, referen
     )
 
 
-def watches_of(plant: ServoAutomaton, controller: Controller, dead_zone: bool) -> int:
+def watches_of(plant: ServoAutomaton, controller: Controller, dead_zone: bool, counts: bool = False) -> int:
     """Largest number of quantities that a block must bound."""
     guards = max(len(mode.guards) for mode in plant.automaton.modes)
     limits = (controller.voltage_limit is not None) + 2 * (controller.rate_limit is not None)
-    return guards + dead_zone + limits
+    return guards + dead_zone + limits + counts
 
 
 def new_memory(places: Places, modes: int, watches: int) -> LiftedMemory:
@@ -151,14 +154,16 @@ class LiftedEngine:
         self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias, friction)
         self.step, searches = search_step(self.plant.automaton, 1.0 / rate)
         self.tables = tables_for(self.plant.automaton, self.step)
-        self.places = places_of(self.plant, self.controller, self.delay, degree(self.inputs.reference))
+        resolution = self.servo.position_resolution
+        counts = resolution > 0.0
+        self.places = places_of(self.plant, self.controller, self.delay, degree(self.inputs.reference), counts)
         start = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             start[index] = value
         set_states(self.plant, start, constants)
         self.state = np.zeros(self.places.states)
         self.state[: self.places.plant] = start
-        for follower in (self.places.filtered, self.places.past):
+        for follower in (self.places.filtered, self.places.past, self.places.counted):
             if follower >= 0:
                 self.state[follower] = start[self.places.position]
         if self.places.feedforward >= 0:
@@ -166,12 +171,14 @@ class LiftedEngine:
         self.past, self.direction = float(start[self.places.position]), 0.0
         modes, law = len(self.plant.automaton.modes), self.controller.law(None)
         dead_zone = self.inputs.tolerance is not None and bool(np.any(self.inputs.tolerance.coeffs[:, 0] > 0.0))
-        self.loop = LiftedLoop(law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes)
-        self.memory = new_memory(self.places, modes, watches_of(self.plant, self.controller, dead_zone))
+        self.loop = LiftedLoop(
+            law, dead_zone, searches, self.step, self.plant.automaton.flows.ravel(), modes, resolution
+        )
+        self.memory = new_memory(self.places, modes, watches_of(self.plant, self.controller, dead_zone, counts))
         self.segments = new_segments(self.places.states, _ROOM)
         self.record = new_record(self.places.plant)
         self.scratch = new_scratch(self.tables)
-        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
+        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
 
     def advance(self, index: int) -> None:
         """Run from the start to the last sample; `index` must be that one."""
@@ -300,6 +307,9 @@ class LiftedEngine:
     def channel(self, name: str, first: int, last: int) -> Array:
         """A channel at samples first .. last - 1, of all samples."""
         row = np.zeros(self.places.states)
+        if name == "measured_position" and self.places.counted >= 0:
+            row[self.places.counted] = 1.0
+            return self.sampled(row)[first:last]
         row[: self.places.plant] = self.plant.rows["position" if name == "measured_position" else name][0]
         return self.sampled(row)[first:last]
 

@@ -1,6 +1,7 @@
 """Tables of the sampled loop's blocks: the map of one tick and the flow after it, and the rows of all that may switch.
 
-The state is the plant's, followed by the law's, the voltages on their way and the reference with its derivatives.
+The state is the plant's, followed by the law's, the voltages on their way and the reference with its derivatives. The
+count of a sensor with a resolution is a state too: it is constant up to the tick that measures another one.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ class Places(NamedTuple):
     ahead: int
     notch: int  # its band-pass
     notch_low: int
+    counted: int  # position as last measured, of a sensor that counts
     waiting: int  # first of the voltages on their way, the next one to be applied
     delay: int  # how many
     reference: int  # and its derivatives
@@ -54,6 +56,7 @@ class LiftedLoop(NamedTuple):
     step: float  # of the search, s
     flows: Array  # M * n * n, row-major
     modes: int
+    resolution: float  # m, of the position sensor; 0.0: it is ideal
 
 
 class LiftedMemory(NamedTuple):
@@ -77,8 +80,8 @@ class LiftedMemory(NamedTuple):
 class Place(NamedTuple):
     """Progress of a run.
 
-    ``at = [tick, mode, active, kind, side of the error, ticks since a switch, need of the vast scale]``; `sign` of the
-    limit that acts.
+    ``at = [tick, mode, active, kind, side of the error, ticks since a switch or another count, need of the vast scale,
+    1: same count as before, ticks that the last count stayed]``; `sign` of the limit that acts.
     """
 
     at: NDArray[np.int64]
@@ -110,15 +113,16 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
     """Fill the tick's map; the rows of the error and of the voltage demanded remain in `change` and `sizes`."""
     p, n, m = loop.parameters, places.states, memory.tick_map
     acting = active or p.acting_inside > 0.5
+    measured = places.counted if places.counted >= 0 else places.position
     error, demand = memory.change, memory.sizes
     _clear(error)
     _clear(demand)
     _clear(m)
     error[places.reference] = 1.0
-    error[places.position] -= p.loop_step
+    error[measured] -= p.loop_step
     if places.filtered >= 0:
         error[places.filtered] -= 1.0 - p.loop_step
-        m[places.filtered * n + places.position] = p.loop_step
+        m[places.filtered * n + measured] = p.loop_step
         m[places.filtered * n + places.filtered] = -p.loop_step
     if acting:
         for i in range(n):
@@ -185,6 +189,11 @@ def _law_watches(loop: LiftedLoop, places: Places, memory: LiftedMemory, first: 
         count += 1
         for i in range(n):
             values[count * n + i] = 1.0 if i == last else 0.0
+        count += 1
+    if places.counted >= 0:
+        for i in range(n):
+            values[count * n + i] = 0.0
+        values[count * n + places.position], values[count * n + places.counted] = 1.0, -1.0
         count += 1
     return count
 

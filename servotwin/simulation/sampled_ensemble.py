@@ -18,6 +18,7 @@ from servotwin.hybrid.members import Figures, figures_of
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_pieces
 from servotwin.simulation.ensemble import Cases, check_constants, samples_of
 from servotwin.simulation.inputs import RunInputs, with_forces
+from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.sampled_groups import SampledMembers, SampledSpan, groups_of, in_blocks, run_group
 from servotwin.simulation.sampled_law import SampledLawEngine
@@ -25,6 +26,7 @@ from servotwin.simulation.sampled_members import SampledResults
 
 LARGEST_DELAY = 64
 OUTPUTS = ("error", "voltage", "position", "theta_m", "theta_d")
+_CHANNELS = {"error": "position"}
 
 
 class SampledCases(NamedTuple):
@@ -205,7 +207,7 @@ def _span(duration: float, sample_rate: float, outputs: Sequence[str], last: flo
 
 
 def _ticked(members: SampledMembers, span: SampledSpan, threads: int | None) -> Iterator[tuple[int, Array]]:
-    """Members that do not advance in blocks, with their (O, N) outputs, tick by tick."""
+    """Members that do not advance in blocks, with their (O, N) outputs: the deployed law at every tick."""
     which = [k for k in range(len(members.servos)) if not in_blocks(members, k, span)]
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         yield from zip(which, pool.map(lambda k: _run(members, k, span), which), strict=True)
@@ -235,11 +237,10 @@ def _run(members: SampledMembers, member: int, span: SampledSpan) -> Array:
         np.random.default_rng(0),
         delay=int(here["delay"]),
     )
-    engine.advance(span.samples - 1)
-    return np.array([_channel(engine, name, span.samples) for name in span.outputs])
-
-
-def _channel(engine: SampledEngine, name: str, samples: int) -> Array:
-    if name != "error":
-        return engine.channel(name, 0, samples)
-    return engine.inputs.reference.on(engine.inputs.times(0, samples)) - engine.channel("position", 0, samples)
+    if kind is SampledEngine and fits_plant_blocks(engine):
+        engine = in_plant_blocks(engine)
+    engine.advance(engine.samples - 1)
+    traces = {name: engine.channel(_CHANNELS.get(name, name), 0, span.samples) for name in span.outputs}
+    if "error" in traces:
+        traces["error"] = inputs.reference.on(inputs.times(0, span.samples)) - traces["error"]
+    return np.array(list(traces.values()))

@@ -74,33 +74,44 @@ class SampledGroup:
 
 
 def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
-    """True for members that advance in blocks: a filtered PID, an ideal sensor, and ticks at every sample of the
-    output; with a friction feedforward a reference that is constant in every piece."""
+    """True for members that advance in blocks: a filtered PID, and ticks at every sample of the output; with a friction
+    feedforward a reference that is constant in every piece."""
     law = members.controllers[member]
     if not isinstance(law, Controller) or (law.friction_feedforward != 0.0 and degree(span.shape) > 0):
         return False
     ratio = (law.sample_rate or 0.0) / span.rate
     whole = round(ratio)
-    return members.constants["resolution"][member] == 0.0 and whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
+    return whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
 
 
 def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
     """Members that advance in blocks, by structure."""
     by_structure: dict[object, list[int]] = {}
-    for member in range(len(members.servos)):
+    for member, structure in enumerate(_structures(members)):
         if in_blocks(members, member, span):
-            by_structure.setdefault(_structure_of(members, member), []).append(member)
+            by_structure.setdefault(structure, []).append(member)
     return [_group(members, span, np.array(which)) for which in by_structure.values()]
 
 
-def _structure_of(members: SampledMembers, member: int) -> tuple[object, ...]:
-    servo, law = members.servos[member], filtered_pid(members.controllers[member])
-    here = {name: float(values[member]) for name, values in members.constants.items()}
+def _structures(members: SampledMembers) -> Iterator[tuple[object, ...]]:
+    """The structure of each member."""
+    constants = members.constants
+    columns = [constants[name] != 0.0 for name in ("tolerance", "input_bias", "friction", "resolution")]
+    switches = zip(*(column.tolist() for column in [*columns, constants["delay"]]), strict=True)
+    # Members share laws, and many share a servo.
+    servos = {id(servo): structure_of(servo) for servo in {id(each): each for each in members.servos}.values()}
+    laws = {id(law): _law_structure(law) for law in {id(each): each for each in members.controllers}.values()}
+    for servo, law, switch in zip(members.servos, members.controllers, switches, strict=True):
+        yield servos[id(servo)], laws[id(law)], switch
+
+
+def _law_structure(law: Law) -> tuple[bool, ...]:
+    """Members whose law is no filtered PID are in no group."""
+    if not isinstance(law, Controller):
+        return ()
     limits = law.voltage_limit is None, law.rate_limit is None, law.loop_filter_hz is None
     always = law.feedforward == 0.0 and law.friction_feedforward == 0.0
-    feedforwards = always, law.velocity_feedforward == 0.0
-    switches = here["tolerance"] > 0.0, here["input_bias"] != 0.0, here["friction"] > 0.0, here["delay"]
-    return structure_of(servo), *limits, law.notch_hz == 0.0, *feedforwards, *switches
+    return *limits, law.notch_hz == 0.0, always, law.velocity_feedforward == 0.0
 
 
 def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64]) -> SampledGroup:
@@ -119,10 +130,11 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
         ]
     )
     loops = sampled_plants([servo for servo, _ in plant_places], 0, bool(bias), bool(friction))
-    places = places_of(loops.first, laws[0], delay, degree(span.shape))
+    counts = bool(constants["resolution"][0] > 0.0)
+    places = places_of(loops.first, laws[0], delay, degree(span.shape), counts)
     states = np.zeros((len(which), places.states))
     states[:, : places.plant] = starts_of(loops, plant, constants)
-    for follower in (places.filtered, places.past):
+    for follower in (places.filtered, places.past, places.counted):
         if follower >= 0:
             states[:, follower] = states[:, places.position]
     if places.feedforward >= 0:
@@ -133,8 +145,10 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     enter, leave = np.array(thresholds).T.copy()
     order = np.lexsort((law, plant))
     limits = np.zeros((len(which), len(span.outputs)))
-    starts = SampledStarts(order, plant, law, states, constants["reference"], enter, leave, limits)
-    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone), family, starts)
+    starts = SampledStarts(
+        order, plant, law, states, constants["reference"], enter, leave, constants["resolution"], limits
+    )
+    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone, counts), family, starts)
 
 
 def _family(
@@ -241,7 +255,7 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         new_memory(group.places, family.modes, group.watches),
         new_scratch(tables, pending),
         np.zeros(n),
-        Place(np.zeros(7, dtype=np.int64), np.zeros(1)),
+        Place(np.zeros(9, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),
         np.zeros(4),
         np.zeros((outputs, slots), dtype=np.int8),

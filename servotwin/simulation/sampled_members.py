@@ -59,6 +59,7 @@ class SampledStarts(NamedTuple):
     reference: Array  # (K,) factors of the shape
     enter: Array  # (K,)
     leave: Array  # (K,)
+    resolution: Array  # (K,) m, of the position sensor; 0: it is ideal
     limits: Array  # (K, O)
 
 
@@ -117,8 +118,9 @@ def run_one(
         p[14], p[15], p[16], p[17], p[18], p[19],
     )  # fmt: skip
     loop = LiftedLoop(
-        parameters, family.dead_zone, family.searches[plant], family.step[plant], family.flows[plant], family.modes
-    )
+        parameters, family.dead_zone, family.searches[plant], family.step[plant], family.flows[plant], family.modes,
+        starts.resolution[k],
+    )  # fmt: skip
     for i in range(places.states):
         z[i] = starts.state[k, i]
     for i in range(len(worker.place.at)):

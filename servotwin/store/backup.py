@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import NamedTuple
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
+from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
 from servotwin.store.engine import POSTGRESQL, parse_address, public_address, sqlite_file
 from servotwin.store.migrate import VERSIONS
@@ -72,6 +74,7 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
 
     Messages posted since the backup are lost here but known to the edges, which ignore serials up to the last one that
     they received. So the serials continue far above those in the backup.
+    Every edge is asked for the windows that it still keeps: those since the backup are not in it.
 
     Raises
     ------
@@ -86,8 +89,18 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
             # Serials that edges received after the backup must not be used again.
-            store.execute("UPDATE twins SET posted = posted + ?", (_SERIAL_MARGIN,))
+            store.execute("UPDATE twins SET posted = posted + ?", (_SERIAL_MARGIN + 1,))
+            _ask_for_windows(store)
         return counts
+
+
+def _ask_for_windows(store: sqlite3.Connection) -> None:
+    reason = "the twin's store was restored from a backup"
+    rows = [
+        (servo, serial, encode(Resend(servo, reason=reason)), time.time())
+        for servo, serial in store.execute("SELECT servo, posted FROM twins").fetchall()
+    ]
+    store.executemany("INSERT INTO outgoing (servo, serial, body, created) VALUES (?, ?, ?, ?)", rows)
 
 
 def _source_file(url: str, command: str, file: Path) -> Path:

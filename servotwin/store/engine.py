@@ -30,12 +30,17 @@ _LOG_PAGES = 2000
 _READERS = 8
 _CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
 """Raised as they are: the statement is wrong, and repeating it does not help."""
+_SQLITE_DAMAGE, _SQL_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB), ("XX001", "XX002")
 _LOST_RACES = ("40001", "40P01")
 """SQLSTATE of a serialization failure and of a deadlock."""
 
 
 class StoreUnavailable(RuntimeError):
     """The database cannot be read or written now: a full or read-only disk, a lost connection. One sentence."""
+
+
+class StoreDamaged(StoreUnavailable):
+    """Pages of the database are damaged. One sentence."""
 
 
 class StoreBusy(RuntimeError):
@@ -123,6 +128,8 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
     except _CALLERS_FAULT:
         raise
     except DBAPIError as error:
+        if _damaged(error.orig):
+            raise StoreDamaged(f"store {public_address(engine.url)}: is damaged ({error.orig})") from error.orig
         raise _unavailable(engine, str(error.orig)) from error.orig
     except (PoolTimeout, sqlite3.Error) as error:
         raise _unavailable(engine, str(error)) from None
@@ -131,6 +138,12 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
 def lost_race(error: StoreUnavailable) -> bool:
     """Test whether PostgreSQL rolled a transaction back only because of a concurrent one: retry it at once."""
     return getattr(error.__cause__, "sqlstate", None) in _LOST_RACES
+
+
+def _damaged(error: BaseException | None) -> bool:
+    """Test for the errors of SQLite and PostgreSQL that name damage: CORRUPT, NOTADB; data or index corrupted."""
+    code = getattr(error, "sqlite_errorcode", None)
+    return (code is not None and code & 0xFF in _SQLITE_DAMAGE) or getattr(error, "sqlstate", None) in _SQL_DAMAGE
 
 
 def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:

@@ -29,13 +29,14 @@ _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
 
 
 def backlog(connection: sa.Connection, now: float) -> Backlog:
-    """Number and age of the unprocessed messages."""
+    """Number, age and lag of the unprocessed messages."""
     counts = [sa.select(sa.func.count()).select_from(messages).where(queue) for queue in (WORK, VERIFICATIONS)]
     first = sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None))
-    query = sa.select(*(count.scalar_subquery() for count in counts), first.scalar_subquery())
+    query = sa.select(*(count.scalar_subquery() for count in counts), first.scalar_subquery(), _OLDEST)
     row: Any = connection.execute(query).one()
-    work, verifications, oldest = row
-    return Backlog(work, verifications, 0.0 if oldest is None else max(0.0, now - oldest))
+    work, verifications, turn, oldest = row
+    age, lag = (0.0 if since is None else max(0.0, now - since) for since in (oldest, turn))
+    return Backlog(work, verifications, age, lag)
 
 
 def servos(connection: sa.Connection, after: str, limit: int) -> list[ServoSummary]:
@@ -178,4 +179,7 @@ def _count(queue: sa.ColumnElement[bool]) -> sa.ColumnElement[int]:
     return counted.correlate(twins).scalar_subquery().label("waiting")
 
 
+_FIRST = sa.select(sa.func.min(messages.c.id)).where(WORK).scalar_subquery()
+_OLDEST = sa.select(messages.c.received).where(messages.c.id == _FIRST).scalar_subquery()
+"""Arrival of the oldest unprocessed window or letter."""
 _SUMMARY = sa.select(*(_count(WORK) if name == "waiting" else twins.c[name] for name in ServoSummary._fields))

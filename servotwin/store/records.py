@@ -117,6 +117,8 @@ class EvidenceRecord(NamedTuple):
     window : str
         "boot/sequence" of the window that it is based on, where `message` is another one: an update that waited for a
         receipt or for a verification. It is stored as that window's evidence.
+    overtaken : bool
+        True where a newer window of the servo was processed before: it does not change the servo's summary.
     """
 
     kind: str
@@ -129,6 +131,7 @@ class EvidenceRecord(NamedTuple):
     context: str = ""
     tail: float | None = None
     window: str = ""
+    overtaken: bool = False
 
 
 class WorkResult(NamedTuple):
@@ -180,11 +183,15 @@ class Backlog(NamedTuple):
         Windows and letters; verifications that twins requested of themselves.
     age : float
         s since the oldest window or letter was received; 0.0: none waits.
+    lag : float
+        s for which new messages of a servo have waited for its turn: the longest of all servos. A backlog that newer
+        messages have overtaken does not count.
     """
 
     messages: int
     verifications: int
     age: float
+    lag: float = 0.0
 
 
 class ServoSummary(NamedTuple):

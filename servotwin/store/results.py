@@ -13,13 +13,13 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.engine import SQLITE
 from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
-from servotwin.store.records import EvidenceRecord, Lease, MessageKind, OutgoingMessage, StoredMessage, WorkResult
+from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.store.schema import VERIFICATIONS, WORK, bodies, contexts, evidence, messages, outgoing, states, twins
-
-_NAMES_PER_QUERY = 5000
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
+BACKLOG_LATER_S = 60.0
+"""s for which other servos' new messages come before the rest of a servo's backlog. It only orders the queue."""
 
 
 def acquire(
@@ -31,14 +31,21 @@ def acquire(
     kinds: Collection[MessageKind],
     only: str | None,
 ) -> list[str]:
-    """Lease the servos that have waited longest; servos due to be woken get at least half of the places.
+    """Lease the servos whose new messages have waited longest; servos due to be woken get at least half of the places.
 
-    Returns their names.
+    A single place goes to the servo that has waited longest for either. Returns their names.
     """
     leased: list[str] = []
     # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
     bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
-    for query, share in _queues(frozenset(kinds), only is not None):
+    queues = _queues(frozenset(kinds), only is not None)
+    if limit == 1:
+        heads = [
+            (connection.execute(query, bound | {"_count": 1}).one_or_none(), n) for n, (query, _) in enumerate(queues)
+        ]
+        oldest = sorted((head[1], n) for head, n in heads if head is not None)[:1]
+        queues = [queues[n] for _, n in oldest]
+    for query, share in queues:
         count = min(math.ceil(share * limit), limit - len(leased))
         servos = connection.scalars(query, bound | {"_count": count}).all()
         if servos:
@@ -53,12 +60,28 @@ def release(connection: sa.Connection, owner: str, servos: Collection[str] | Non
     connection.execute(ending if servos is None else ending.where(twins.c.servo.in_(servos)))
 
 
+def renew(connection: sa.Connection, owner: str, servos: Collection[str], until: float) -> None:
+    """Extend an owner's leases of some servos; those that it has lost stay lost."""
+    mine = sa.update(twins).where(twins.c.lease_owner == owner, twins.c.servo.in_(servos))
+    connection.execute(mine.values(lease_until=until))
+
+
+def hold(connection: sa.Connection, servo: str, until: float) -> None:
+    """Lease a servo to nobody, unless somebody has it: its next turn is after `until`."""
+    free = sa.update(twins).where(twins.c.servo == servo, twins.c.lease_owner.is_(None))
+    connection.execute(free.values(lease_owner=_NOBODY, lease_until=until))
+
+
 def load(
-    connection: sa.Connection, servos: Sequence[str], kinds: Collection[MessageKind], per_servo: int
+    connection: sa.Connection,
+    servos: Sequence[str],
+    kinds: Collection[MessageKind],
+    per_servo: int,
+    newest_first: bool,
 ) -> list[Lease]:
     """State and pending messages of leased servos, in their order."""
     rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos})}
-    pending = _pending(connection, servos, kinds, per_servo)
+    pending = _pending(connection, servos, kinds, per_servo, newest_first)
     return [
         Lease(servo, rows[servo].state or b"", rows[servo].serial, tuple(pending[servo]), rows[servo].attempts)
         for servo in servos
@@ -92,38 +115,54 @@ def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: boo
     late = sa.bindparam("_late", type_=sa.Double)
     free = sa.or_(until.is_(None), until <= _NOW, until > late)
     count = sa.bindparam("_count", type_=sa.Integer)
-    query = sa.select(twins.c.servo).where(turn, free).order_by(order).limit(count)
+    query = sa.select(twins.c.servo, order).where(turn, free).order_by(order).limit(count)
     query = query.where(twins.c.servo == sa.bindparam("_only")) if one else query
     # SQLite has one writer at a time and ignores this.
     return query.with_for_update(skip_locked=True)
 
 
 def _pending(
-    connection: sa.Connection, servos: Sequence[str], kinds: Collection[MessageKind], per_servo: int
+    connection: sa.Connection,
+    servos: Sequence[str],
+    kinds: Collection[MessageKind],
+    per_servo: int,
+    newest_first: bool,
 ) -> dict[str, list[StoredMessage]]:
+    """Pending messages of each servo in the order of their commits; of the windows the first ones, or the newest."""
     pending: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
-    for queue in ({MessageKind.WINDOW, MessageKind.LETTER}, {MessageKind.VERIFICATION}):
-        selected = frozenset(queue & set(kinds))
+    for queue in _NEWEST_FIRST if newest_first else _OLDEST_FIRST:
+        selected = queue & set(kinds)
         if selected:
-            for row in connection.execute(_oldest_messages(selected), {"_servos": servos, "_per_servo": per_servo}):
+            query = _few_messages(selected, newest_first and MessageKind.WINDOW in selected)
+            for row in connection.execute(query, {"_servos": servos, "_per_servo": per_servo}):
                 pending[row.servo].append(
                     StoredMessage(row.id, MessageKind(row.kind), row.body, row.encoding, row.received, row.key)
                 )
-    return pending
+    return {servo: sorted(found, key=_work_before_verifications) for servo, found in pending.items()}
 
 
-@lru_cache(maxsize=8)
-def _oldest_messages(kinds: frozenset[MessageKind]) -> sa.Select[Any]:
-    """Query of the first pending messages of each servo, of these kinds: verifications only, or all others."""
+def _work_before_verifications(message: StoredMessage) -> tuple[bool, int]:
+    return message.kind is MessageKind.VERIFICATION, message.id
+
+
+_OLDEST_FIRST = (frozenset({MessageKind.WINDOW, MessageKind.LETTER}), frozenset({MessageKind.VERIFICATION}))
+_NEWEST_FIRST = tuple(frozenset({kind}) for kind in MessageKind)
+"""Kinds that share the places of a lease: where a part of the windows stays behind, no letter may."""
+
+
+@lru_cache(maxsize=16)
+def _few_messages(kinds: frozenset[MessageKind], newest: bool) -> sa.Select[Any]:
+    """Query of the first, or newest, pending messages of each servo, of these kinds: verifications only, or others."""
     verifications = MessageKind.VERIFICATION in kinds
-    place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=messages.c.id).label("place")
+    order = messages.c.id.desc() if newest else messages.c.id.asc()
+    place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=order).label("place")
     waiting = sa.select(messages.c.id, messages.c.servo, place)
     waiting = waiting.where(VERIFICATIONS if verifications else WORK, messages.c.servo.in_(_SERVOS))
     if len(kinds) == 1 and not verifications:
         waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
     first = waiting.subquery()
     few = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
-    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=first.c.servo, order_by=first.c.id)
+    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=first.c.servo, order_by=first.c.place)
     sized = sa.select(first.c.id, first.c.place, so_far.label("so_far")).join(bodies, bodies.c.message == first.c.id)
     some = sized.where(few).subquery()
     known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
@@ -132,6 +171,8 @@ def _oldest_messages(kinds: frozenset[MessageKind]) -> sa.Select[Any]:
     return sa.select(*known, bodies.c.body).select_from(joined).where(small).order_by(messages.c.id)
 
 
+_NOBODY = "nobody"
+"""Owner of the leases that only hold a servo."""
 _SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
 _NOW = sa.bindparam("_now", type_=sa.Double)
 
@@ -185,29 +226,6 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
     return valid
 
 
-def outgoing_messages(connection: sa.Connection, servo: str, after: int, limit: int) -> list[OutgoingMessage]:
-    """Messages to the edge with serials above `after`."""
-    query = sa.select(outgoing.c.serial, outgoing.c.body).where(outgoing.c.servo == servo, outgoing.c.serial > after)
-    rows = connection.execute(query.order_by(outgoing.c.serial).limit(limit))
-    return [OutgoingMessage(row.serial, row.body) for row in rows]
-
-
-def posted(connection: sa.Connection, servos: Collection[str]) -> dict[str, int]:
-    """Serials of the newest messages to the edges of these servos."""
-    names, newest = list(servos), dict[str, int]()
-    for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
-        part = names[begin : begin + _NAMES_PER_QUERY]
-        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
-        newest.update((servo, serial) for servo, serial in connection.execute(query))
-    return newest
-
-
-def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
-    """Make the serial of the next message to the edge exceed `serial`."""
-    behind = sa.update(twins).where(twins.c.servo == servo, twins.c.posted < serial)
-    connection.execute(behind.values(posted=serial))
-
-
 def _write(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], now: float) -> None:
     results = [result for result, _ in valid]
     _advance(connection, valid)
@@ -226,7 +244,7 @@ def _write(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], n
         connection, sa.insert(outgoing), (row for result, last in valid for row in _outgoing_rows(result, last, now))
     )
     put(connection, [item for result in results for item in result.enqueue])
-    connection.execute(_RESCHEDULE, {"_servos": sorted({result.servo for result in results})})
+    connection.execute(_RESCHEDULE, _places_in_queue(results, now))
 
 
 def _advance(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]]) -> None:
@@ -277,6 +295,7 @@ def _evidence_row(
     servo: str, record: EvidenceRecord, windows: Mapping[tuple[str, str], int], now: float
 ) -> dict[str, Any]:
     row = record._asdict()
+    del row["overtaken"]
     message = windows.get((servo, row.pop("window")), record.message)
     return row | {"message": message or None, "context": record.context or None, "servo": servo, "created": now}
 
@@ -293,7 +312,7 @@ def _summary(records: Sequence[EvidenceRecord]) -> dict[str, Any]:
     """Columns of the servo's row that a new estimate, update or receipt sets."""
     known: dict[str, Any] = {}
     for record in records:
-        if record.kind in _ESTIMATES:
+        if record.kind in _ESTIMATES and not record.overtaken:
             known |= {"gap": record.gap, "std": record.std, "status": record.status}
         elif record.kind == "update":
             known["version"] = record.version
@@ -337,15 +356,32 @@ def _upsert_state(dialect: str) -> Any:
     return new.on_conflict_do_update(index_elements=[states.c.servo], set_={"state": new.excluded.state})
 
 
+def _places_in_queue(results: Sequence[WorkResult], now: float) -> list[dict[str, Any]]:
+    """Parameters of `_RESCHEDULE`: of each servo the newest message that was processed, and the backlog's turn."""
+    newest: dict[str, int] = {}
+    for result in results:
+        newest[result.servo] = max((*result.done, newest.get(result.servo, 0)))
+    later = now + BACKLOG_LATER_S
+    return [{"_servo": servo, "_newest": id_, "_later": later} for servo, id_ in sorted(newest.items())]
+
+
 def _oldest_time(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
     oldest = sa.select(messages.c.received).where(queue, messages.c.servo == twins.c.servo)
     return oldest.order_by(messages.c.id).limit(1).correlate(twins).scalar_subquery()
+
+
+def _next_turn() -> sa.ColumnElement[float]:
+    """Place in the queue: as of the oldest message that came after those processed, or of a backlog, or null."""
+    newer = messages.c.id > sa.bindparam("_newest", type_=sa.BigInteger)
+    left = sa.select(messages.c.id).where(WORK, messages.c.servo == twins.c.servo).correlate(twins).exists()
+    backlog = sa.case((left, sa.bindparam("_later", type_=sa.Double)), else_=sa.null())
+    return sa.func.coalesce(_oldest_time(sa.and_(WORK, newer)), backlog)
 
 
 # A separate statement after the serials were advanced: on PostgreSQL those rows are locked by then. Messages put before
 # that are seen here; a later put waits for the lock and marks the servo itself.
 _RESCHEDULE = (
     sa.update(twins)
-    .where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))
-    .values(ready=_oldest_time(WORK), verification_ready=_oldest_time(VERIFICATIONS))
+    .where(twins.c.servo == sa.bindparam("_servo"))
+    .values(ready=_next_turn(), verification_ready=_oldest_time(VERIFICATIONS))
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -33,7 +34,11 @@ class RetentionResult(NamedTuple):
 
 
 def delete_old_bodies(
-    store: Store, before: float, batch: int = 256, pause: Callable[[], None] | None = None
+    store: Store,
+    before: float,
+    batch: int = 256,
+    pause: Callable[[], None] | None = None,
+    most: float = math.inf,
 ) -> RetentionResult:
     """Delete the bodies of windows received before a time.
 
@@ -47,6 +52,8 @@ def delete_old_bodies(
         s since the epoch.
     batch : int
         Windows in one transaction.
+    most : float
+        Windows after which the rest is left to the next call, to within a batch.
 
     Raises
     ------
@@ -56,7 +63,7 @@ def delete_old_bodies(
     if batch < 1:
         raise InvalidInput(f"retention batch = {batch!r} windows: must be at least 1")
     total, after = RetentionResult(0, 0, 0), 0
-    while rows := _next(store, after, batch):
+    while total.emptied < most and (rows := _next(store, after, batch)):
         old = [row for row in rows if row.received < before]
         # Ids rise with time, except after a clock was set back: a whole batch of newer windows ends the scan.
         if not old:

@@ -25,7 +25,8 @@ twins = sa.Table(
     sa.Column("posted", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("windows", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
-    # Time at which the oldest unprocessed window or letter (ready) or verification was received; null: none.
+    # Place in the queues: time at which the oldest verification, or the oldest window or letter since the servo's last
+    # turn, was received; of a backlog alone, a later time (results.BACKLOG_LATER_S); null: nothing waits.
     sa.Column("ready", sa.Double),
     sa.Column("verification_ready", sa.Double),
     sa.Column("wake", sa.Double),

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import TypeVar
 
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
 from servotwin.store import incoming, queries, results
+from servotwin.store import outgoing as posting
 from servotwin.store.claims import StoredClaim, add_alarm, claim_of, raise_claim
 from servotwin.store.engine import (
     Engines,
@@ -101,6 +102,7 @@ class Store:
         kinds: Collection[MessageKind] = WORK_KINDS,
         per_servo: int = 16,
         servo: str | None = None,
+        newest_first: bool = False,
     ) -> list[Lease]:
         """Lease servos that have unprocessed messages of these kinds, or that are due to be woken.
 
@@ -117,12 +119,14 @@ class Store:
             s; s since the epoch.
         servo : str, optional
             Only this one.
+        newest_first : bool
+            Where not all windows of a servo are leased, the newest ones are; of other kinds always the oldest.
         """
         leased = self._write(lambda c: results.acquire(c, owner, limit, now + lease_s, now, kinds, servo))
         if not leased:
             return []
         with transaction(self.engines.reader) as connection:
-            loaded = results.load(connection, leased, kinds, per_servo)
+            loaded = results.load(connection, leased, kinds, per_servo, newest_first)
             due = results.due(connection, leased, now)
         idle = {lease.servo for lease in loaded if not lease.messages and lease.servo not in due}
         if idle:
@@ -133,20 +137,32 @@ class Store:
         """End leases without a result: all of an owner's, or those of some servos."""
         self._write(lambda connection: results.release(connection, owner, servos))
 
+    def renew(self, owner: str, servos: Collection[str], until: float) -> None:
+        """Extend an owner's leases of some servos until a time, s since the epoch; those that it has lost stay lost."""
+        self._write(lambda connection: results.renew(connection, owner, servos, until))
+
+    def hold(self, servo: str, until: float) -> None:
+        """Let nobody lease a servo until a time, s since the epoch; does nothing where somebody has it."""
+        self._write(lambda connection: results.hold(connection, servo, until))
+
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first.
 
         An edge that reports a higher serial than any that was posted received it before the store was restored from a
         backup: the next message gets a serial that the edge does not take for a duplicate.
         """
-        messages = self._read(lambda connection: results.outgoing_messages(connection, servo, after, limit))
+        messages = self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
         if not messages and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
-            self._write(lambda connection: results.skip_to_serial(connection, servo, after))
+            self._write(lambda connection: posting.skip_to_serial(connection, servo, after))
         return messages
+
+    def post(self, sent: Mapping[str, bytes], now: float) -> None:
+        """Post a message to each of these edges; unknown servos are left out."""
+        self._write(lambda connection: posting.post(connection, sent, now))
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
-        return self._read(lambda connection: results.posted(connection, servos))
+        return self._read(lambda connection: posting.newest_serials(connection, servos))
 
     def claim_of(self, servo: str) -> StoredClaim:
         """Newest claim of a servo's edge."""

@@ -22,6 +22,7 @@ from servotwin.estimation.gap import estimate_gap, options_for
 from servotwin.estimation.learning.machine import nameplate
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
+from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
 from servotwin.messages import Setting
@@ -72,7 +73,7 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     def of_model(window: Window, expected: Expectation) -> GapEstimate:
         if model is None:
             # The methods that settings name are those of a servo.
-            return estimate_gap(window, servo, prior=expected.prior)
+            return estimate_gap(window, servo, prior=expected.prior, settings=_worn(expected, settings))
         if not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
         growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
@@ -89,6 +90,12 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         return replace(of_model(window, expected), model_version=servo.version)
 
     return of_model if model is servo else estimate
+
+
+def _worn(expected: Expectation, settings: TwinSettings) -> OutputErrorSettings:
+    """Settings of the output-error estimator for a gap that grows as the trend says, once two windows have told it."""
+    known = expected.trend is not None and expected.trend.updates > 1
+    return OutputErrorSettings(gap_rate=expected.gap_rate(settings.trend) if known else 0.0)
 
 
 def motor_learning_of(servo: Plant, settings: TwinSettings) -> MotorLearning | None:

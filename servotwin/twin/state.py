@@ -196,6 +196,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         m, sizes of the reference's steps in the last windows, the newest last.
     other_controller : int
         Windows in a row whose voltage is not that of the controller stated for them.
+    newest : (str, float) or None
+        Boot and start (s) of the newest window that was processed.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -213,6 +215,13 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     steps: tuple[float, ...] = ()
     responses: ResponseState | None = None
     other_controller: int = 0
+    newest: tuple[str, float] | None = None
+
+    def has_overtaken(self, window: WindowMessage) -> bool:
+        """True where a newer window was processed before this one."""
+        if self.versions.has_ended(window.boot):
+            return True
+        return self.newest is not None and window.boot == self.newest[0] and window.start < self.newest[1]
 
 
 _encoder = msgspec.msgpack.Encoder()

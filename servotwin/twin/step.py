@@ -49,10 +49,11 @@ from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.requests import Attempts
 from servotwin.twin.state import TwinState, draft_update, noted_setting
-from servotwin.twin.triage import Glance
+from servotwin.twin.triage import Glance, no_glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
 _OTHER = "another controller runs than is stated: a setting follows when a window is of the stated one"
+_OVERTAKEN = "a newer window of this servo has come: the setting follows from that"
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
@@ -63,13 +64,28 @@ _STEPS = 4
 
 
 class WindowArrival(NamedTuple):
-    """A new window that the store has committed, and its arrival time (s, on the clock of `now`).
+    """A new window that the store has committed.
 
-    The time between two boots of the edge is taken from `time`.
+    Attributes
+    ----------
+    window : WindowMessage
+    time : float
+        Arrival, s, on the clock of `now`; the time between two boots of the edge is taken from it.
+    overtaken : bool
+        A newer window of the servo waits, or was processed already: this one changes no setting. With triage it gets a
+        glance and no more.
+    unseen : bool
+        Other servos wait: without triage an overtaken window is not even estimated.
+    too_late : str
+        Reason why an update for this window could not be applied in time; empty: it could. It is estimated, and changes
+        no setting.
     """
 
     window: WindowMessage
     time: float
+    overtaken: bool = False
+    unseen: bool = False
+    too_late: str = ""
 
 
 class Wake(NamedTuple):
@@ -162,8 +178,14 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
     state, glance = _glance(model, state, decoded, arrived)
+    if glance is None and event.overtaken and event.unseen:
+        glance = no_glance(_OVERTAKEN)
+    if not state.has_overtaken(message):
+        state = replace(state, newest=(message.boot, message.start))
     if glance is not None:
         records.append(GlanceRecord(message, glance, decoded.tail))
+        if event.overtaken:
+            return StepResult(state, (), tuple(records))
         if not glance.moved:
             state, taught = _teach(model, state, decoded, arrived)
             return StepResult(state, taught, (*records, *taught))
@@ -176,7 +198,10 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     if decoded.step > 0.0 and not stale:
         state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
     evidence = _evidence(model, state, learnt, arrived)
-    state, redesign = _redesign(model, state, evidence, stale)
+    if why_none := _OVERTAKEN if event.overtaken else event.too_late:
+        redesign = Redesign(None, math.nan, why_none)
+    else:
+        state, redesign = _redesign(model, state, evidence, stale)
     if learnt.disturbance.known and not stale:
         state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))

@@ -180,6 +180,11 @@ def glance(
     return replace(result, moved=bool(why), why=why or "nothing moved")
 
 
+def no_glance(why: str) -> Glance:
+    """Record of a window that was not looked at, and need not be."""
+    return _without_result(why, moved=False)
+
+
 def _without_result(why: str, moved: bool = True) -> Glance:
     return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 

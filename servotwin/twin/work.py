@@ -8,7 +8,8 @@ evidence whose status begins with "failed", and the next message finds the twin 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from servotwin import messages
 from servotwin.errors import InvalidInput
@@ -28,7 +29,26 @@ ONE_BY_ONE, ABANDON_AFTER = 3, 5
 workers; attempts from which on that message is abandoned."""
 
 
-def work(registry: ModelRegistry, lease: Lease, now: float) -> WorkResult:
+@dataclass(frozen=True)
+class Urgency:
+    """How a servo's work is cut down to what can still have an effect, where more arrives than can be worked off.
+
+    Attributes
+    ----------
+    expected_s : float
+        Time that the work for one servo takes.
+    speed : float
+        Least ratio of sample time to real time.
+    others_wait : bool
+        Overtaken windows are not estimated, because other servos wait.
+    """
+
+    expected_s: float = 0.0
+    speed: float = 1.0
+    others_wait: bool = False
+
+
+def work(registry: ModelRegistry, lease: Lease, now: float, urgency: Urgency | None = None) -> WorkResult:
     """Process a lease.
 
     Parameters
@@ -38,10 +58,13 @@ def work(registry: ModelRegistry, lease: Lease, now: float) -> WorkResult:
         Where the registry has no model of the servo, every message fails.
     now : float
         s since the epoch; in lock-step, sample time. It may jump: no wait becomes longer than one from `now`.
+    urgency : Urgency, optional
+        Only the newest window of the lease may change the setting, if that can still be in time, and receipts are
+        processed first. None, as in lock-step: every window may, in order.
     """
     batch = lease.messages[:1] if lease.attempts >= ONE_BY_ONE else lease.messages
     try:
-        return _Worker(registry.model_of(lease.servo), lease).result(batch, now)
+        return _Worker(registry.model_of(lease.servo), lease).result(batch, now, urgency)
     except InvalidInput as error:
         evidence = tuple(failure_row(stored.id, str(error)) for stored in batch)
         return WorkResult(lease.servo, lease.serial, lease.state, None, tuple(stored.id for stored in batch), evidence)
@@ -58,15 +81,14 @@ class _Worker:
         self.sent: list[Message] = []
         self.model, self.state = self._restored()
 
-    def result(self, batch: Sequence[StoredMessage], now: float) -> WorkResult:
+    def result(self, batch: Sequence[StoredMessage], now: float, urgency: Urgency | None) -> WorkResult:
         """Process the messages and whatever is overdue, and return the result."""
         abandoned = self.lease.attempts >= ABANDON_AFTER
-        for stored in batch:
-            if abandoned:
-                why = f"abandoned, because {self.lease.attempts - 1} workers died while they processed it"
-                self.evidence.append(failure_row(stored.id, why))
-            else:
-                self._process(stored, now)
+        if abandoned:
+            why = f"abandoned, because {self.lease.attempts - 1} workers died while they processed it"
+            self.evidence += [failure_row(stored.id, why) for stored in batch]
+        else:
+            self._process(batch, now, urgency)
         # A lease without messages that kills its workers must wait for the next message, not kill one at each wake.
         woken = not (abandoned and not batch) and self._step(0, Wake(), now)
         return WorkResult(
@@ -97,22 +119,34 @@ class _Worker:
         model = self.servo_model.twin(restored=False)
         return model, model.initial_state(servo)
 
-    def _process(self, stored: StoredMessage, now: float) -> None:
-        """Decode a message and step; a twin that is switched off does nothing."""
-        try:
-            event = _event(stored)
+    def _process(self, batch: Sequence[StoredMessage], now: float, urgency: Urgency | None) -> None:
+        """Decode the messages and step; a twin that is switched off does nothing."""
+        if urgency is None:
+            decoded: Iterator[tuple[int, Event]] = self._decoded(batch)
+        else:
+            decoded = iter(_urgent(list(self._decoded(batch)), self.model.settings.validity, now, urgency))
+        for message, event in decoded:
             if not self.model.settings.enabled:
-                return
-        except Exception as error:
-            self.evidence.append(failure_row(stored.id, f"{type(error).__name__}: {error}"))
-            return
-        self._step(stored.id, event, now)
+                continue
+            if urgency is not None and isinstance(event, WindowArrival) and self.state.has_overtaken(event.window):
+                event = event._replace(overtaken=True, unseen=urgency.others_wait)
+            self._step(message, event, now)
+
+    def _decoded(self, batch: Sequence[StoredMessage]) -> Iterator[tuple[int, Event]]:
+        """Id and event of each message; one that cannot be decoded becomes evidence."""
+        for stored in batch:
+            try:
+                yield stored.id, _event(stored)
+            except Exception as error:
+                self.evidence.append(failure_row(stored.id, f"{type(error).__name__}: {error}"))
 
     def _step(self, message: int, event: Event, now: float) -> bool:
         """Step; after an error the state is as before the event, and the result is False."""
         try:
             result = step(self.model, self.state, event, now)
             evidence = rows(result.evidence, message, self.context[0])
+            if isinstance(event, WindowArrival) and event.overtaken:
+                evidence = [row._replace(overtaken=True) for row in evidence]
         except Exception as error:
             self.evidence.append(failure_row(message, f"{type(error).__name__}: {error}"))
             return False
@@ -121,6 +155,33 @@ class _Worker:
         self.unverified += [record for record in result.evidence if isinstance(record, VerificationRequest)]
         self.sent += result.messages
         return True
+
+
+def _urgent(
+    events: Sequence[tuple[int, Event]], validity: float, now: float, urgency: Urgency
+) -> list[tuple[int, Event]]:
+    """Events with the receipts first, so that an update names the right base, and windows that come too late marked."""
+    windows = [event for _, event in events if isinstance(event, WindowArrival)]
+    if not windows:
+        return list(events)
+    boot = windows[-1].window.boot
+    newest = max((event for event in windows if event.window.boot == boot), key=lambda event: event.window.start)
+    end = newest.window.start + (newest.window.samples - 1) / newest.window.rate
+    done_at = end + urgency.speed * max(0.0, now + urgency.expected_s - newest.time)
+
+    def marked(event: Event) -> Event:
+        if not isinstance(event, WindowArrival):
+            return event
+        left = event.window.start + validity - done_at
+        late = f"too late by {-left:.3g} s: an update may be applied for {validity:g} s from the window's start"
+        overtaken = event is not newest
+        return event._replace(
+            overtaken=overtaken, unseen=overtaken and urgency.others_wait, too_late="" if left > 0.0 else late
+        )
+
+    # Stable: the order of the others stays.
+    ordered = sorted(events, key=lambda each: not isinstance(each[1], messages.Receipt))
+    return [(message, marked(event)) for message, event in ordered]
 
 
 def _event(stored: StoredMessage) -> Event:

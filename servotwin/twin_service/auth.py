@@ -116,23 +116,38 @@ class EdgeGate:
     access : AccessControl
     has_servo : callable
         Test whether a servo of that name belongs to this twin.
-    limiter : RateLimiter
+    messages, polls : RateLimiter
     """
 
-    def __init__(self, access: AccessControl, has_servo: Callable[[str], bool], limiter: RateLimiter) -> None:
-        self._access, self._has_servo, self._limiter = access, has_servo, limiter
+    def __init__(
+        self, access: AccessControl, has_servo: Callable[[str], bool], messages: RateLimiter, polls: RateLimiter
+    ) -> None:
+        self._access, self._has_servo = access, has_servo
+        self._messages, self._polls = messages, polls
 
     def admit(self, servo: str, token: bytes | None, *, limited: bool = True) -> None:
         """Check the token, the name and, if `limited`, the message rate of a servo; raises RequestRejected."""
         self._access.check_servo(servo, token)
-        self.admit_authenticated(servo, limited=limited)
+        self._admit(servo, self._messages if limited else None)
 
-    def admit_authenticated(self, servo: str, *, limited: bool = True) -> None:
+    def admit_poll(self, servo: str, token: bytes | None) -> None:
+        """Check the token, the name and the rate of polls of a servo; raises RequestRejected."""
+        self._access.check_servo(servo, token)
+        self.admit_authenticated_poll(servo)
+
+    def admit_authenticated(self, servo: str) -> None:
         """`admit` for a servo whose seal was checked already."""
+        self._admit(servo, self._messages)
+
+    def admit_authenticated_poll(self, servo: str) -> None:
+        """`admit_poll` for a servo whose seal was checked already."""
+        self._admit(servo, self._polls)
+
+    def _admit(self, servo: str, limiter: RateLimiter | None) -> None:
         if not self._has_servo(servo):
             raise RequestRejected(Refusal.UNKNOWN_SERVO, f"this twin has no servo {servo[:64]!r}")
-        if limited:
-            self._limiter.take(servo)
+        if limiter is not None:
+            limiter.take(servo)
 
     def find_verifier(self, servo: str) -> bytes | None:
         """Verifier of a servo's token; None: it has none."""

@@ -143,8 +143,12 @@ class ServiceConfig:
         float,
         key(above=0.0, infinite=True, help="Time after which the body of a window that led to no update is deleted."),
     ] = 30.0
-    rate_limit_per_s: Annotated[float, key(above=0.0, help="Largest mean rate of messages from one servo.")] = 20.0
-    rate_burst: Annotated[float, key(above=0.0, help="Largest burst of messages from one servo.")] = 200.0
+    rate_limit_per_s: Annotated[
+        float, key(above=0.0, help="Largest mean rate of messages from one servo, and of its polls.")
+    ] = 20.0
+    rate_burst: Annotated[float, key(above=0.0, help="Largest burst of messages from one servo, and of its polls.")] = (
+        200.0
+    )
     max_body_bytes: Annotated[
         int, key(minimum=1024, maximum=MAX_BYTES, help="Largest size of a body, as sent and as decompressed.")
     ] = MAX_BYTES
@@ -152,6 +156,9 @@ class ServiceConfig:
     long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Largest number of long polls open at once.")] = (
         20_000
     )
+    polls_per_servo: Annotated[
+        int, key(minimum=1, maximum=_MOST, help="Largest number of long polls of one servo open at once.")
+    ] = 8
     queue: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of messages that wait for their commit.")
     ] = 2000
@@ -160,6 +167,23 @@ class ServiceConfig:
         float, key(minimum=0.0, help="Largest lead of a window's sample time over that ratio.")
     ] = 60.0
     job_timeout_s: Annotated[float, key(above=0.0, help="Time for one servo after which a worker is replaced.")] = 300.0
+    worker_share: Annotated[
+        float,
+        key(
+            above=0.0,
+            maximum=1.0,
+            help="Largest share of one worker's time for one servo, while work waits for a worker.",
+        ),
+    ] = 0.5
+    lag_limit_s: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Time for which new messages of a servo may wait for their turn; beyond it the service reports itself "
+            "as degraded.",
+        ),
+    ] = 30.0
     log_level: Annotated[str, key(choices=_LOG_LEVELS, help="Level of the log.")] = "info"
     mqtt: MqttConfig | None = None
 

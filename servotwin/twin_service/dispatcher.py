@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections import Counter
 from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 
 from servotwin.store.engine import StoreUnavailable
@@ -23,8 +24,16 @@ from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerPool, W
 log = logging.getLogger(__name__)
 
 LEASE_S, _POLL_S, _RETRY_S = 120.0, 0.5, 1.0
+_RENEWALS = 4.0
+"""Renewals of a lease within its time while a worker is at work, however long that takes."""
 _SERVOS, _MESSAGES = 16, 16
-"""Servos in one job, and messages of each."""
+"""Servos in one job, and messages of each, at most."""
+_JOB_S = 0.5
+"""s that a job may be expected to take: a servo in it has no newer messages than those of its lease."""
+_FORGETTING = 0.1
+"""Weight of the newest work in the mean time for one servo."""
+_SHORTEST_HOLD_S = 0.1
+"""A shorter hold is not worth a write."""
 _MAX_STEPS = 64
 """Results that one lock-step request may lead to."""
 QUIET = ("glance", "trend", "machine", "motor", "disturbance", "excitation")
@@ -63,6 +72,33 @@ class VerificationQuota:
         self._level -= 1.0
 
 
+class WorkPace:
+    """Mean time of the work for one servo, and what follows from it.
+
+    Parameters
+    ----------
+    share : float
+        Largest share of one worker's time for one servo.
+    """
+
+    def __init__(self, share: float = 1.0) -> None:
+        self._share, self.seconds = share, 0.0
+
+    def note(self, seconds: float) -> None:
+        """Note the time that a servo took."""
+        self.seconds += (_FORGETTING if self.seconds else 1.0) * (seconds - self.seconds)
+
+    @property
+    def servos(self) -> int:
+        """Number of servos that a job may have."""
+        return _SERVOS if self.seconds * _SERVOS <= _JOB_S else max(1, int(_JOB_S / self.seconds))
+
+    def hold(self, seconds: float) -> float:
+        """s for which a servo that took so long waits for its next turn."""
+        hold = seconds * (1.0 / self._share - 1.0)
+        return hold if hold >= _SHORTEST_HOLD_S else 0.0
+
+
 class Dispatcher:
     """Keeps the worker pool busy.
 
@@ -79,6 +115,11 @@ class Dispatcher:
     owner : str
         Of the leases.
     quota : VerificationQuota
+    pace : WorkPace, optional
+    paused : callable
+        True while nothing new is to be begun.
+    speed : float
+        Least ratio of sample time to real time.
     """
 
     def __init__(
@@ -92,12 +133,16 @@ class Dispatcher:
         clocks: Clocks,
         owner: str,
         quota: VerificationQuota,
+        pace: WorkPace | None = None,
+        speed: float = 1.0,
+        paused: Callable[[], bool] = lambda: False,
     ) -> None:
         self._store, self._executor, self._pool = store, executor, pool
         self._commit, self._notify, self._metrics, self._clocks = commit, notify, metrics, clocks
         self._owner, self._quota = owner, quota
+        self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
         self._work_pending = asyncio.Event()
-        self._stopping = False
+        self._stopping, self._waited_for = False, False
         self._tasks: set[asyncio.Task[None]] = set()
         self._to_release: set[str] = set()
         self._failures: Counter[tuple[str, bool]] = Counter()
@@ -112,11 +157,12 @@ class Dispatcher:
             worker = await self._pool.acquire()
             # After a worker is free: a lease that waited for one would lose a part of its time, and other processes
             # could not take it.
+            self._waited_for = True  # unless there is nothing to do
             leases = await self._next_leases()
             if not leases:
                 self._pool.release(worker)
                 continue
-            task = asyncio.create_task(self._employ(worker, leases))
+            task = asyncio.create_task(self._employ(worker, leases, self._waited_for))
             self._tasks.add(task)
             # The loop has weak references to tasks only; the set keeps this one from being collected.
             task.add_done_callback(self._tasks.discard)
@@ -168,6 +214,9 @@ class Dispatcher:
         while not self._stopping:
             # Cleared before the store is read: a message that comes meanwhile ends the rest that follows.
             self._work_pending.clear()
+            if self._paused():
+                await self._rest(_RETRY_S)
+                continue
             try:
                 await self._release_failed()
                 leases = await self._lease_next()
@@ -177,6 +226,7 @@ class Dispatcher:
                 continue
             if leases:
                 return leases
+            self._waited_for = False
             await self._rest(_POLL_S)
         return []
 
@@ -188,11 +238,11 @@ class Dispatcher:
             if verifications:
                 self._quota.take()
                 return verifications
-        return await self._lease(now, _SERVOS, WORK_KINDS)
+        return await self._lease(now, self._pace.servos, WORK_KINDS)
 
     async def _lease(self, now: float, servos: int, kinds: Collection[MessageKind]) -> list[Lease]:
         return await self._executor.run(
-            lambda: self._store.lease(self._owner, servos, LEASE_S, now, kinds, per_servo=_MESSAGES)
+            lambda: self._store.lease(self._owner, servos, LEASE_S, now, kinds, per_servo=_MESSAGES, newest_first=True)
         )
 
     async def _rest(self, seconds: float) -> None:
@@ -202,8 +252,11 @@ class Dispatcher:
         except TimeoutError:
             return
 
-    async def _employ(self, worker: WorkerProcess, leases: Sequence[Lease]) -> None:
-        """Let a worker process leases; those that failed before each in a job of its own, which isolates the fault."""
+    async def _employ(self, worker: WorkerProcess, leases: Sequence[Lease], others_wait: bool) -> None:
+        """Let a worker process leases; those that failed before each in a job of its own, which isolates the fault.
+
+        `others_wait`: other servos waited for a worker, when these were leased.
+        """
         # Failures of this process, not the store's count of leases: that also rises where a worker was lost to another
         # lease.
         leases = [lease._replace(attempts=1 + self._failures[_queue(lease)]) for lease in leases]
@@ -213,19 +266,30 @@ class Dispatcher:
         ]
         left = dict.fromkeys(lease.servo for job in jobs for lease in job)
         commits: list[asyncio.Task[WorkResult | None]] = []
-        now = self._clocks.wall()
+        now, urgency = self._clocks.wall(), (self._pace.seconds, self._speed, others_wait)
+        renewal = asyncio.create_task(self._renew(left))
         try:
             for job in filter(None, jobs):
                 waiting = iter(job)
-                async for done in worker.work(job, now):
+                async for done in worker.work(job, now, urgency):
                     lease = next(waiting)
                     del left[lease.servo]
-                    commits.append(asyncio.create_task(self._complete(lease, done, now)))
+                    commits.append(asyncio.create_task(self._complete(lease, done, now, others_wait)))
         except WorkerLost as lost:
             await self._lost(worker, leases, list(left), str(lost))
         else:
             self._pool.release(worker)
+        finally:
+            renewal.cancel()
         await asyncio.gather(*commits)
+
+    async def _renew(self, left: Collection[str]) -> None:
+        """Renew the leases of servos that a worker has not finished, so that no other process takes them meanwhile."""
+        while True:
+            await asyncio.sleep(LEASE_S / _RENEWALS)
+            until, servos = self._clocks.wall() + LEASE_S, frozenset(left)
+            with suppress(StoreUnavailable):
+                await self._executor.run(partial(self._store.renew, self._owner, servos, until))
 
     async def _lost(self, worker: WorkerProcess, leases: Sequence[Lease], left: Sequence[str], why: str) -> None:
         """Replace a lost worker: the lease that it was processing failed, those after it are released."""
@@ -237,17 +301,29 @@ class Dispatcher:
         await self._pool.replace(worker, why)
         self.wake()
 
-    async def _complete(self, lease: Lease, done: LeaseResult, now: float) -> WorkResult | None:
+    async def _complete(
+        self, lease: Lease, done: LeaseResult, now: float, others_wait: bool = False
+    ) -> WorkResult | None:
         """Commit a worker's result; None: there is none, and the servo is to be released."""
         self._metrics.work.observe(done.seconds)
+        if not _queue(lease)[1]:
+            self._pace.note(done.seconds)
         if done.result is None:
             self._fail(lease, done.error)
             return None
         if not await self._committed(done.result):
             return None
         self._failures.pop(_queue(lease), None)
+        if others_wait:
+            await self._hold(lease.servo, done.seconds)
         self._report(lease, done.result, done.seconds, now)
         return done.result
+
+    async def _hold(self, servo: str, seconds: float) -> None:
+        """Let the other servos come first after one that took long."""
+        if hold := self._pace.hold(seconds):
+            with suppress(StoreUnavailable):
+                await self._executor.run(partial(self._store.hold, servo, self._clocks.wall() + min(hold, LEASE_S)))
 
     async def _committed(self, result: WorkResult) -> bool:
         counts = self._metrics.results

@@ -49,8 +49,8 @@ class LongPolls:
     ----------
     read : callable
         Reads the store without blocking the event loop.
-    limit : int
-        Polls that may wait at once.
+    limit, per_servo : int
+        Polls that may wait at once, in all and of one servo.
     shared : bool
         Other processes post messages too: the caller has to read from the store the newest serials of the servos in
         `waiting` and give them to `notify_serials`.
@@ -61,8 +61,9 @@ class LongPolls:
         Polls that are being served.
     """
 
-    def __init__(self, read: Read, limit: int, shared: bool = False) -> None:
+    def __init__(self, read: Read, limit: int, shared: bool = False, per_servo: int | None = None) -> None:
         self._read, self._limit, self._shared = read, limit, shared
+        self._per_servo, self._open_of = limit if per_servo is None else per_servo, Counter[str]()
         self._waiting: dict[str, dict[asyncio.Future[None], int]] = {}
         self._notifications: Counter[str] = Counter()
         self._empty_after: dict[str, int] = {}
@@ -110,11 +111,17 @@ class LongPolls:
         """
         if self.open >= self._limit:
             raise RequestRejected(Refusal.TOO_MANY, f"{self._limit} polls wait already")
+        if self._open_of[servo] >= self._per_servo:
+            raise RequestRejected(Refusal.TOO_MANY, f"{self._per_servo} polls of servo {servo!r} wait already")
         self.open += 1
+        self._open_of[servo] += 1
         try:
             return await self._poll(servo, after, wait)
         finally:
             self.open -= 1
+            self._open_of[servo] -= 1
+            if not self._open_of[servo]:
+                del self._open_of[servo]
 
     async def _poll(self, servo: str, after: int, wait: float) -> Sequence[OutgoingMessage]:
         loop = asyncio.get_running_loop()
@@ -251,7 +258,7 @@ class EdgeApi:
         incoming, window = self._ingest.read_window(servo, body, request.content_encoding)
         if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
             raise RequestRejected(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
-        new = await self._ingest.commit(incoming) is PutResult.NEW
+        new = await self._ingest.commit(incoming, window) is PutResult.NEW
         if new:
             self._wake()
         return msgpack_response([acknowledgement(window)], 201 if new else 200)
@@ -262,15 +269,15 @@ class EdgeApi:
         self._gate.admit(servo, request.token)
         await self._claims.check(servo, request.claim)
         body = await self._bodies.read(request.content_length, request.receive)
-        incoming, _ = self._ingest.read_letter(servo, body, request.content_encoding)
-        if await self._ingest.commit(incoming) is PutResult.NEW:
+        incoming, letter = self._ingest.read_letter(servo, body, request.content_encoding)
+        if await self._ingest.commit(incoming, letter) is PutResult.NEW:
             self._wake()
         return HttpResponse(202)
 
     async def _get_outgoing(self, request: HttpRequest) -> HttpResponse:
         """Sealed messages with serials above `after`, as soon as there are some; none after `wait` s."""
         servo = request.path["servo"]
-        self._gate.admit(servo, request.token, limited=False)
+        self._gate.admit_poll(servo, request.token)
         after, wait = request.integer("after", 0), request.seconds("wait", 0.0)
         if wait > MAX_WAIT_S:
             detail = f"wait = {wait:g} s: at most {MAX_WAIT_S:g} s are allowed"

@@ -93,7 +93,7 @@ class LockstepApi:
             detail = f"the window ends at {end_of(message):g} s, after now = {now:g} s"
             raise RequestRejected(Refusal.FUTURE, detail)
         async with self._locks[servo]:
-            new = await self._ingest.commit(incoming._replace(received=now)) is PutResult.NEW
+            new = await self._ingest.commit(incoming._replace(received=now), message) is PutResult.NEW
             sent = await self._process(servo, now) if new else []
         first = [acknowledgement(message)] if isinstance(message, WindowMessage) else []
         return await self._response(servo, first + sent)

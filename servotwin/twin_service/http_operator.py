@@ -42,8 +42,8 @@ from servotwin.twin_service.store_executor import StoreExecutor
 MAX_ROWS = 1000
 _BACKLOG_S = 0.5
 """s for which a backlog that was read is served again."""
-Health = Callable[[], dict[str, Any]]
-"""Returns the health of each part of the service, and "ok" for all of them."""
+Health = Callable[[Backlog | None], dict[str, Any]]
+"""Returns the health of each part of the service, "ok" for all of them, and "degraded"; None: the store is away."""
 
 
 class OperatorApi:
@@ -75,6 +75,8 @@ class OperatorApi:
         self._backlog: tuple[float, Backlog | None] = -math.inf, None
         metrics.add_gauge("servotwin_waiting", "Messages and verifications not yet processed.", self._counts, "kind")
         metrics.add_gauge("servotwin_waiting_seconds", "Age of the oldest message not yet processed.", self._age)
+        lag = "Longest time for which new messages of a servo have waited for its turn."
+        metrics.add_gauge("servotwin_lag_seconds", lag, self._lag)
 
     def routes(self) -> list[HttpRoute]:
         """Declarations."""
@@ -168,11 +170,11 @@ class OperatorApi:
 
     async def _get_health(self, _request: HttpRequest) -> HttpResponse:
         """Health and backlog: 200, or 503."""
-        health = self._health()
         try:
-            health["waiting"] = (await self._read_backlog())._asdict()
+            backlog = await self._read_backlog()
+            health = {**self._health(backlog), "waiting": backlog._asdict()}
         except StoreUnavailable:
-            health["ok"] = health["store"] = False
+            health = {**self._health(None), "ok": False, "store": False}
         return json_response(health, 200 if health["ok"] else 503)
 
     async def _get_metrics(self, _request: HttpRequest) -> HttpResponse:
@@ -187,6 +189,10 @@ class OperatorApi:
     def _age(self) -> float:
         backlog = self._backlog[1]
         return math.nan if backlog is None else backlog.age
+
+    def _lag(self) -> float:
+        backlog = self._backlog[1]
+        return math.nan if backlog is None else backlog.lag
 
     async def _read_backlog(self) -> Backlog:
         """Backlog, read from the store at most every 0.5 s: requests for it need no token and have no rate limit."""

@@ -21,6 +21,9 @@ from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
+_DRAIN_BYTES, _DRAIN_S = 256 * 1024, 2.0
+"""Rest of a body that is still received, and discarded, after its request was answered; then the connection ends. An
+edge whose token is no longer valid can so read its answer, and a stranger holds nothing."""
 _BACKLOG = 2048
 """Connections that wait to be accepted: after an outage all edges connect at once."""
 _BODY_MEMORY = 256 * 1024 * 1024
@@ -40,8 +43,9 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     header or trailer, which the parser reports only once it is complete.
     """
 
-    _head = _unreported = 0
+    _head = _unreported = _drained = 0
     _timer: asyncio.TimerHandle | None = None
+    _drain_timer: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
@@ -49,6 +53,7 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop_timer()
+        self._stop_drain()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -61,6 +66,10 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_body(self, body: bytes) -> None:
         self._unreported = 0
         super().on_body(body)
+        if self.cycle.response_complete:
+            self._drained += len(body)
+            if self._drained > _DRAIN_BYTES:
+                self.transport.abort()
 
     def on_message_begin(self) -> None:
         self._unreported = 0
@@ -83,7 +92,20 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
 
     def on_message_complete(self) -> None:
         self._unreported = 0
+        self._stop_drain()
         super().on_message_complete()
+
+    def on_response_complete(self) -> None:
+        # Answered before its body was complete: a rejection.
+        if self.cycle.more_body and not self.transport.is_closing():
+            self._drained = 0
+            self._drain_timer = self.loop.call_later(_DRAIN_S, self.transport.abort)
+        super().on_response_complete()
+
+    def _stop_drain(self) -> None:
+        if self._drain_timer is not None:
+            self._drain_timer.cancel()
+            self._drain_timer = None
 
     def _count(self, size: int) -> None:
         self._unreported = 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable
-from hashlib import blake2b
 from typing import NamedTuple
 
 from servotwin.messages import (
@@ -24,12 +23,11 @@ from servotwin.messages import (
 from servotwin.messages.codec import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.records import Incoming, MessageKind, PutResult
+from servotwin.store.soundness import message_digest
 from servotwin.twin_service.limits import RequestRejected, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 
 LETTERS = (Hello, Receipt, Fallback, Answer)
-_CHUNK = 2047
-"""Bytes; see `_digest`."""
 
 
 class Clocks(NamedTuple):
@@ -62,6 +60,8 @@ class Ingest:
     limit : int
         Bytes of a message, decompressed.
     clocks : Clocks
+    note : callable
+        Called with each window that was new.
     """
 
     def __init__(
@@ -72,7 +72,9 @@ class Ingest:
         metrics: Metrics,
         limit: int = MAX_BYTES,
         clocks: Clocks | None = None,
+        note: Callable[[WindowMessage], None] = lambda _window: None,
     ) -> None:
+        self._note = note
         self._put, self._has_servo, self._sample_times = put, has_servo, sample_times
         self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
@@ -109,7 +111,7 @@ class Ingest:
             The message is not for a twin, or invalid; `refusal` is the reason.
         """
         data, message = self._decoded(servo, body, encoding)
-        now, digest = self._clocks.monotonic(), _digest(data)
+        now, digest = self._clocks.monotonic(), message_digest(data)
         if isinstance(message, WindowMessage):
             self._sample_times.check(servo, message.boot, end_of(message), now)
             incoming = Incoming(
@@ -135,8 +137,8 @@ class Ingest:
         """Decode a message of that servo that is not to be stored; raises RequestRejected as `read` does."""
         return self._decoded(servo, body, encoding)[1]
 
-    async def commit(self, incoming: Incoming) -> PutResult:
-        """Commit a message; returns when it is on the disk.
+    async def commit(self, incoming: Incoming, message: Message) -> PutResult:
+        """Commit a message that was read; returns when it is on the disk.
 
         Raises
         ------
@@ -154,6 +156,8 @@ class Ingest:
             )
         self._metrics.commit.observe(self._clocks.monotonic() - begun)
         self._metrics.stored.add(incoming.kind.value, put.value)
+        if put is PutResult.NEW and isinstance(message, WindowMessage):
+            self._note(message)
         return put
 
     def _decoded(self, servo: str, body: bytes, encoding: str) -> tuple[bytes, Message]:
@@ -178,18 +182,6 @@ def end_of(window: WindowMessage) -> float:
 def acknowledgement(window: WindowMessage) -> bytes:
     """Message that tells the edge that its window is safe."""
     return encode(Acknowledge(window.servo, window.boot, window.sequence))
-
-
-def _digest(data: bytes) -> bytes:
-    """Digest of a message, in chunks so small that hashlib does not release the interpreter lock.
-
-    With larger ones another thread takes the lock, and the event loop waits for that thread: 270 us instead of 25 for
-    20 kB while commits are being written.
-    """
-    whole, digest = memoryview(data), blake2b(digest_size=16)
-    for begin in range(0, len(data), _CHUNK):
-        digest.update(whole[begin : begin + _CHUNK])
-    return digest.digest()
 
 
 def _kind(message: Message) -> str:

@@ -60,10 +60,19 @@ class RateLimiter:
     """Token bucket per servo: a message takes one token, `rate` tokens per s are added up to `burst`.
 
     The least recently used buckets are dropped; a bucket that was dropped is full when it is used again.
+
+    Parameters
+    ----------
+    rate, burst : float
+        Per s; number.
+    monotonic : callable
+        s.
+    counted : str
+        What a token stands for, in rejections.
     """
 
-    def __init__(self, rate: float, burst: float, monotonic: Callable[[], float]) -> None:
-        self._rate, self._burst, self._now = rate, max(1.0, burst), monotonic
+    def __init__(self, rate: float, burst: float, monotonic: Callable[[], float], counted: str = "messages") -> None:
+        self._rate, self._burst, self._now, self._counted = rate, max(1.0, burst), monotonic, counted
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, servo: str) -> None:
@@ -83,7 +92,9 @@ class RateLimiter:
         if len(self._levels) > MAX_SERVOS:
             self._levels.popitem(last=False)
         if level < 1.0:
-            raise RequestRejected(Refusal.TOO_MANY, f"more than {self._rate:g} messages per s of servo {servo!r}")
+            raise RequestRejected(
+                Refusal.TOO_MANY, f"more than {self._rate:g} {self._counted} per s of servo {servo!r}"
+            )
 
 
 class _SampleTime(NamedTuple):

@@ -111,9 +111,12 @@ class Metrics:
         self.evidence = Counter("servotwin_evidence_total", "Pieces of evidence committed, by kind.", "kind")
         self.sent = Counter("servotwin_posted_total", "Messages posted to edges.")
         self.workers_lost = Counter("servotwin_workers_lost_total", "Worker processes that were replaced.")
+        self.missing = Counter(
+            "servotwin_windows_missing_total", "Windows of a boot that did not come, though later ones did."
+        )
         self._all: list[Counter | Gauge | Histogram] = [
             self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.sent,
-            self.workers_lost,
+            self.workers_lost, self.missing,
         ]  # fmt: skip
 
     def add_gauge(

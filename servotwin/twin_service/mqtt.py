@@ -100,7 +100,7 @@ class MqttRequestHandler:
     async def _handle(self, request: ReceivedRequest) -> MqttResponse:
         servo, question = request.servo, request.content
         if isinstance(question, PollRequest):
-            self._gate.admit_authenticated(servo, limited=False)
+            self._gate.admit_authenticated_poll(servo)
             if question.question is not None:
                 return PollResponse([], await self._claims.answer(servo, question.question))
             await self._claims.check(servo, question.claim)
@@ -109,8 +109,8 @@ class MqttRequestHandler:
             return PollResponse(seal_messages(self._gate.verifier(servo), servo, messages))
         self._gate.admit_authenticated(servo)
         await self._claims.check(servo, question.claim)
-        incoming, _ = self._ingest.read(servo, question.body, question.encoding)
-        if await self._ingest.commit(incoming) is PutResult.NEW:
+        incoming, message = self._ingest.read(servo, question.body, question.encoding)
+        if await self._ingest.commit(incoming, message) is PutResult.NEW:
             self._wake()
         return PutResponse()
 

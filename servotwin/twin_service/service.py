@@ -14,16 +14,17 @@ from uuid import uuid4
 
 from servotwin import __version__
 from servotwin.messages import NAME_PATTERN
+from servotwin.store.clock_gaps import received_before
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
-from servotwin.store.records import OutgoingMessage
-from servotwin.store.retention import delete_old_bodies
+from servotwin.store.records import Backlog, OutgoingMessage, PutResult
+from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
-from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
+from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
@@ -31,15 +32,20 @@ from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.worker import WorkerPool
 
 log = logging.getLogger(__name__)
 
-_REFRESH_S, _RETENTION_S, _DAY = 1.0, 600.0, 86400.0
+_REFRESH_S, _WATCH_S, _RETENTION_S, _DAY = 1.0, 5.0, 600.0, 86400.0
+_LEAST_DELETED = 4096
+"""Windows that one pass of retention may empty, beside twice those that came since the pass before: it keeps pace, and
+a mistake does not cost the past at once."""
 _UNHEALTHY_S = 60.0
 """s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
 _SOLE_OWNER = "twin"
@@ -71,32 +77,43 @@ class TwinService:
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
-        self.polls = LongPolls(self._read_outgoing, config.long_polls, shared=self._shared)
+        self.polls = LongPolls(self._read_outgoing, config.long_polls, self._shared, config.polls_per_servo)
         self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
+        self.watch = StoreWatch(
+            store, self.executor, self._writes.put, self._writes.commit, self.clocks.wall, self.clocks.monotonic
+        )
+        sequences = SequenceWatch(self.clocks.monotonic)
+        self._missing = MissingWindows(
+            store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall
+        )
         has_servo = _servo_test(twin.servos)
         slack = math.inf if config.lockstep else config.future_slack_s
         self.ingest = Ingest(
-            put=self._writes.put,
+            put=self.watch.put,
             has_servo=has_servo,
             sample_times=SampleTimeLimiter(config.speed, slack),
             metrics=self.metrics,
             limit=config.max_body_bytes,
             clocks=self.clocks,
+            note=sequences.note,
         )
-        self.gate = EdgeGate(
-            self.access, has_servo, RateLimiter(config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
-        )
+        limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
+        self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
         self.dispatcher = Dispatcher(
             store=store,
             executor=self.executor,
             pool=self.pool,
-            commit=self._writes.commit,
+            commit=self.watch.commit,
             notify=self.polls.notify,
             metrics=self.metrics,
             clocks=self.clocks,
             owner=self._owner,
             quota=VerificationQuota(config.verifications_per_minute),
+            # In lock-step everything is worked on in order, however long it takes.
+            pace=WorkPace(1.0 if config.lockstep else config.worker_share),
+            speed=min(1.0, config.speed),
+            paused=lambda: bool(self.watch.fault),
         )
         self.claims = EdgeClaims(
             store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
@@ -123,7 +140,8 @@ class TwinService:
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""
-        if not self._shared:
+        await self.watch.start()
+        if not self._shared and not self.watch.fault:
             # The store is locked for this process, so that every lease is one of a process that has ended.
             await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
@@ -132,6 +150,10 @@ class TwinService:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
             self._spawn(self.dispatcher.run())
+            self._spawn(self._watch_lag())
+            self._spawn(self._missing.run())
+            self._spawn(self.watch.run())
+            self._spawn(self.watch.run_mark())
         if not math.isinf(self.config.retention_days):
             self._spawn(self._apply_retention())
         if self._mqtt is not None:
@@ -149,17 +171,29 @@ class TwinService:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.pool.stop()
         await asyncio.to_thread(self.commits.close)
+        with suppress(StoreUnavailable):
+            if not self.watch.fault:
+                await asyncio.to_thread(self.watch.mark)
         self.executor.close()
 
-    def health(self) -> dict[str, Any]:
-        """Health of each part, and "ok" for all."""
+    def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
+        """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
         store, workers = self._store_healthy(), self.pool.alive
-        dispatching = all(not task.done() for task in self._tasks)
-        ok = store and workers > 0 and dispatching
-        return {"ok": ok, "store": store, "workers": workers, "dispatching": dispatching}
+        # A task that ended without an error did so because of the damage.
+        dispatching = not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
+        parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
+        return {"ok": store and workers > 0 and dispatching, "degraded": self._lagging(backlog), **parts}
+
+    def _lagging(self, backlog: Backlog | None) -> list[str]:
+        """The lag in a sentence, where it is above its limit."""
+        if backlog is None or backlog.lag <= self.config.lag_limit_s:
+            return []
+        return [f"new messages of a servo have waited for {backlog.lag:.0f} s, {backlog.messages} in all"]
 
     def _store_healthy(self) -> bool:
         """Last read and last write succeeded, or that write failed long ago: none may have been tried since."""
+        if self.watch.fault:
+            return False
         return not self.executor.fault and self.clocks.monotonic() - self._writes.failed_at >= _UNHEALTHY_S
 
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
@@ -184,15 +218,37 @@ class TwinService:
             with suppress(StoreUnavailable):
                 self.polls.notify_serials(await self.executor.run(partial(self.store.posted, self.polls.waiting)))
 
-    async def _apply_retention(self) -> None:
-        """Delete the bodies of windows that are too old."""
+    async def _watch_lag(self) -> None:
+        """Log when new messages begin to wait too long, and when they no longer do."""
+        lagging = False
         while True:
-            before = self.clocks.wall() - self.config.retention_days * _DAY
+            await asyncio.sleep(_WATCH_S)
             with suppress(StoreUnavailable):
-                done = await self.executor.run(partial(delete_old_bodies, self.store, before))
+                backlog = await self.executor.run(lambda: self.store.backlog(self.clocks.wall()))
+                before, lagging = lagging, bool(self._lagging(backlog))
+                figures = {"lag": round(backlog.lag, 1), "waiting": backlog.messages}
+                if lagging and not before:
+                    log.warning("updates lag", extra=figures)
+                if before and not lagging:
+                    log.info("updates lag no longer", extra=figures)
+
+    async def _apply_retention(self) -> None:
+        """Delete the bodies of windows that are too old: never at the start, where a wrong clock is set right."""
+        age, stored = self.config.retention_days * _DAY, 0
+        while True:
+            await asyncio.sleep(_RETENTION_S)
+            before, stored = stored, self.metrics.stored.values["window", PutResult.NEW.value]
+            with suppress(StoreUnavailable):
+                done = await self.executor.run(partial(self._delete_old, age, _LEAST_DELETED + 2 * (stored - before)))
                 if done.emptied:
                     log.info("old window bodies deleted", extra=done._asdict())
-            await asyncio.sleep(_RETENTION_S)
+
+    def _delete_old(self, age: float, most: int) -> RetentionResult:
+        now = self.clocks.wall()
+        before = received_before(self.store, now, age)
+        if (left_out := now - age - before) > 0.0 and not math.isinf(left_out):
+            log.warning("retention leaves out a gap", extra={"days": round(left_out / _DAY, 3)})
+        return delete_old_bodies(self.store, before, most=most)
 
     def _add_gauges(self) -> None:
         add = self.metrics.add_gauge
@@ -200,6 +256,9 @@ class TwinService:
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
+        damaged = "1: the store is damaged, and is not written any more."
+        add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))
+        add("servotwin_store_checks", "Times that the whole store was checked.", lambda: self.watch.rounds)
         mqtt = self._mqtt
         if mqtt is not None:
             add("servotwin_broker_connected", "1 while the MQTT broker is connected.", lambda: mqtt.connected)

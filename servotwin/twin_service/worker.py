@@ -53,11 +53,25 @@ class WorkerStart(NamedTuple):
     folder: str
 
 
+WorkerUrgency = tuple[float, float, bool]
+"""Fields of `twin.work.Urgency`."""
+
+
 class WorkerJob(NamedTuple):
-    """Leases to be processed in order; `now` in s: since the epoch, or sample time in lock-step."""
+    """Leases to be processed in order.
+
+    Attributes
+    ----------
+    leases : tuple of Lease
+    now : float
+        s: since the epoch, or sample time in lock-step.
+    urgency : (float, float, bool), optional
+        Fields of `twin.work.Urgency`; the time then runs on from `now`. None: in lock-step.
+    """
 
     leases: tuple[Lease, ...]
     now: float
+    urgency: WorkerUrgency | None = None
 
 
 class LeaseResult(NamedTuple):
@@ -81,7 +95,7 @@ _encoder = msgspec.msgpack.Encoder()
 _decode_start = msgspec.msgpack.Decoder(WorkerStart).decode
 _decode_job = msgspec.msgpack.Decoder(WorkerJob).decode
 decode_result = msgspec.msgpack.Decoder(LeaseResult).decode
-Work = Callable[[Lease, float], WorkResult]
+Work = Callable[[Lease, float, WorkerUrgency | None], WorkResult]
 
 
 def encode_frame(message: WorkerStart | WorkerJob | LeaseResult) -> bytes:
@@ -161,9 +175,11 @@ class WorkerProcess:
             if refusal := await self._receive(_START_S):
                 raise WorkerLost(refusal.decode())
 
-    async def work(self, leases: Sequence[Lease], now: float) -> AsyncIterator[LeaseResult]:
-        """Process leases; yields their results in order. Raises WorkerLost."""
-        self._send(encode_frame(WorkerJob(tuple(leases), now)))
+    async def work(
+        self, leases: Sequence[Lease], now: float, urgency: WorkerUrgency | None = None
+    ) -> AsyncIterator[LeaseResult]:
+        """Process leases, as `WorkerJob` has them; yields their results in order. Raises WorkerLost."""
+        self._send(encode_frame(WorkerJob(tuple(leases), now, urgency)))
         # One timeout per lease, not per job: a job may hold sixteen of them.
         for _ in leases:
             yield decode_result(await self._receive(self._timeout))
@@ -332,18 +348,20 @@ def main(descriptor: int) -> None:
         # Empty: the imports are done, and the worker is ready for a job.
         line.sendall(frame(b""))
         while (body := read_frame(stream)) is not None:
-            job = _decode_job(body)
+            job, begun = _decode_job(body), time.monotonic()
             for lease in job.leases:
+                # The leases before this one took their time; in lock-step no time passes.
+                now = job.now if job.urgency is None else job.now + time.monotonic() - begun
                 # Each result at once: a lease that kills the worker must not take the results before it along.
-                line.sendall(encode_frame(_attempt(work, lease, job.now)))
+                line.sendall(encode_frame(_attempt(work, lease, now, job.urgency)))
 
 
-def _attempt(work: Work, lease: Lease, now: float) -> LeaseResult:
+def _attempt(work: Work, lease: Lease, now: float, urgency: WorkerUrgency | None) -> LeaseResult:
     """Process a lease; an exception becomes the result's error."""
     begun = time.perf_counter()
     result, error = None, ""
     try:
-        result = work(lease, now)
+        result = work(lease, now, urgency)
     except Exception as failure:
         error = f"{type(failure).__name__}: {failure}"
     return LeaseResult(result, error, time.perf_counter() - begun)
@@ -351,11 +369,11 @@ def _attempt(work: Work, lease: Lease, now: float) -> LeaseResult:
 
 def _load_work(start: bytes) -> Work:
     from servotwin.twin.model_registry import ModelRegistry
-    from servotwin.twin.work import work
+    from servotwin.twin.work import Urgency, work
 
     file = _decode_start(start)
     registry = ModelRegistry.loads(file.text, file.source, Path(file.folder))
-    return lambda lease, now: work(registry, lease, now)
+    return lambda lease, now, urgency: work(registry, lease, now, None if urgency is None else Urgency(*urgency))
 
 
 if __name__ == "__main__":

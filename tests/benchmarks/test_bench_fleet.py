@@ -274,4 +274,4 @@ def test_the_option_full_belongs_to_the_fleet_bench() -> None:
     for names in (["tick"], ["W1"], [], ["fleet", "--quick"]):
         shown = CliRunner().invoke(app, ["bench", *names, "--full"])
         assert shown.exit_code == 2
-        assert "--full: only bench fleet takes it" in shown.output
+        assert "--full: only bench fleet or overload takes it" in shown.output

@@ -10,6 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from exploration import extent
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
@@ -295,6 +296,7 @@ def test_a_new_friction_feedforward_fades_in() -> None:
 _compiled_tick: Any = numba.njit(tick)
 
 
+@numba.njit
 def _compiled_run(parameters: Any, state: Any, references: Any, measurements: Any, out: Any) -> None:
     for k in range(len(references)):
         state = _compiled_tick(parameters, state, references[k], measurements[k])
@@ -319,17 +321,20 @@ NOTCHED = LIMITED.replace(notch_hz=4.3, notch_damping=0.4, voltage_limit=1.0, ra
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize(
-    ("controller", "samples"),
-    [(LIMITED, 1_000_000), *((controller, 250_000) for controller in (PAPER, BIASED, STOPPED, FED, NOTCHED))],
+    "controller",
+    [LIMITED, PAPER, BIASED, STOPPED, FED, NOTCHED],
     ids=["limits, hysteresis, filter", "paper", "offset, feedforward", "integral only", "fed forward", "notch"],
 )
-def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller, samples: int) -> None:
+def test_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: Controller) -> None:
+    """A million of them in `make fuzz`."""
+    samples = extent(100_000, 1_000_000)
     law = controller.law(1e-3)
     reference, measurement = _signals(samples)
     compiled = np.empty((samples, len(LawState._fields)))
     first = start(0.0)._replace(offset=2.3)
-    numba.njit(_compiled_run)(law, first, reference, measurement, compiled)
+    _compiled_run(law, first, reference, measurement, compiled)
     state, interpreted = first, array("d")
     for r, y in zip(reference.tolist(), measurement.tolist(), strict=True):
         state = tick(law, state, r, y)
@@ -339,8 +344,8 @@ def test_a_million_ticks_interpreted_and_compiled_agree_bit_for_bit(controller: 
     if controller.voltage_limit is not None:
         saturated = np.abs(compiled[:, 3]) == law.voltage_limit
         rate_limited = np.isclose(np.abs(np.diff(compiled[:, 3])), law.rate_step)
-        assert 1000 < np.count_nonzero(saturated) < samples - 1000
-        assert np.count_nonzero(rate_limited) > 1000
+        assert samples // 2000 < np.count_nonzero(saturated) < samples - 1000
+        assert np.count_nonzero(rate_limited) > 100
 
 
 def test_parameters_are_plain_floats_for_the_compiler() -> None:

@@ -16,7 +16,7 @@ from servotwin.twin.settings import TwinSettings
 LEARNT = 20.0  # s, the second step begins
 
 
-LENGTH = 120.0  # s: the gap grows to 13 deg; the demonstration's test runs all of it
+LENGTH = 80.0  # s: the gap grows to 7 deg; the demonstration's test runs all of it
 
 
 @cache
@@ -36,7 +36,7 @@ def test_it_is_fig15s_wear_under_the_default_policy():
 def test_estimates_are_right_or_refused():
     truth = loop().scenario.gap
     good = [e for e in loop().estimates if e.status is GapStatus.OK]
-    assert len(good) >= 4
+    assert len(good) >= 3
     for estimate in good:
         assert abs(estimate.gap - float(truth.pieces(200.0).value([estimate.time])[0])) < math.radians(0.05)
 
@@ -120,6 +120,6 @@ def test_the_other_policies_close_the_loop_too(policy):
 
 @pytest.mark.slow
 def test_noise_and_a_loop_filter_are_no_reason_to_fall_back():
-    found = cosimulate(Scenario.preset("fig16").replace(duration=45.0, twin=TwinSettings()))
+    found = cosimulate(Scenario.preset("fig16").replace(duration=25.0, twin=TwinSettings()))
     assert not found.fallbacks
     assert len(found.applied) == len(found.updates) >= 1

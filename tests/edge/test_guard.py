@@ -47,6 +47,7 @@ def test_a_good_update_is_applied_at_the_next_sample() -> None:
         ({"base_version": 3}, Reason.BASE_MISMATCH),
         ({"data_time": 22.001}, Reason.FUTURE_DATA),
         ({"not_after": 22.0}, Reason.EXPIRED),
+        ({"not_after": 22.0, "base_version": 1}, Reason.EXPIRED),
         ({"data_time": 11.9}, Reason.EXPIRED),
         ({"setting": Setting(3.1e-4)}, Reason.OUT_OF_BOUNDS),
         ({"setting": Setting(0.1e-4)}, Reason.OUT_OF_BOUNDS),

@@ -191,3 +191,13 @@ def test_windows_and_settings_that_do_not_fit_are_refused() -> None:
     still = estimate_gap(Window(0.0 * time, time, sample_rate=1000.0), TABLE, settings=OutputErrorSettings())
     assert still.status is GapStatus.UNIDENTIFIABLE
     assert "position is constant" in still.reasons[0]
+
+
+def test_a_gap_that_may_grow_within_the_window_widens_the_interval_only() -> None:
+    """By the standard deviation of a place anywhere in the window, 1/sqrt(12) of its growth."""
+    window = recorded(TWO_MASS, 0.03, 1e-4)
+    still = estimate_gap(window, TWO_MASS)
+    worn = estimate_gap(window, TWO_MASS, settings=OutputErrorSettings(gap_rate=1e-3))
+    assert (worn.gap, worn.std) == (still.gap, still.std)
+    grown = 1e-3 * window.duration / math.sqrt(12.0)
+    assert worn.std_total == pytest.approx(math.hypot(still.std_total, grown), rel=1e-3)

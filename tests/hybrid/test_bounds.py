@@ -37,7 +37,7 @@ else:
 
 import test_hybrid_automaton, test_hybrid_ball, test_hybrid_random
 test_hybrid_ball.test_zeno_point_to_rounding_when_bounces_die_quickly()
-test_hybrid_random.check_a_record_that_grows(5_000)
+test_hybrid_random.check_a_record_that_grows(2_500)
 test_hybrid_random.test_standing_still_for_ever_is_safe()
 test_hybrid_random.test_after_zeno_a_run_stays_refused_and_its_past_readable()
 test_hybrid_automaton.test_jumps_at_one_instant_apply_in_order()
@@ -46,13 +46,13 @@ test_hybrid_automaton.test_set_between_advances()
 
 import servotwin as st
 from servotwin.simulation.ensemble import simulate_ensemble
-servo = st.Servo.preset("table1")
+servo = st.Servo.preset("table1").replace(n=2)
 knots = [0.0, 0.1001, 0.10013, 0.15]
 worn = st.PiecewiseCubic(knots, [[0.1, 0.2, 0, 0], [0.2, 0, 0, 0], [0.05, 0, 0, 0], [0, 0, 1, 1]])
 wave, tolerance = st.SquareWave(1e-3, 0.125), servo.tolerance_for(math.radians(1.0))
 limited = servo.controller.replace(voltage_limit=0.5, loop_filter_hz=20.0)
 sampled = [limited.replace(sample_rate=1000.0), servo.controller.replace(sample_rate=5000.0)]
-for law in (servo.controller, limited, *sampled):
+for law in (limited, *sampled):
     run = st.simulate(servo, 0.15, controller=law, reference=wave, gap=worn, tolerance=tolerance, noise=st.Noise(1e-5))
     assert len(run.events) > 5 and np.isfinite(run.q).all() and np.isfinite(run.voltage).all()
 assert simulate_ensemble(servo, 0.15, 1e-3, gap=[0.0, 0.1, 0.2], tolerance=[0.0, tolerance, tolerance]).shape == (3, 16)

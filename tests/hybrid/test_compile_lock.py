@@ -14,6 +14,7 @@ from servotwin.runtime.locks import locked
 
 MODULE = """
 import os
+import time
 from pathlib import Path
 
 from numba.core.event import install_recorder
@@ -38,7 +39,7 @@ def factorial(n):
 
 def wait_for(name):
     while not Path(name).exists():
-        pass
+        time.sleep(0.001)
 
 
 if "HANG" in os.environ:

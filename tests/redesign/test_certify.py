@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from servotwin.control.law import start, tick
 from servotwin.control.retuning import unfed
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess, joined, nearness, stillness
 from servotwin.redesign.certified.attempt import Attempt, Question
@@ -212,6 +213,11 @@ def test_a_decision_is_the_same_whenever_it_is_made() -> None:
 def test_no_candidate_is_one_sentence() -> None:
     with pytest.raises(InvalidInput, match=r"no candidate has Ms <= 1\.01 on this servo"):
         certify(SERVO, Uncertainty(), replace(SMALL, Ms=1.01), SHORT)
+
+
+def test_a_controller_without_proportional_action_is_refused() -> None:
+    with pytest.raises(InvalidInput, match=r"controller kp = 0: verified settings have scaled proportional gains"):
+        certify(Axis.preset("stepper-stage"), Uncertainty())
 
 
 def test_without_a_verified_setting_the_best_candidate_is_reported() -> None:

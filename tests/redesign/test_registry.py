@@ -43,6 +43,7 @@ friction_n_m = [0.0, 0.001]
 Ms = 1.9
 settled_percent = 98
 overshoot_percent = 20
+velocity_feedforward = false
 """
 
 
@@ -71,7 +72,7 @@ def test_each_policy_gets_what_is_set_of_it():
 @pytest.mark.slow
 def test_certified_designs_for_the_controller_that_runs():
     """Loop filter and limits count, the sample rate stays; no more is fed forward than may be needed."""
-    scenario = Scenario.preset("fig16").replace(twin=TwinSettings())
+    scenario = Scenario.preset("fig16").replace(twin=TwinSettings(demands=Demands(velocity_feedforward=False)))
     policy = certified_policy(scenario.model, scenario.twin)
     law = policy.fallback().setting.controller
     assert (law.loop_filter_hz, law.sample_rate) == (20.0, 5000.0)
@@ -124,7 +125,7 @@ def test_an_empty_set_of_candidates_is_refused_before_anything_runs(tmp_path):
 @pytest.mark.slow
 def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_path):
     with pytest.raises(InvalidInput, match=r"no fallback set for the servo's stated range: none of \d+ candidates"):
-        load(tmp_path, "[twin.demands]\nsettled_percent = 100\nvelocity_feedforward = false")
+        load(tmp_path, "[twin.demands]\nsettled_percent = 100\nvelocity_feedforward = false\nMs = 1.2")
 
 
 def test_an_unstable_loop_is_refused_under_every_policy(tmp_path):
@@ -161,7 +162,7 @@ def test_the_loop_begins_on_the_controller_that_the_scenario_gives(tmp_path, tex
 
 @pytest.mark.slow
 def test_a_sample_rate_says_nothing_of_gains(tmp_path):
-    scenario = load(tmp_path, "[controller]\nsample_rate_hz = 5000.0\n")
+    scenario = load(tmp_path, "[controller]\nsample_rate_hz = 5000.0\n[twin.demands]\nvelocity_feedforward = false\n")
     assert scenario.agent_settings().parameters.fallback
     assert scenario.start_law.sample_rate == 5000.0
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 
 import numpy as np
@@ -24,15 +25,18 @@ SERVO, DEMANDS = Servo.preset("paper"), Demands()
 UNCERTAINTY = Uncertainty(gap=(0.1, math.radians(40.0)), input_bias=(-0.02, 0.03))
 
 
+@cache
 def question_and_candidates() -> tuple[Question, list[Design]]:
     trial = trial_for(SERVO, UNCERTAINTY, DEMANDS)
     candidates = candidates_of(SERVO, UNCERTAINTY, DEMANDS, disturbed=True, noisy=False)
     return Question(SERVO, UNCERTAINTY, DEMANDS, trial, noise=0.0), candidates
 
 
-def fully_ranked(question: Question, candidates: list[Design]) -> list[Design]:
-    """Every candidate on every machine."""
-    demands = question.demands
+@cache
+def fully_ranked(part: int) -> list[Design]:
+    """Every candidate, or one of so many, on every machine."""
+    question, every = question_and_candidates()
+    candidates, demands = every[::part], question.demands
     members = draw(SERVO, UNCERTAINTY, demands.screened, demands.conditions, demands.seed)
     measures = assess(candidates, members, question.trial.half)
 
@@ -51,13 +55,13 @@ def test_the_order_is_that_of_all_candidates_on_all_machines() -> None:
     candidates = every[::7]
     ranked = list(Screening(question).ranked(candidates))
     assert len(candidates) > 5
-    assert ranked == fully_ranked(question, candidates)
+    assert ranked == fully_ranked(7)
 
 
 @pytest.mark.slow
 def test_the_first_candidates_cost_fewer_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
-    question, candidates = question_and_candidates()
-    runs = 0
+    question, every = question_and_candidates()
+    candidates, runs = every[::2], 0
 
     def counted(settings: list[Design], members: SimulatedMachines, *rest: object) -> object:
         nonlocal runs
@@ -66,7 +70,7 @@ def test_the_first_candidates_cost_fewer_simulations(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(module, "assess", counted)
     first = list(islice(Screening(question).ranked(candidates), 2))
-    assert first == fully_ranked(question, candidates)[:2]
+    assert first == fully_ranked(2)[:2]
     assert runs < 0.5 * len(candidates) * DEMANDS.screened * DEMANDS.conditions
 
 
@@ -76,7 +80,7 @@ def test_only_those_that_meet_the_demands_come_first() -> None:
     question, every = question_and_candidates()
     candidates = every[::7]
     screening = Screening(question)
-    expected = [each for each in fully_ranked(question, candidates) if not screening.fails(each)]
+    expected = [each for each in fully_ranked(7) if not screening.fails(each)]
     assert list(Screening(question).ranked(candidates, passing=True)) == expected
 
 
@@ -84,7 +88,7 @@ def test_only_those_that_meet_the_demands_come_first() -> None:
 def test_candidates_that_are_not_plain_can_be_dropped_on_the_way() -> None:
     question, every = question_and_candidates()
     candidates = every[::7]
-    expected, screening = fully_ranked(question, candidates), Screening(question)
+    expected, screening = fully_ranked(7), Screening(question)
     ranked = screening.ranked(candidates)
     first = [next(ranked)]
     screening.only = is_plain

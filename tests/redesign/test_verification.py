@@ -133,7 +133,7 @@ def test_no_plant_of_the_stated_set_exceeds_the_worst_Ms(rate: float | None) -> 
     servo = SERVO.replace(sample_rate=rate)
     demands = Demands(integral=(0.0,))
     laws = [setting.controller for setting in candidates_of(servo, Uncertainty(), demands, False, False)]
-    fresh = draw_independently(servo, widened(Uncertainty(), demands), extent(256, 512), 11)
+    fresh = draw_independently(servo, widened(Uncertainty(), demands), extent(128, 512), 11)
     plants = PlantSet.of([plant.plant() for plant in fresh.plants], rate)
     for law in laws:
         for delay in (0,) if rate is None else (0, 3):
@@ -173,7 +173,7 @@ def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
     found = certify(servo, known)
     assert isinstance(found, Certificate), found
-    members = draw_independently(servo, known, extent(512, 1024), 99)
+    members = draw_independently(servo, known, extent(256, 1024), 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
 

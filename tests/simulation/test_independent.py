@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from exploration import extent
 from paper_loop import Case, by_exponentials, by_solve_ivp
 
 from servotwin.errors import InvalidInput
@@ -16,6 +17,7 @@ TIMES = np.linspace(0.0, 20.0, 201)
 # A run whose position moves by more than this part of the amplitude, when the amplitude changes by 1e-12 of it, cannot
 # be compared to 1e-8.
 SENSITIVE = 1e-9
+SEEDS = extent(10, 64)
 
 
 def random_servo(rng: np.random.Generator) -> Servo:
@@ -75,11 +77,12 @@ def sensitivity(case: Case) -> float:
 @pytest.fixture(scope="module")
 def cases() -> list[tuple[int, Case, float]]:
     """Seed, case, sensitivity."""
-    return [(seed, random_case(seed), sensitivity(random_case(seed))) for seed in range(16)]
+    return [(seed, random_case(seed), sensitivity(random_case(seed))) for seed in range(SEEDS)]
 
 
+@pytest.mark.exploration
 def test_most_random_runs_can_be_compared(cases: list[tuple[int, Case, float]]) -> None:
-    assert sum(sensitive <= SENSITIVE for *_, sensitive in cases) >= 13
+    assert sum(sensitive <= SENSITIVE for *_, sensitive in cases) >= 0.8 * SEEDS
     assert {case.servo.n for _, case, _ in cases} == {2, 3, 5}
     assert {(case.gap[2] > 0.0, case.tolerance > 0.0) for _, case, _ in cases} == {
         (a, b) for a in (0, 1) for b in (0, 1)
@@ -92,12 +95,14 @@ def test_against_solve_ivp(cases: list[tuple[int, Case, float]]) -> None:
     calm = [(seed, case) for seed, case, sensitive in cases if sensitive <= SENSITIVE]
     growing = [next(each for each in calm if each[1].servo.n == n and each[1].gap[2] > 0.0) for n in (2, 3, 5)]
     for seed, case in [*growing, next(each for each in calm if each[1].gap[2] == 0.0)]:
-        (expected, count), run = by_solve_ivp(case, TIMES), ours(case)
+        case = replace(case, duration=10.0)
+        (expected, count), run = by_solve_ivp(case, 0.5 * TIMES), ours(case)
         assert np.abs(run.position - expected).max() < 1e-8 * case.amplitude, seed
-        assert count == np.count_nonzero(run.events.state_triggered) >= 10, seed
+        assert count == np.count_nonzero(run.events.state_triggered) >= 5, seed
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_against_exponentials(cases: list[tuple[int, Case, float]]) -> None:
     """scipy's expm on a grid and brentq, on all; the events agree in kind and time."""
     for seed, case, sensitive in cases:
@@ -154,7 +159,7 @@ def test_what_the_paper_lacks_against_exponentials(changes: dict[str, float]) ->
         assert [label for _, label in events] == list(found.kind), seed
         assert np.abs(found.time - [time for time, _ in events]).max() < 1e-7, seed
         compared += 1
-        if compared == 4:
+        if compared == 2:
             return
     raise AssertionError(f"only {compared} cases could be compared")
 
@@ -165,7 +170,7 @@ def elastic_case(seed: int) -> Case:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(4))
 def test_elastic_screw_whose_load_acts_back(seed: int) -> None:
     case = elastic_case(seed)
     (expected, events), run = by_exponentials(case), ours(case)

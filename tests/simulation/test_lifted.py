@@ -45,6 +45,42 @@ def test_random_loops_are_those_of_the_ticks(first: int) -> None:
             assert np.all(np.abs(np.diff(times)) < 1e-7), seed
 
 
+def counting_case(seed: int) -> SampledCase:
+    """A random loop whose position sensor counts, coarsely or finely."""
+    case = random_case(20_000 + seed)
+    size = float(np.abs(case.inputs.reference.coeffs).max())
+    share = 10.0 ** np.random.default_rng([32, seed]).uniform(-5.0, -1.0)
+    case.servo = case.servo.replace(position_resolution=size * share)
+    return case
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 50])
+def test_random_loops_with_counts_are_those_of_the_ticks(first: int) -> None:
+    """The same counts at every sample, the dead zone to the tick, states to 1e-9 of their range."""
+    for seed in range(first, first + 50):
+        case = counting_case(seed)
+        ticked, blocks = case.ticked(), case.in_blocks()
+        assert largest_difference(case, ticked, blocks) < 1e-9, seed
+        measured = [engine.channel("measured_position", 0, case.samples) for engine in (ticked, blocks)]
+        assert np.array_equal(*measured), seed
+        zones = [[event for event in each.events() if event[1] in ZONE] for each in (ticked, blocks)]
+        assert zones[0] == zones[1], seed
+
+
+def test_ticks_of_one_count_are_advanced_in_blocks() -> None:
+    servo = PAPER.replace(position_resolution=1e-6)
+    law = servo.controller.replace(sample_rate=5e3, Ki=0.0)
+    inputs = RunInputs(PiecewiseCubic.constant(1e-3), PiecewiseCubic.constant(10.0 * DEGREE), None, 5e3, 1e-3)
+    case = SampledCase(servo, law, inputs, 0.0, 60_001, 0)
+    ticked, blocks = case.ticked(), case.in_blocks()
+    assert share_of_ticks(blocks) < 0.2
+    assert largest_difference(case, ticked, blocks) < 1e-9
+    counts, expected = (engine.channel("measured_position", 0, case.samples) for engine in (blocks, ticked))
+    assert np.array_equal(counts, expected)
+    assert np.unique(counts).size > 500
+
+
 def test_most_ticks_are_advanced_in_blocks() -> None:
     law = PAPER.controller.replace(sample_rate=5e3)
     wave = as_pieces(SquareWave(1e-3, 4.0), 20.0)

@@ -108,6 +108,15 @@ def test_servos_to_be_woken_do_not_crowd_out_messages_nor_the_reverse(store: Sto
     assert len([servo for servo in servos if servo.startswith("m")]) == 2
 
 
+def test_a_single_place_goes_to_whoever_waited_longest(store: Store) -> None:
+    """Otherwise servos whose updates wait for receipts would starve those that never had a turn."""
+    store.put([window("w")])
+    store.commit([outcome(one, wake=150.0) for one in claim(store)], 201.0)
+    store.put([window("m", received=140.0), window("late", received=160.0)])
+    assert [claim(store, limit=1)[0].servo for _ in range(3)] == ["m", "w", "late"]
+    assert claim(store, limit=1) == []
+
+
 def test_large_messages_are_leased_a_few_at_a_time(store: Store) -> None:
     large, small = b"x" * (MAX_LEASE_BYTES // 2), b"y"
     store.put([window("a", sequence, large) for sequence in range(3)])
@@ -300,3 +309,59 @@ def test_a_transaction_that_lost_a_race_is_retried(store: Store) -> None:
     sa.event.remove(store.engines.writer, "before_cursor_execute", fail)
     assert next(failures, None) is None
     assert rows(store, messages) == 1
+
+
+def test_the_newest_windows_are_leased_first_and_every_letter(store: Store) -> None:
+    store.put([letter(), *(window(sequence=n, body=b"%d" % n) for n in range(5)), letter(body=b"receipt")])
+    (leased,) = claim(store, per_servo=2, newest_first=True)
+    assert bodies_of(leased) == [b"hello", b"3", b"4", b"receipt"]
+    store.commit([outcome(leased)], 201.0)
+    (rest,) = claim(store, per_servo=2, newest_first=True)
+    assert bodies_of(rest) == [b"1", b"2"]
+
+
+def test_the_newest_windows_are_leased_as_far_as_a_lease_has_room(store: Store) -> None:
+    half = MAX_LEASE_BYTES // 2
+    store.put([window("a", n, b"%d" % n + b"x" * half) for n in range(3)])
+    (leased,) = claim(store, newest_first=True)
+    assert [message.key for message in leased.messages] == ["boot/2"]
+
+
+def test_new_messages_of_others_come_before_the_rest_of_a_backlog(store: Store) -> None:
+    store.put([window("a", n, received=100.0 + n) for n in range(5)])
+    store.put([window("b", received=150.0)])
+    (first,) = claim(store, limit=1, per_servo=2, newest_first=True)
+    assert first.servo == "a"
+    store.commit([outcome(first)], 201.0)
+    assert store.backlog(210.0) == Backlog(4, 0, 110.0, 60.0)
+    assert [each.servo for each in claim(store, limit=1, now=202.0)] == ["b"]
+    assert [each.servo for each in claim(store, limit=1, now=202.0)] == ["a"]
+    store.release("me")
+    # A window that comes while its servo's backlog waits has its own place again.
+    store.put([window("a", 9, received=149.0)])
+    assert [each.servo for each in claim(store, limit=1, now=203.0)] == ["a"]
+
+
+def test_what_came_during_the_work_is_no_backlog(store: Store) -> None:
+    store.put([window("a", received=100.0)])
+    (leased,) = claim(store)
+    store.put([window("a", 2, received=201.0)])
+    store.commit([outcome(leased)], 202.0)
+    assert store.backlog(205.0) == Backlog(1, 0, 4.0, 4.0)
+
+
+def test_a_lease_lasts_as_long_as_it_is_renewed(store: Store) -> None:
+    store.put([window(), window("b")])
+    claim(store, now=200.0, lease_s=30.0)
+    store.renew("me", ["a"], 260.0)
+    store.renew("you", ["b"], 260.0)
+    assert [each.servo for each in claim(store, "you", now=240.0)] == ["b"]
+
+
+def test_a_servo_on_hold_waits(store: Store) -> None:
+    store.put([window(), window("b")])
+    store.hold("a", 220.0)
+    assert [each.servo for each in claim(store, now=210.0)] == ["b"]
+    store.hold("b", 500.0)  # it is leased: nothing changes
+    assert [each.servo for each in claim(store, now=221.0)] == ["a"]
+    assert [each.servo for each in claim(store, "you", now=241.0)] == ["b"]

@@ -8,15 +8,16 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
-from store_cases import NewAddress, filled, letter, outcome, window
+from store_cases import NEXT, NewAddress, filled, letter, outcome, window
 
 from servotwin.errors import InvalidInput
+from servotwin.messages import Resend, decode
 from servotwin.store import migrate as migrations
 from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.store.engine import transaction
 from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
-from servotwin.store.schema import bodies
+from servotwin.store.schema import REVISION, bodies
 from servotwin.store.store import open_store
 
 pytest_plugins = ("store_fixtures",)
@@ -42,14 +43,20 @@ def test_a_backup_restored_holds_the_same(url: str, tmp_path: Path) -> None:
     assert restore(saved, again) == counts
     restored = open_store(again)
     assert restored.audit("a") == store.audit("a")[1:]
-    assert restored.outgoing("a", 0) == store.outgoing("a", 0)
+    (update, asking) = restored.outgoing("a", 0)
+    assert [update] == store.outgoing("a", 0)
+    # An edge is asked for the windows that came after the backup.
+    assert decode(asking.body) == Resend("a", reason="the twin's store was restored from a backup")
     assert restored.window("a", "boot", 3) == store.window("a", "boot", 3)
     (summary,) = restored.servos()
     assert summary.posted > store.servos()[0].posted + 100_000
     restored.put([window(sequence=9)])
     (claim,) = restored.lease("me", 1, 30.0, 300.0)
     restored.commit([outcome(claim, outgoing=(b"v", b"w"))], 301.0)
-    assert [posted.serial for posted in restored.outgoing("a", 1)] == [summary.posted + 1, summary.posted + 2]
+    assert [posted.serial for posted in restored.outgoing("a", asking.serial)] == [
+        summary.posted + 1,
+        summary.posted + 2,
+    ]
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(("backup", ".backup"))) == ["backup.db"]
     restored.close()
     store.close()
@@ -136,10 +143,10 @@ def test_a_damaged_or_newer_backup_is_not_restored(url: str, tmp_path: Path, lat
     saved.write_bytes(b"".join((whole[: places[-1]], b"aboot/71", whole[places[-1] + 8 :])))
     with pytest.raises(InvalidInput, match="is damaged"):
         restore(saved, str(to))
-    migrations.migrate(store.engines.writer, "0003", later_scripts)
+    migrations.migrate(store.engines.writer, NEXT, later_scripts)
     store.close()
     shutil.copy(tmp_path / "store.db", saved)
-    with pytest.raises(InvalidInput, match="newer than 0002"):
+    with pytest.raises(InvalidInput, match=f"newer than {REVISION}"):
         restore(saved, str(to))
     assert not to.exists()
     with pytest.raises(InvalidInput, match="there is no such file"):

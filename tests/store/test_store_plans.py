@@ -9,6 +9,7 @@ import pytest
 import sqlalchemy as sa
 from store_cases import letter, outcome, verification, window
 
+from servotwin.store.clock_gaps import received_before
 from servotwin.store.records import EvidenceRecord, MessageKind
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store, open_store
@@ -52,7 +53,9 @@ def exercise(store: Store) -> None:
                 )
                 made = outcome(claim, *result, outgoing=(b"update",), contexts=(("c", "{}"),), wake=150.0)
                 store.write([window("c", first)], [made], 100.0)
-    store.lease("me", 16, 60.0, 300.0)
+    store.lease("me", 16, 60.0, 300.0, newest_first=True)
+    store.renew("me", ["a"], 400.0)
+    store.hold("c", 400.0)
     store.release("me", ["a"])
     store.release("me")
     store.outgoing("a", 0)
@@ -69,6 +72,7 @@ def exercise(store: Store) -> None:
     store.audit("a", window=("boot", 1))
     store.events("a")
     delete_old_bodies(store, 1e9)
+    received_before(store, 1e9, 1e3)
 
 
 def plan(path: str, statement: str, parameters: Any) -> list[str]:

@@ -39,9 +39,9 @@ def test_an_edge_that_received_more_than_a_restored_store_posted_gets_the_next_m
 def test_the_backlog_counts_messages_and_gives_the_age_of_the_oldest(store: Store) -> None:
     assert store.backlog(200.0) == Backlog(0, 0, 0.0)
     store.put([window(received=110.0), letter(received=120.0), window("b", received=150.0)])
-    assert store.backlog(200.0) == Backlog(3, 0, 90.0)
+    assert store.backlog(200.0) == Backlog(3, 0, 90.0, 90.0)
     store.commit([outcome(claim(store, servo="a")[0])], 201.0)
-    assert store.backlog(200.0) == Backlog(1, 0, 50.0)
+    assert store.backlog(200.0) == Backlog(1, 0, 50.0, 50.0)
 
 
 def test_contexts_are_kept_once(store: Store) -> None:

@@ -74,7 +74,8 @@ class Twin:
         known = SERVOS.__contains__
         limits = SampleTimeLimiter(1.0, 1e9)
         ingest = Ingest(AwaitedCommits(self.commits).put, known, limits, self.metrics)
-        gate = EdgeGate(AccessControl(VERIFIERS), known, RateLimiter(1e6, 1e6, self._loop.time))
+        limiter = RateLimiter(1e6, 1e6, self._loop.time)
+        gate = EdgeGate(AccessControl(VERIFIERS), known, limiter, limiter)
         executor = StoreExecutor()
         claims = EdgeClaims(self.store, executor, self.polls.evict, self.metrics, Clocks(), True, "test")
         handler = MqttRequestHandler(gate, ingest, self.polls, claims, lambda: None, self.metrics)

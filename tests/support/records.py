@@ -58,8 +58,10 @@ def count_stored(fleet: Fleet) -> int:
 
 
 def receipts(fleet: Fleet) -> dict[str, list[Receipt]]:
-    """Of each servo, in the order in which they came."""
+    """Of each servo, in the order in which they came; none before there is a store."""
     found: dict[str, list[Receipt]] = {servo: [] for servo in fleet.roles}
+    if not count_stored(fleet):
+        return found
     letters = "SELECT servo, body, encoding FROM messages JOIN bodies ON message = id WHERE kind = 'letter' ORDER BY id"
     for servo, body, encoding in ask(fleet.database, letters):
         message = decode(decompress(body, encoding, 1 << 20))

@@ -11,7 +11,7 @@ from servotwin.twin_service import worker
 ABANDON_AFTER = 3
 
 
-def work(claim: Lease, now: float) -> WorkResult:
+def work(claim: Lease, now: float, _urgency: object) -> WorkResult:
     """One piece of evidence for each message; a message that others died of is given up."""
     messages = claim.messages[:1] if claim.attempts > 1 else claim.messages
     evidence = []

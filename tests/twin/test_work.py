@@ -41,8 +41,8 @@ from servotwin.twin import step as stepping
 from servotwin.twin.estimating import DecodedWindow
 from servotwin.twin.evidence import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
-from servotwin.twin.settings import TwinSettings
-from servotwin.twin.work import ABANDON_AFTER, ONE_BY_ONE, work
+from servotwin.twin.settings import TriageSettings, TwinSettings
+from servotwin.twin.work import ABANDON_AFTER, ONE_BY_ONE, Urgency, work
 
 SCENARIO = Scenario.preset("fig15-sampled").replace(duration=45.0, name="axis")
 START = Setting(SCENARIO.start_tolerance, gains_of(SCENARIO.start_law))
@@ -383,3 +383,68 @@ def test_it_says_what_the_twin_of_the_simulation_says(name):
     assert sent == [m.data for m in down if not isinstance(m.message, Acknowledge | LetterAcknowledge)]
     assert len(sent) >= 1
     assert TwinSettings() != scenario.twin or name == "calm"
+
+
+def redesigns(outcome: WorkResult) -> dict[int, str]:
+    return {row.message: row.status for row in outcome.evidence if row.kind == "redesign"}
+
+
+def test_of_the_windows_that_wait_only_the_newest_changes_the_setting():
+    outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.0, 0.0]), 0.1, Urgency())
+    assert [kinds(outcome, n).count("estimate") for n in (1, 2, 3)] == [1, 1, 1]
+    assert [decode(update).window for update in outcome.outgoing] == [(windows()[2].boot, windows()[2].sequence)]
+    assert {n: why[:14] for n, why in redesigns(outcome).items()} == {1: "a newer window", 2: "a newer window", 3: ""}
+    assert outcome.done == (1, 2, 3)
+
+
+def test_a_window_that_was_overtaken_before_changes_nothing_and_no_summary():
+    first = work(fleet(), claim(windows()[2]), 0.1, Urgency())
+    late = work(fleet(), claim(*windows()[:2], state=first.state, serial=1), 0.2, Urgency())
+    assert late.outgoing == ()
+    assert {why[:14] for why in redesigns(late).values()} == {"a newer window"}
+    assert all(row.overtaken for row in late.evidence)
+    assert not any(row.overtaken for row in first.evidence)
+    # Without the need to hurry all of them have their say.
+    plain_first = work(fleet(), claim(windows()[0]), 0.1)
+    assert work(fleet(), claim(windows()[1], state=plain_first.state, serial=1), 0.2).outgoing
+
+
+def test_with_triage_a_window_that_was_overtaken_gets_a_glance_only():
+    quick = fleet(triage=TriageSettings())
+    outcome = work(quick, claim(*windows()[:3], received=[0.0, 0.0, 0.0]), 0.1, Urgency())
+    assert [kinds(outcome, n) for n in (1, 2)] == [["glance"], ["glance"]]
+    assert kinds(outcome, 3)[:2] == ["glance", "estimate"]
+    assert len(outcome.outgoing) == 1
+
+
+def test_while_other_servos_wait_an_overtaken_window_is_stored_only():
+    outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.0, 0.0]), 0.1, Urgency(others_wait=True))
+    assert [kinds(outcome, n) for n in (1, 2)] == [["glance"], ["glance"]]
+    assert {row.status[:14] for row in outcome.evidence if row.message < 3} == {"a newer window"}
+    assert "estimate" in kinds(outcome, 3)
+    assert len(outcome.outgoing) == 1
+
+
+def test_no_setting_is_computed_that_would_come_too_late():
+    window = windows()[1]
+    spent = window.samples / window.rate
+    in_time, late = 100.0 + QUICK.validity - spent - 0.5, 100.0 + QUICK.validity - spent + 0.5
+    sent = claim(window, received=[100.0])
+    assert work(fleet(), sent, in_time, Urgency()).outgoing
+    assert work(fleet(), sent, in_time, Urgency(expected_s=1.0)).outgoing == ()
+    outcome = work(fleet(), sent, late, Urgency())
+    assert outcome.outgoing == ()
+    assert redesigns(outcome)[1].startswith("too late by 0.5 s: an update may be applied for 60 s")
+    assert "estimate" in kinds(outcome, 1)
+    assert work(fleet(), sent, late, Urgency(speed=0.5)).outgoing
+    assert work(fleet(), sent, late).outgoing
+
+
+def test_a_receipt_is_processed_before_the_window_that_came_first():
+    first = work(fleet(), claim(windows()[1], received=[100.0]), 100.0, Urgency())
+    in_force = windows()[1].parameter_version
+    refused = receipt(decode(first.outgoing[0]), Reason.STEP_TOO_LARGE, in_force)
+    next_window = msgspec.structs.replace(windows()[2], parameter_version=in_force)
+    both = claim(next_window, refused, state=first.state, serial=1, received=[101.0, 102.0])
+    (update,) = map(decode, work(fleet(), both, 102.0, Urgency()).outgoing)
+    assert update.base_version == in_force

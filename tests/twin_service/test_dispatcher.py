@@ -4,13 +4,14 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
-from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota
+from servotwin.twin_service import dispatcher as dispatching
+from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import LeaseResult, WorkerLost
 
-DIES, FAILS = b"dies", b"fails"
+DIES, FAILS, TAKES_LONG = b"dies", b"fails", b"takes long"
 
 
 def claim(servo: str, body: bytes = b"", kind: MessageKind = MessageKind.WINDOW) -> Lease:
@@ -24,12 +25,20 @@ class Lender:
         self.turns = list(turns)
         self.seen: list[tuple[str, int]] = []
         self.released: list[frozenset[str]] = []
+        self.renewed: list[frozenset[str]] = []
+        self.held: list[str] = []
         self.through = asyncio.Event()
 
     def lease(self, _owner, _limit, _lease, _now, kinds, **_more) -> list[Lease]:
         if MessageKind.VERIFICATION in kinds:
             return []
         return list(self.turns.pop(0)) if self.turns else []
+
+    def renew(self, _owner, servos, _until) -> None:
+        self.renewed.append(servos)
+
+    def hold(self, servo, _until) -> None:
+        self.held.append(servo)
 
     def release(self, _owner, servos=None) -> None:
         """Of the store: the servos; of the pool: a worker."""
@@ -45,14 +54,16 @@ class Lender:
     async def replace(self, _worker, _why) -> None:
         pass
 
-    async def work(self, claims: Sequence[Lease], _now: float) -> AsyncIterator[LeaseResult]:
+    async def work(self, claims: Sequence[Lease], _now: float, _urgency: object = None) -> AsyncIterator[LeaseResult]:
         for each in claims:
             self.seen.append((each.servo, each.attempts))
             body = each.messages[0].body
             if body == DIES:
                 raise WorkerLost("it died")
             made = None if body == FAILS else WorkResult(each.servo, each.serial, b"", None, (1,))
-            yield LeaseResult(made, "it failed", 0.0)
+            while body == TAKES_LONG and not self.renewed:
+                await asyncio.sleep(0.001)
+            yield LeaseResult(made, "it failed", 19.0 if body == TAKES_LONG else 0.0)
 
 
 def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
@@ -73,6 +84,7 @@ def through(turns: Sequence[Sequence[Lease]], valid: bool = True) -> Lender:
             clocks=Clocks(),
             owner="me",
             quota=VerificationQuota(0.0),
+            pace=WorkPace(0.5),
         )
 
         async def one_by_one() -> "Lender":
@@ -110,3 +122,32 @@ def test_a_void_result_releases_no_lease():
     lender = through([[claim("a")], [claim("b", FAILS)], [claim("b")]], valid=False)
     assert [servos for servos in lender.released if "a" in servos] == []
     assert frozenset({"b"}) in lender.released
+
+
+def test_a_lease_is_renewed_for_as_long_as_a_worker_is_at_work(monkeypatch):
+    monkeypatch.setattr(dispatching, "LEASE_S", 0.01)
+    lender = through([[claim("a"), claim("b", TAKES_LONG)]])
+    assert set(lender.renewed) == {frozenset({"b"})}
+
+
+def test_a_servo_that_took_long_lets_the_others_come_first(monkeypatch):
+    monkeypatch.setattr(dispatching, "LEASE_S", 0.01)
+    assert through([[claim("a"), claim("b", TAKES_LONG)]]).held == ["b"]
+
+
+def test_jobs_are_as_large_as_the_work_is_quick():
+    pace = WorkPace()
+    assert pace.servos == 16
+    for _ in range(100):
+        pace.note(0.1)
+    assert pace.servos == 5
+    pace.note(30.0)
+    assert pace.servos == 1
+    for _ in range(100):
+        pace.note(0.001)
+    assert pace.servos == 16
+
+
+def test_a_servo_waits_until_its_share_of_a_worker_is_not_exceeded():
+    assert WorkPace(0.25).hold(2.0) == 6.0
+    assert WorkPace(0.25).hold(0.01) == WorkPace(1.0).hold(60.0) == 0.0

@@ -1,6 +1,7 @@
 """The twin's HTTP API: accepted requests, refused requests, and no acknowledgement without a commit."""
 
 import asyncio
+import re
 import threading
 import zlib
 from collections.abc import Callable, Coroutine
@@ -364,6 +365,20 @@ def test_health_names_the_unhealthy_part(serving):
         assert (await client.get("/healthz")).status_code == 503
 
     serving(body)
+
+
+def test_health_names_the_lag(serving):
+    async def body(system, client):
+        assert (await client.get("/healthz")).json()["degraded"] == []
+        assert (await put(client, window())).status_code == 201
+        await asyncio.sleep(0.6)  # a backlog that was read is served again for so long
+        health = (await client.get("/healthz")).json()
+        assert health["waiting"]["lag"] >= 0.6
+        (sentence,) = health["degraded"]
+        assert re.fullmatch(r"new messages of a servo have waited for \d+ s, 1 in all", sentence)
+        assert "\nservotwin_lag_seconds " in (await client.get("/metrics")).text
+
+    serving(body, "lag_limit_s = 0.5")
 
 
 def test_a_store_that_rejects_writes_is_unhealthy_although_it_can_be_read(serving):

@@ -223,6 +223,25 @@ def test_polls_read_the_store_only_when_there_may_be_a_message():
     asyncio.run(body())
 
 
+def test_one_servo_cannot_hold_the_polls_of_all():
+    async def read(_servo, _serial):
+        return []
+
+    async def body():
+        outgoing = LongPolls(read, 10, per_servo=2)
+        waiting = [asyncio.create_task(outgoing.messages("a", 0, 60.0)) for _ in range(2)]
+        await asyncio.sleep(0.01)
+        with pytest.raises(RequestRejected, match="2 polls of servo 'a' wait already"):
+            await outgoing.messages("a", 0, 0.0)
+        assert list(await outgoing.messages("b", 0, 0.0)) == []
+        outgoing.close()
+        await asyncio.gather(*waiting)
+        assert list(await outgoing.messages("a", 0, 0.0)) == []
+        assert not outgoing._open_of
+
+    asyncio.run(body())
+
+
 def test_a_message_posted_while_the_store_is_read_is_not_missed():
     posted = []
 

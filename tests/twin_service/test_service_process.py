@@ -289,8 +289,9 @@ ENDLESS = (
     b"GET /healthz HTTP/1.1\r\nX: ",
     b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nAuthorization: Bearer token-of-ax-1\r\n"
     b"Transfer-Encoding: chunked\r\n\r\n0\r\nX: ",
+    b"PUT /v1/servos/ax-1/windows/b/0 HTTP/1.1\r\nAuthorization: Bearer guess\r\nContent-Length: 1000000000\r\n\r\n",
 )
-"""A header and a trailer that are cut before they fill the memory."""
+"""A header and a trailer that are cut before they fill the memory, and a body that nobody asked for."""
 
 
 @pytest.mark.slow

@@ -23,7 +23,7 @@ from records import pending, witnessed
 from relay import Relay, Weather
 
 SEED = 20
-ROLES = ["control"] + ["supervise"] * extent(3, 7)
+ROLES = ["control"] + ["supervise"] * extent(2, 7)
 BAD = Chances(lost_before=0.08, lost_after=0.08, twice=0.08, held=0.08, delay_s=(0.1, 0.5), hold_s=2.0)
 """Each way: 0.2 to 1.0 s there and back."""
 CUTS_S = (3.0, 6.0)
@@ -65,7 +65,7 @@ def met(killer: Killer, relay: Relay, bad: Sequence[str]) -> bool:
 @pytest.mark.slow
 @pytest.mark.exploration
 def test_kills_and_a_bad_network_lose_no_window(tmp_path: Path) -> None:
-    fleet, windows = Fleet(tmp_path, ROLES), extent(100, 450)
+    fleet, windows = Fleet(tmp_path, ROLES), extent(60, 450)
     killer = Killer(fleet, SEED, {"twin": 1, "edge": 2, "link": 1})
     bad_link = HttpRelay(fleet.port, BAD, SEED, Weather(cut_s=CUTS_S))
     with bad_link as relay, deployed(fleet, f"http://127.0.0.1:{relay.port}"):
@@ -79,7 +79,7 @@ def test_kills_and_a_bad_network_lose_no_window(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.exploration
 def test_kills_of_the_broker_too_lose_no_window(tmp_path: Path) -> None:
-    windows = extent(80, 250)
+    windows = extent(50, 250)
     with broker(tmp_path / "broker") as server:
         fleet = Fleet(tmp_path, ROLES, f'[service.mqtt]\nurl = "{server.url}"')
         killer = Killer(fleet, SEED, {"twin": 1, "edge": 1, "link": 1, "broker": 1}, server)

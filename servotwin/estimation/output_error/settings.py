@@ -39,6 +39,14 @@ class OutputErrorSettings:
     model_share: Annotated[
         float, key(minimum=0.0, help="Standard deviation of unmodelled effects, of the gap; part of std_total.")
     ] = 0.002
+    gap_rate: Annotated[
+        float,
+        key(
+            "gap_rate_deg_per_s",
+            minimum=0.0,
+            help="Growth of the gap within the window that is thought possible, root mean square; part of std_total.",
+        ),
+    ] = 0.0
     calibration: Annotated[float, key(above=0.0, help="Reported over computed standard deviation.")] = 1.1
 
     def __post_init__(self) -> None:

@@ -23,6 +23,7 @@ _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the way off a flank; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0  # interval over the computed one
+_EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in a window, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
 
 
@@ -52,7 +53,9 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFi
     best, problem = found.best, found.problem
     half = float(best.values[HALF])
     std = settings.calibration * best.std(HALF, found.free)
-    total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count)
+    # The fit's gap is that of whenever the motor crossed it.
+    grown = settings.gap_rate / unit * problem.interval * problem.position.size * _EVENLY
+    total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count, grown)
     mismatches = _mismatches(found)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)

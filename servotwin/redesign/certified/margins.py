@@ -131,11 +131,16 @@ def laws_within(
     Raises
     ------
     InvalidInput
-        There is none.
+        There is none, or the servo's controller has no proportional action.
     """
-    plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
-    delays = delays_of(servo.controller, uncertainty)
     own = servo.controller
+    if isinstance(own, Controller) and own.Kp == 0.0:
+        raise InvalidInput(
+            "controller kp = 0: verified settings have scaled proportional gains, and this controller has none; give "
+            'one, or another policy than "certified"'
+        )
+    plants = plant_set(servo, uncertainty, own.sample_rate)
+    delays = delays_of(own, uncertainty)
     notched = with_notch(servo) if demands.notch else None
     known: dict[AnyController, bool] = {}
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from servotwin.plant.plants import Plant
-from servotwin.plant.signals import PiecewiseCubic
+from servotwin.plant.signals import Array, PiecewiseCubic
 from servotwin.redesign.certified.assess import nearness, stillness
 from servotwin.redesign.certified.certificate import RampResult
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw
+from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw
 from servotwin.redesign.design import Design
+from servotwin.simulation.ensemble import samples_of
+from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled
 from servotwin.simulation.simulate import simulate
 
 # Length of a ramp in units of 1 / crossover: several times what the loop lags behind.
@@ -29,11 +31,33 @@ def follow_ramp(servo: Plant, uncertainty: Uncertainty, setting: Design, trial: 
         As for the verification.
     seed : int
     """
-    members = draw(servo, uncertainty, _PLANTS, 2, seed)
-    law, size = setting.simulated.controller, uncertainty.step[1]
-    reference = triangle(size, _RAMP * trial.unit)
+    members, size = draw(servo, uncertainty, _PLANTS, 2, seed), uncertainty.step[1]
     still, near = stillness(members), nearness(setting, members, members.step)
-    worst, settled = 0.0, 0
+    errors = _errors(setting, members, trial, triangle(size, _RAMP * trial.unit))
+    last = errors[..., -max(1, round(trial.last * trial.rate)) :]
+    settled = (0.5 * np.ptp(last, axis=-1) <= still) & (np.abs(last).max(axis=-1) <= near)
+    return RampResult(members.count, float(np.mean(settled)), float(np.abs(errors).max()) / size)
+
+
+def _errors(setting: Design, members: SimulatedMachines, trial: Trial, reference: PiecewiseCubic) -> Array:
+    """(P, C, N) m, reference less position of every machine."""
+    law = setting.simulated.controller
+    if law.sample_rate is not None:
+        cases = SampledCases(
+            1.0,
+            members.gap,
+            setting.tolerance,
+            members.theta_d0,
+            members.input_bias,
+            members.friction,
+            resolution=members.model.position_resolution,
+        )
+        plants = np.array(members.plants, dtype=object)[:, None]
+        runs = simulate_sampled(
+            plants, law, trial.duration, cases, ("error",), trial.rate, trial.threads, shape=reference
+        )
+        return runs["error"]
+    errors = np.empty((*members.gap.shape, samples_of(trial.duration, trial.rate)))
     for p, c in np.ndindex(members.gap.shape):
         run = simulate(
             members.plants[p],
@@ -47,11 +71,8 @@ def follow_ramp(servo: Plant, uncertainty: Uncertainty, setting: Design, trial: 
             input_bias=float(members.input_bias[p, c]),
             friction=float(members.friction[p, c]),
         )
-        error = run.reference - run.position
-        last = error[-max(1, round(trial.last * trial.rate)) :]
-        worst = max(worst, float(np.abs(error).max()) / size)
-        settled += bool(0.5 * np.ptp(last) <= still[p, c] and np.abs(last).max() <= near[p, c])
-    return RampResult(members.count, settled / members.count, worst)
+        errors[p, c] = run.reference - run.position
+    return errors
 
 
 def triangle(size: float, time: float) -> PiecewiseCubic:

@@ -1,0 +1,52 @@
+"""`servotwin twin check`: check every page of the twin's store, and every body against its digest."""
+
+from __future__ import annotations
+
+import math
+from contextlib import closing
+from pathlib import Path
+
+from rich.progress import Progress
+
+from servotwin.errors import InvalidInput
+from servotwin.store.soundness import Soundness, check_bodies, check_pages, newest_message
+from servotwin.store.store import Store
+from servotwin.twin_service.command import open_existing_store
+from servotwin.twin_service.twin_file import service_of
+
+_BODIES = 256
+
+
+def check_store(config: Path) -> None:
+    """Check the store of a twin's file, and print one line.
+
+    Raises
+    ------
+    InvalidInput
+        The store is damaged, or cannot be opened.
+    """
+    with closing(open_existing_store(service_of(config))) as store:
+        _require_sound(store, check_pages(store, math.inf))
+        checked = _check_bodies(store)
+        print(f"store {store.name}: is sound ({checked} messages agree with their digests)")
+
+
+def _check_bodies(store: Store) -> int:
+    """Compare all bodies; returns their number."""
+    after, checked, complete = 0, 0, False
+    with Progress(transient=True) as progress:
+        task = progress.add_task("comparing", total=newest_message(store))
+        while not complete:
+            result, after = check_bodies(store, after, _BODIES)
+            _require_sound(store, result)
+            checked, complete = checked + result.checked, result.complete
+            progress.update(task, completed=after)
+    return checked
+
+
+def _require_sound(store: Store, result: Soundness) -> None:
+    if result.faults:
+        raise InvalidInput(
+            f"store {store.name}: is damaged ({'; '.join(result.faults)}); end the twin, move the file away and "
+            "restore a backup: edges send again what they still keep"
+        )

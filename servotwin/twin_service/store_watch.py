@@ -1,0 +1,160 @@
+"""Watch over the store's soundness: at the start, and in the background all the time."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+from servotwin.messages import Resend, encode
+from servotwin.runtime.files import replace_file
+from servotwin.store.engine import StoreDamaged, StoreUnavailable, sqlite_file
+from servotwin.store.records import Incoming, PutResult, WorkResult
+from servotwin.store.soundness import Soundness, check_bodies, check_pages, newest_message
+from servotwin.store.store import Store
+from servotwin.twin_service.store_executor import StoreExecutor
+
+log = logging.getLogger(__name__)
+
+_Record = TypeVar("_Record", Incoming, WorkResult)
+_Result = TypeVar("_Result")
+
+_START_S, _PAGES_S = 5.0, 60.0
+"""s for which pages are checked at the start, and once per round in the background."""
+_BODIES, _SHARE = 32, 0.02
+"""Bodies that are compared at once, and the share of the time for that."""
+_MARK_S = 5.0
+"""s between two notes of the newest message: as many acknowledged messages may go unnoticed if the log is lost."""
+_MARK = "newest"
+_LOST = "the twin's store has lost messages"
+
+
+class StoreWatch:
+    """Checks the store, and keeps a damaged one from being written.
+
+    Parameters
+    ----------
+    store, executor : Store, StoreExecutor
+    put, commit : callable
+        Commit a message, and a work result.
+    wall, monotonic : callable
+        s.
+
+    Attributes
+    ----------
+    fault : str
+        Damage that was found; empty: none.
+    rounds : int
+        Number of times that everything was checked.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        executor: StoreExecutor,
+        put: Callable[[Incoming], Awaitable[PutResult]],
+        commit: Callable[[WorkResult], Awaitable[bool]],
+        wall: Callable[[], float],
+        monotonic: Callable[[], float],
+    ) -> None:
+        self._store, self._executor = store, executor
+        self._put, self._commit = put, commit
+        self._wall, self._monotonic = wall, monotonic
+        self._marked = 0
+        self.fault, self.rounds = "", 0
+
+    async def put(self, item: Incoming) -> PutResult:
+        """Commit a message, unless the store is damaged; raises StoreUnavailable."""
+        return await self._guarded(self._put, item)
+
+    async def commit(self, result: WorkResult) -> bool:
+        """Commit a work result, likewise; False: it is void."""
+        return await self._guarded(self._commit, result)
+
+    async def _guarded(self, write: Callable[[_Record], Awaitable[_Result]], record: _Record) -> _Result:
+        if self.fault:
+            raise StoreUnavailable(f"store {self._store.name}: is damaged and not written any more")
+        try:
+            return await write(record)
+        except StoreDamaged as error:
+            self._found(Soundness((str(error),), False))
+            raise
+
+    async def start(self) -> None:
+        """Check the pages for a short time, and if messages are missing that the store once had."""
+        with suppress(StoreUnavailable):
+            self._found(await self._executor.run(partial(check_pages, self._store, _START_S)))
+            if not self.fault:
+                await self._executor.run(self._compare_mark)
+
+    async def run(self) -> None:
+        """Check everything, again and again, at a small share of the time."""
+        after = 0
+        while not self.fault:
+            begun = self._monotonic()
+            with suppress(StoreUnavailable):
+                after = await self._executor.run(partial(self._check_some, after))
+            await asyncio.sleep(max(1.0, (self._monotonic() - begun) * (1.0 / _SHARE - 1.0)))
+
+    async def run_mark(self) -> None:
+        """Note the newest message beside the store every few seconds."""
+        while not self.fault:
+            await asyncio.sleep(_MARK_S)
+            with suppress(StoreUnavailable):
+                await self._executor.run(self.mark)
+
+    def mark(self) -> None:
+        """Note the newest message beside an SQLite store."""
+        file = self._mark_file
+        newest = 0 if file is None else newest_message(self._store)
+        if file is None or newest == self._marked:
+            return
+        try:
+            replace_file(file, b"%d\n" % newest, durable=True, mode=0o600)
+            self._marked = newest
+        except OSError as error:
+            log.warning("newest message not noted", extra={"why": str(error)})
+
+    @property
+    def _mark_file(self) -> Path | None:
+        file = sqlite_file(self._store.engines.writer.url)
+        return None if file is None else file.with_name(f"{file.name}-{_MARK}")
+
+    def _compare_mark(self) -> None:
+        """Where the store lacks messages that it once had, ask all edges for the windows that they still keep."""
+        noted, newest = _read_mark(self._mark_file), newest_message(self._store)
+        if newest >= noted:
+            return
+        log.error("the store has lost messages", extra={"had": noted, "has": newest})
+        after = ""
+        while summaries := self._store.servos(after):
+            after = summaries[-1].servo
+            asked = {one.servo: encode(Resend(one.servo, reason=_LOST)) for one in summaries}
+            self._store.post(asked, self._wall())
+
+    def _check_some(self, after: int) -> int:
+        """Check the next bodies, and the pages where a round ends; returns the id of the last one, 0 after a round."""
+        result, last = check_bodies(self._store, after, _BODIES)
+        self._found(result)
+        if not result.complete:
+            return last
+        self._found(check_pages(self._store, _PAGES_S))
+        self.rounds += 1
+        return 0
+
+    def _found(self, result: Soundness) -> None:
+        if result.faults and not self.fault:
+            self.fault = result.faults[0]
+            log.error("store damaged: it is not written any more", extra={"why": "; ".join(result.faults)})
+
+
+def _read_mark(file: Path | None) -> int:
+    """Id in the file; 0: there is none, or it cannot be read."""
+    try:
+        return 0 if file is None else int(file.read_text())
+    except (OSError, ValueError):
+        return 0

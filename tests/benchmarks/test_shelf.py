@@ -1,0 +1,58 @@
+"""The presets of the shelf with their twins in the loop, as they are measured, and a short loop of each."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.shelf import SHELF, certified_machines, judged, measured, shelf_machines
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.plant.axis import AXES
+
+ESTIMATED = tuple(name for name in SHELF if name != "emps")
+
+
+def test_every_preset_has_a_duty_and_machines_near_it() -> None:
+    assert tuple(SHELF) == AXES
+    for name in SHELF:
+        machines = shelf_machines(name, 3, 5)
+        assert machines == shelf_machines(name, 4, 5)[:3]
+        assert machines[0].gap.end_value == pytest.approx(10.0 * SHELF[name].gap / machines[0].model.p)
+        worn = certified_machines(name, 3, 5)
+        assert [each.plant for each in worn] == [each.plant for each in machines]
+        # A stepper goes where it is told, and its load follows: none of the numbers that are off is in its model.
+        assert (machines[0].plant == machines[0].model) == (name == "stepper-stage")
+        assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
+
+
+@pytest.mark.parametrize("name", ESTIMATED)
+def test_a_preset_s_twin_finds_its_gap(name: str) -> None:
+    """Three steps of a machine that is not quite its model, worn to five times its healthy gap."""
+    (machine,) = shelf_machines(name, 1, 20261123)
+    found = measured(replace(machine, worn=(5.0, 5.0), steps=3))
+    accepted = found["estimates"]
+    assert "ok" in found["statuses"], found["reasons"]
+    assert all(each["near"] and each["inside"] for each in accepted), accepted
+
+
+def test_a_preset_without_a_load_encoder_is_refused() -> None:
+    (machine,) = shelf_machines("emps", 1, 20261123)
+    for certified in (False, True):
+        found = measured(replace(machine, steps=2, certified=certified))
+        assert "twin" not in found
+        assert "own" in found
+        assert found["refused"]
+
+
+def test_an_estimate_is_judged_by_gap_interval_and_counts() -> None:
+    def at(gap: float, half: float) -> dict[str, float]:
+        estimate = GapEstimate(gap, 0.1 * half, half, (gap - half, gap + half), GapStatus.OK, 1.0)
+        return judged(estimate, (0.9, 1.0, 1.1), 1e-3)
+
+    assert at(1.0, 0.1) == {"gap": 1.0, "error": 0.0, "inside": 1.0, "near": 1.0}
+    assert at(1.109, 0.05)["near"] == 1.0
+    assert at(1.109, 0.05)["inside"] == 0.0
+    assert at(0.5, 0.1)["near"] == 0.0
+    assert math.isclose(at(0.5, 0.1)["error"], 0.4)

@@ -1,0 +1,104 @@
+"""Damage that is found: pages, bodies, and messages that are gone."""
+
+import math
+import os
+from pathlib import Path
+
+import pytest
+from store_cases import window
+
+from servotwin.errors import InvalidInput
+from servotwin.store.engine import sqlite_file
+from servotwin.store.soundness import (
+    Soundness,
+    check_bodies,
+    check_pages,
+    message_digest,
+    missing_windows,
+    newest_message,
+)
+from servotwin.store.store import Store, open_store
+
+pytest_plugins = ("store_fixtures",)
+PAGE = 8192
+
+
+def digested(sequence: int, body: bytes) -> object:
+    return window(sequence=sequence, body=body)._replace(digest=message_digest(body))
+
+
+def filled(url: str, windows: int = 40) -> Path:
+    store = open_store(url)
+    store.put([digested(n, os.urandom(20_000)) for n in range(windows)])
+    file = sqlite_file(store.engines.writer.url)
+    store.close()
+    assert file is not None
+    return file
+
+
+def overwrite(file: Path, page: int, pages: int = 1) -> None:
+    with file.open("r+b") as opened:
+        opened.seek(page * PAGE)
+        opened.write(os.urandom(pages * PAGE))
+
+
+def test_a_sound_store_is_sound(store: Store) -> None:
+    store.put([digested(n, b"%d" % n) for n in range(5)])
+    assert check_pages(store, math.inf).faults == ()
+    assert check_bodies(store, 0, 3)[0] == Soundness((), False, 3)
+    ids = newest_message(store)
+    assert check_bodies(store, ids - 2, 3) == (Soundness((), True, 2), ids)
+
+
+def test_twenty_pages_of_rubbish_are_found(url: str) -> None:
+    file = filled(url)
+    overwrite(file, file.stat().st_size // PAGE // 2, 20)
+    store = open_store(url)
+    found = check_pages(store, math.inf)
+    assert found.faults
+    assert not found.complete
+    store.close()
+
+
+@pytest.mark.parametrize("changed", [b"other samples", b""])
+def test_a_body_that_changed_is_found_by_its_digest(store: Store, changed: bytes) -> None:
+    whole = digested(1, b"samples")
+    store.put([digested(0, b"earlier"), whole._replace(body=changed)])
+    result, _ = check_bodies(store, 0, 10)
+    assert result.faults == (f"message {newest_message(store)} of servo 'a': its body differs from its digest",)
+
+
+def test_a_check_ends_in_time_and_says_so(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    filled(url)
+    monkeypatch.setattr("servotwin.store.soundness._STEPS", 1)
+    store = open_store(url)
+    result = check_pages(store, 0.0)
+    assert (result.faults, result.complete) == ((), False)
+    store.close()
+
+
+def test_reading_a_damaged_page_says_damaged(url: str) -> None:
+    file = filled(url)
+    overwrite(file, 1, file.stat().st_size // PAGE - 1)
+    with pytest.raises(InvalidInput, match="is damaged"):
+        open_store(url)
+
+
+def test_holes_in_the_sequences_of_a_boot_are_found(store: Store) -> None:
+    store.put([window(sequence=n) for n in (0, 1, 4, 5, 9)])
+    assert missing_windows(store, "a", "boot") == [(2, 3), (6, 8)]
+    assert missing_windows(store, "a", "another") == missing_windows(store, "b", "boot") == []
+    # Of so few of the newest windows the beginning is not known.
+    assert missing_windows(store, "a", "boot", 3) == [(6, 8)]
+    store.put([window("b", 3)])
+    assert missing_windows(store, "b", "boot") == [(0, 2)]
+    store.put([window(sequence=n) for n in (2, 3, 6, 7, 8)])
+    assert missing_windows(store, "a", "boot") == []
+
+
+def test_a_message_is_posted_to_an_edge_besides_results(store: Store) -> None:
+    store.put([window()])
+    store.post({"a": b"asking", "unknown": b"lost"}, 100.0)
+    store.post({"a": b"again"}, 100.0)
+    assert [(each.serial, each.body) for each in store.outgoing("a", 0)] == [(1, b"asking"), (2, b"again")]
+    assert store.posted(["a", "unknown"]) == {"a": 2}

@@ -1,0 +1,142 @@
+"""The service notices a damaged store, messages that are gone, and windows that never came."""
+
+import asyncio
+import os
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+from service_system import bearer, place, served, twin_file, window
+
+from servotwin.messages import Resend, decode, encode
+from servotwin.store.store import open_store
+from servotwin.twin_service import missing_windows
+
+PAGE = 8192
+Body = Callable[..., Awaitable[None]]
+
+
+def serve(path: Path, body: Body) -> None:
+    async def both() -> None:
+        async with served(path) as (system, client):
+            await body(system, client)
+
+    asyncio.run(both())
+
+
+async def send(client, *sequences: int) -> list[int]:
+    sent = [window(n) for n in sequences]
+    answers = [await client.put(place(one), content=encode(one), headers=bearer()) for one in sent]
+    return [answer.status_code for answer in answers]
+
+
+def posted(system) -> list[Resend]:
+    return [decode(each.body) for each in system.store.outgoing("ax-1", 0)]
+
+
+def test_a_damaged_store_is_noticed_at_the_start_and_not_written(tmp_path, caplog):
+    path = twin_file(tmp_path)
+
+    async def fill(_system, client):
+        assert set(await send(client, *range(40))) == {201}
+
+    serve(path, fill)
+    file = tmp_path / "twin.db"
+    pages = file.stat().st_size // PAGE
+    with file.open("r+b") as opened:
+        opened.seek((pages - 20) * PAGE)
+        opened.write(os.urandom(18 * PAGE))
+
+    async def look(system, client):
+        health = await client.get("/healthz")
+        assert health.status_code == 503
+        assert health.json()["store"] is False
+        assert health.json()["damage"]
+        assert await send(client, 100) == [503]
+        assert "servotwin_store_damaged 1\n" in (await client.get("/metrics")).text
+
+    serve(path, look)
+    assert "store damaged: it is not written any more" in caplog.messages
+
+
+def test_damage_that_comes_later_is_noticed_by_the_digest_of_a_body(tmp_path):
+    async def body(system, client):
+        assert await send(client, 0, 1, 2) == [201, 201, 201]
+        assert (await client.get("/healthz")).json()["damage"] == ""
+        assert system.watch._check_some(0) == 0
+        with system.store.engines.writer.begin() as connection:
+            connection.exec_driver_sql("UPDATE bodies SET body = x'00' WHERE message = 2")
+        system.watch._check_some(0)
+        assert "message 2 of servo 'ax-1'" in (await client.get("/healthz")).json()["damage"]
+        assert await send(client, 3) == [503]
+        assert system.watch.rounds >= 1
+
+    serve(twin_file(tmp_path), body)
+
+
+def test_a_store_that_lost_acknowledged_messages_says_so_and_asks_for_them(tmp_path, caplog):
+    path = twin_file(tmp_path)
+
+    async def fill(_system, client):
+        await send(client, *range(5))
+
+    serve(path, fill)
+    assert (tmp_path / "twin.db-newest").read_text() == "5\n"
+    store = open_store(f"sqlite:///{tmp_path}/twin.db")
+    with store.engines.writer.begin() as connection:  # as where the second half of its log is gone
+        connection.exec_driver_sql("DELETE FROM bodies WHERE message > 2")
+        connection.exec_driver_sql("DELETE FROM messages WHERE id > 2")
+    store.close()
+
+    async def look(system, _client):
+        assert posted(system) == [Resend("ax-1", reason="the twin's store has lost messages")]
+
+    serve(path, look)
+    (line,) = (record for record in caplog.records if record.message == "the store has lost messages")
+    assert (line.had, line.has) == (5, 2)
+
+
+def test_windows_that_never_came_are_asked_for_once(tmp_path, caplog, monkeypatch):
+    monkeypatch.setattr(missing_windows, "_PATIENCE_S", 0.0)
+
+    async def body(system, client):
+        await send(client, 0, 1, 4, 5)
+        await system._missing.look()
+        assert posted(system) == [Resend("ax-1", "b", 2, 3, "windows of this boot did not come")]
+        await send(client, 8)
+        await system._missing.look()
+        await system._missing.look()
+        assert [(asked.first, asked.last) for asked in posted(system)] == [(2, 3), (6, 7)]
+        assert "servotwin_windows_missing_total 4\n" in (await client.get("/metrics")).text
+        await send(client, 2, 3, 6, 7, 9)
+        await system._missing.look()
+        assert len(posted(system)) == 2
+
+    serve(twin_file(tmp_path), body)
+    assert caplog.messages.count("windows missing") == 2
+
+
+def test_windows_that_were_only_overtaken_are_not_asked_for(tmp_path):
+    async def body(system, client):
+        await send(client, 2, 1, 0)
+        await system._missing.look()  # patience is not over
+        assert posted(system) == []
+        for known in system._missing._sequences._boots.values():
+            known.look_at = 0.0
+        await system._missing.look()
+        assert posted(system) == []
+
+    serve(twin_file(tmp_path), body)
+
+
+@pytest.mark.parametrize("selected", [None, 0])
+def test_an_edge_that_selects_its_windows_leaves_no_holes(selected):
+
+    now = [0.0]
+    watch = missing_windows.SequenceWatch(lambda: now[0])
+    for number in (0, 5):
+        watch.note(msgspec.structs.replace(window(number), response_version=selected))
+    assert watch.due() == []
+    now[0] = 100.0
+    assert watch.due() == ([("ax-1", "b")] if selected is None else [])
