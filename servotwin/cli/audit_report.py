@@ -185,6 +185,10 @@ def _reasons(one: JsonObject) -> Sequence[str]:
         return ("no reason noted",)
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _sent_update(update: JsonObject) -> str:
     """Contents of an update, and its verification."""
     body = update["body"] or {}
@@ -198,6 +202,10 @@ def _sent_update(update: JsonObject) -> str:
         friction = gains.get("friction_feedforward")
         parts += [f"friction feedforward {friction * 1e3:.1f} mV"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
+    law = setting.get("law") or {}
+    parts += [", ".join(f"{name} {value:.6g}" for name, value in law.items() if _is_number(value) and value)] * bool(
+        law
+    )
     if verification:
         parts.append(f"verified on {verification['members']} simulated machines")
     return f"version {update['version']} sent: {', '.join(parts)}"

@@ -20,8 +20,9 @@ from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
+from servotwin.plant.plants import Plant, check_load_encoder, plant_of, resolve_plant
 from servotwin.plant.scales import scales
-from servotwin.plant.servo import Servo
+from servotwin.plant.shown import command_unit, position_unit
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
@@ -51,7 +52,7 @@ class Identification:
 
     Attributes
     ----------
-    servo : Servo
+    servo : Servo or Axis
         The model.
     windows : tuple of Window
     estimates : tuple of GapEstimate
@@ -62,7 +63,7 @@ class Identification:
         From `trend.time` on.
     """
 
-    servo: Servo
+    servo: Plant
     windows: tuple[Window, ...]
     estimates: tuple[GapEstimate, ...]
     trend: Trend | None
@@ -91,7 +92,7 @@ def identify(options: IdentifyOptions) -> Identification:
     return Identification(servo, windows, tuple(estimates), trend, until)
 
 
-def cut(log: Log, options: IdentifyOptions, servo: Servo) -> tuple[Window, ...]:
+def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
     """Cut the window that the options name, or one after each change of the reference, as an edge does: no overlaps."""
     whole = log.whole
     if options.start is not None or options.duration is not None:
@@ -102,7 +103,8 @@ def cut(log: Log, options: IdentifyOptions, servo: Servo) -> tuple[Window, ...]:
         return (_one(whole, options),)
     if whole.reference is None:
         raise InvalidInput(
-            f"{whole.where}there is no column 'reference_m' to find the steps in: give --start and --duration"
+            f"{whole.where}there is no column 'reference_{position_unit(servo).si}' to find the steps in: "
+            "give --start and --duration"
         )
     length = _option("window", options.window, log.metadata.get("window_s"), WINDOW * scales(servo).time)
     before = _option("pre-trigger", options.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
@@ -110,7 +112,7 @@ def cut(log: Log, options: IdentifyOptions, servo: Servo) -> tuple[Window, ...]:
         raise InvalidInput(f"--pre-trigger {before!r} s: must be at least 0 and below the window's {length!r} s")
     firsts = window_starts(whole.reference, round(length * whole.sample_rate), round(before * whole.sample_rate))
     if not firsts:
-        shown = f"no change of reference_m is followed by {length:g} s"
+        shown = f"no change of the reference is followed by {length:g} s"
         raise InvalidInput(f"{whole.where}{shown}; give --start and --duration")
     return tuple(whole.slice(whole.start + first / whole.sample_rate, length) for first in firsts)
 
@@ -144,13 +146,22 @@ def _option(name: str, given: float | None, logged: Any, default: float) -> floa
     return float(value)
 
 
-def _servo(options: IdentifyOptions, log: Log) -> Servo:
-    if options.servo is not None:
-        return Servo.resolve(options.servo)
+def _servo(options: IdentifyOptions, log: Log) -> Plant:
     text = log.metadata.get("servo")
-    if not isinstance(text, str):
+    if options.servo is not None:
+        servo = resolve_plant(options.servo)
+    elif isinstance(text, str):
+        servo = plant_of(text, f"log {options.log}, servo")
+    else:
         raise InvalidInput(f"{log.whole.where}the log does not describe its servo: give --servo, a preset or a TOML")
-    return Servo.loads(text, f"log {options.log}, servo")
+    check_load_encoder(servo, "the estimate of the gap")
+    for channel, unit in (("position", position_unit(servo).si), ("voltage", command_unit(servo))):
+        if channel in log.names and log.unit(channel) != unit:
+            raise InvalidInput(
+                f"{log.whole.where}column {log.names[channel]!r} is in {log.unit(channel)}, and the machine counts it "
+                f"in {unit}: give the log's own machine with --servo"
+            )
+    return servo
 
 
 def _settings(options: IdentifyOptions) -> TwinSettings:

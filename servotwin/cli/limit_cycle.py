@@ -12,8 +12,9 @@ from rich.console import Console
 from rich.table import Table
 
 from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
-from servotwin.analysis.limit_cycles.describing import Prediction, limit_cycle_near, predictions
+from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
+from servotwin.analysis.limit_cycles.prediction import Prediction
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import Plant, resolve_plant
 from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit

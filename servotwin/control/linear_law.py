@@ -282,7 +282,7 @@ class LinearLaw:
 
     def _flat(self) -> tuple[list[float], list[float]]:
         """Numbers of the tick, row by row: of the next states, and of the command; spare states never move."""
-        size = len(self._padded(()))
+        size = len(self.padded(()))
         spare = size - self.n
         advance: list[float] = []
         for row, column, cut in zip(self.A, self.B, self.windup, strict=True):
@@ -319,7 +319,7 @@ class LinearLaw:
         """State at rest at measurements (rad, m or rad) with no error: filters at what they filter, integrators at
         zero."""
         reference = self.error[0] * y_motor + self.error[1] * y_load
-        return LinearState(self._padded(self.rest((reference, y_motor, y_load), {})), 0.0, 1.0, 0.0)
+        return LinearState(self.padded(self.rest((reference, y_motor, y_load), {})), 0.0, 1.0, 0.0)
 
     def rest(self, inputs: Sequence[float], known: dict[str, float]) -> tuple[float, ...]:
         """States at rest under constant inputs, some of them given by name."""
@@ -330,14 +330,15 @@ class LinearLaw:
         places = {self.names.index(name): value for name, value in known.items()}
         return at_rest(tuple(tuple(row) for row in A), driven, places)
 
-    def _padded(self, states: tuple[float, ...]) -> tuple[float, ...]:
+    def padded(self, states: tuple[float, ...]) -> tuple[float, ...]:
+        """States with the spare ones of the tick behind them."""
         size = max(_MULTIPLE, -(-self.n // _MULTIPLE) * _MULTIPLE)
         return states + (0.0,) * (size - len(states))
 
     def carried(self, old: LinearLaw, state: LinearState, inputs: Sequence[float]) -> tuple[float, ...]:
         """States of this law that take over from another one: equal names go on, new ones begin at rest."""
         known = dict(zip(old.names, state.states, strict=False))
-        return self._padded(self.rest(inputs, {name: known[name] for name in self.names if name in known}))
+        return self.padded(self.rest(inputs, {name: known[name] for name in self.names if name in known}))
 
     def transfer(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,9 +22,11 @@ from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltyRules
+from servotwin.plant.noise import Noise
+from servotwin.plant.own_units import own_controller
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.twin.settings import TwinSettings, read_twin_settings
+from servotwin.twin.settings import TWIN_UNITS, TwinSettings, read_twin_settings
 
 CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
     name_of(each) for each in (Controller, Recording, ProbeLimits, NoveltyRules, LinkSettings, TwinSettings)
@@ -36,16 +38,16 @@ _TURN = 2.0 * math.pi
 
 
 def square_wave(
-    amplitude: Annotated[float, key("amplitude_mm", help="Half the difference of the two levels.")],
+    amplitude: Annotated[float, key("amplitude_mm", "amplitude_deg", help="Half the difference of the two levels.")],
     period: Annotated[float, key("period_s", above=0.0, help="Period.")],
-    offset: Annotated[float, key("offset_mm", help="Mean of the two levels.")] = 0.0,
+    offset: Annotated[float, key("offset_mm", "offset_deg", help="Mean of the two levels.")] = 0.0,
 ) -> SignalLike:
     """Square wave."""
     return SquareWave(amplitude, period, offset)
 
 
 def step(
-    size: Annotated[float, key("size_mm", help="Size of the step.")],
+    size: Annotated[float, key("size_mm", "size_deg", help="Size of the step.")],
     at: Annotated[float, key("at_s", minimum=0.0, help="Time of the step.")] = 0.0,
 ) -> SignalLike:
     """One step."""
@@ -53,8 +55,8 @@ def step(
 
 
 def s_curve(
-    begin_value: Annotated[float, key("from_mm", help="First value.")],
-    end_value: Annotated[float, key("to_mm", help="Last value.")],
+    begin_value: Annotated[float, key("from_mm", "from_deg", help="First value.")],
+    end_value: Annotated[float, key("to_mm", "to_deg", help="Last value.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last value.")],
     begin: Annotated[float, key("begin_s", help="Time at which it begins.")] = 0.0,
 ) -> SignalLike:
@@ -64,13 +66,13 @@ def s_curve(
 
 def samples(
     times: Annotated[tuple[float, ...], key("times_s", help="Times.")],
-    values: Annotated[tuple[float, ...], key("values_mm", help="Values, as many.")],
+    values: Annotated[tuple[float, ...], key("values_mm", "values_deg", help="Values, as many.")],
 ) -> SignalLike:
     """Values at given times; the last one holds."""
     return Samples(times, list(values))
 
 
-def constant(value: Annotated[float, key("value_mm", help="Value.")]) -> SignalLike:
+def constant(value: Annotated[float, key("value_mm", "value_deg", help="Value.")]) -> SignalLike:
     """One value at all times."""
     return value
 
@@ -78,6 +80,14 @@ def constant(value: Annotated[float, key("value_mm", help="Value.")]) -> SignalL
 REFERENCES: Mapping[str, Maker] = {
     "square": square_wave, "step": step, "s-curve": s_curve, "samples": samples, "constant": constant,
 }  # fmt: skip
+
+OWN_UNITS: Mapping[str, Sequence[Maker]] = {
+    "reference": tuple(REFERENCES.values()),
+    "noise": (Noise,),
+    "edge.probe": (ProbeLimits,),
+    **{f"{TWIN}.{path}": makers for path, makers in TWIN_UNITS.items()},
+}
+"""Tables whose keys are in the units of the servo."""
 
 
 def constant_gap(
@@ -113,7 +123,10 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    controller = read_inner(table, CONTROLLER, lambda inner: _changed(inner, servo.controller))
+    inner = own_controller(table, CONTROLLER, servo)
+    with named(inner):
+        controller = _changed(inner, servo.controller)
+    inner.done()
     edge = table.table(EDGE)
     edge.known(PROBE)
     probe = part(edge, PROBE, ProbeLimits) if PROBE in edge.values else None
@@ -131,7 +144,7 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
         "recording": replace(part(table, RECORDING, Recording), probe=probe, novelty=novelty),
         "uplink": uplink,
         "downlink": downlink,
-        "twin": read_inner(table, TWIN, lambda inner: read_twin_settings(inner, folder)),
+        "twin": read_inner(table, TWIN, lambda inner: read_twin_settings(inner, folder, servo)),
     }
 
 

@@ -13,7 +13,9 @@ from servotwin.messages import Probe
 class ProbeLimits:
     """Limits of the probing moves that an edge makes."""
 
-    size: Annotated[float, key("size_mm", "size_m", above=0.0, help="Largest move, either way.")]
+    size: Annotated[
+        float, key("size_mm", "size_m", "size_deg", "size_rad", above=0.0, help="Largest move, either way.")
+    ]
     interval_s: Annotated[float, key(minimum=0.0, help="Shortest time from the beginning of one to the next.")] = 60.0
     rest_s: Annotated[float, key(above=0.0, help="Time for which the reference must have rested before one.")] = 1.0
 

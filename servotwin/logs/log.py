@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from servotwin.config.table import did_you_mean
+from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
 from servotwin.logs.columns import LogColumns, SignalTable
@@ -18,29 +19,41 @@ from servotwin.plant.signals import Array
 from servotwin.runtime import files
 
 TIME = "time_s"
-# Column names of each channel, in order of preference: the measured position before the true one.
+# Column names of each channel, in order of preference: the measured position before the true one. The end of a name is
+# its unit, and those of one log agree.
+_POSITION_UNITS = ("m", "rad", "mm", "deg")
 COLUMNS = {
-    "position": ("measured_position_m", "position_m"),
-    "theta_m": ("theta_m_rad",),
-    "voltage": ("voltage_v",),
-    "reference": ("reference_m",),
+    "position": tuple(f"{name}_{unit}" for name in ("measured_position", "position") for unit in _POSITION_UNITS),
+    "theta_m": ("theta_m_rad", "theta_m_deg"),
+    "voltage": ("voltage_v", "command_n_m", "command_rad_per_s", "command_rad"),
+    "reference": tuple(f"reference_{unit}" for unit in _POSITION_UNITS),
 }
 _COLUMN_NAMES = (TIME, *(name for names in COLUMNS.values() for name in names))
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """A log as one long window, and its metadata: servo, window_s ...; empty for a foreign log."""
+    """A log as one long window in SI units, its metadata (servo, window_s ...; empty for a foreign log), and the names
+    of its columns by channel."""
 
     whole: Window
     metadata: Mapping[str, Any]
+    names: Mapping[str, str]
+
+    def unit(self, channel: str) -> str:
+        """SI unit of a channel that the log has."""
+        return unit_of(self.names[channel]).si
 
     def table(self) -> SignalTable:
         """Columns and metadata, as `write_log` takes them."""
         whole = self.whole
         columns = {TIME: whole.time}
-        columns |= {COLUMNS[channel][0]: values for channel, values in whole.channels.items()}
+        columns |= {self._exact_name(channel): values for channel, values in whole.channels.items()}
         return SignalTable(columns, self.metadata)
+
+    def _exact_name(self, channel: str) -> str:
+        """Name of a column in SI units: the measured position for one that may be either."""
+        return next(name for name in COLUMNS[channel] if unit_of(name).exact and unit_of(name).si == self.unit(channel))
 
 
 def read_log(path: Path) -> Log:
@@ -53,7 +66,10 @@ def read_log(path: Path) -> Log:
         the times are not uniform.
     """
     columns = read_columns(path, _COLUMN_NAMES)
-    return Log(_whole(path, columns), columns.metadata)
+    names = _chosen(path, columns)
+    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in names.items()}
+    whole = Window(**channels, time=_numbers(path, TIME, columns), source=f"log {path}")
+    return Log(whole, columns.metadata, names)
 
 
 def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
@@ -103,14 +119,20 @@ def write_log(table: SignalTable, path: Path) -> None:
         write(table, temporary)
 
 
-def _whole(path: Path, columns: LogColumns) -> Window:
+def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
+    """Names of the columns by channel."""
     chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
     for name, place in (("position_m", chosen["position"]), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
             hint, known = did_you_mean(name, columns.names), ", ".join(columns.names)
             raise InvalidInput(f"log {path}: column {name!r} is missing{hint}; it has {known or 'none'}")
-    channels: dict[str, Any] = {key: _numbers(path, name, columns) for key, name in chosen.items() if name is not None}
-    return Window(**channels, time=_numbers(path, TIME, columns), source=f"log {path}")
+    names = {channel: name for channel, name in chosen.items() if name is not None}
+    position, reference = names["position"], names.get("reference")
+    if reference is not None and unit_of(reference).si != unit_of(position).si:
+        raise InvalidInput(
+            f"log {path}: columns {position!r} and {reference!r}: must both be lengths or both be angles"
+        )
+    return names
 
 
 def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
@@ -119,6 +141,7 @@ def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
     try:
         if np.iscomplexobj(columns.values[name]):
             raise TypeError
-        return np.asarray(columns.values[name], dtype=np.float64)
+        values, unit = np.asarray(columns.values[name], dtype=np.float64), unit_of(name)
+        return values if unit.exact else values * unit.factor / unit.divisor
     except (TypeError, ValueError):
         raise InvalidInput(f"log {path}: column {name!r} must hold numbers") from None

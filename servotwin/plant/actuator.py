@@ -10,7 +10,11 @@ import numpy as np
 
 from servotwin.config.keys import check, items_of, key, settings
 from servotwin.plant.linear import product
+from servotwin.plant.numbers import check_stribeck
 from servotwin.plant.signals import Array
+
+SHAFT_KEYS = ("coulomb_friction_n_m", "static_friction_n_m", "stribeck_speed_rad_per_s", "N m")
+"""Keys of the friction of a shaft: Coulomb, static, Stribeck speed; and the unit of the first two."""
 
 
 class ShaftMatrices(NamedTuple):
@@ -47,11 +51,28 @@ class ShaftPolynomials(NamedTuple):
     torque: Array
 
 
+_STATIC = key(
+    "static_friction_n_m",
+    above=0.0,
+    help="Friction of the shaft at standstill; absent: the Coulomb friction.",
+)
+_STRIBECK = key(
+    "stribeck_speed_rad_per_s",
+    above=0.0,
+    help="Speed at which the friction has fallen, linearly, from the static to the Coulomb friction.",
+)
+
+
 def _checked(actuator: object) -> None:
     """Refuse values out of their range, and make floats of the others."""
     check(actuator)
     for item in items_of(type(actuator)):
-        object.__setattr__(actuator, item.name, float(getattr(actuator, item.name)))
+        given = getattr(actuator, item.name)
+        object.__setattr__(actuator, item.name, None if given is None else float(given))
+
+
+def _check_friction(actuator: DcMotor | TorqueDrive) -> None:
+    check_stribeck("actuator", actuator.coulomb, actuator.static, actuator.stribeck, SHAFT_KEYS)
 
 
 @settings("actuator")
@@ -78,11 +99,18 @@ class DcMotor:
         float, key("viscous_friction_n_m_s_per_rad", minimum=0.0, help="Viscous friction of the shaft.")
     ] = 0.0
     coulomb: Annotated[float, key("coulomb_friction_n_m", minimum=0.0, help="Coulomb friction of the shaft.")] = 0.0
+    static: Annotated[float | None, _STATIC] = None
+    stribeck: Annotated[float | None, _STRIBECK] = None
+    limit: Annotated[
+        float | None,
+        key("voltage_limit_v", above=0.0, help="Supply of the drive: it gives no more, either sign; absent: no limit."),
+    ] = None
 
     unit = "V"
 
     def __post_init__(self) -> None:
         _checked(self)
+        _check_friction(self)
 
     def matrices(self) -> ShaftMatrices:
         """Matrices of (current, speed, theta_m); without inductance of (speed, theta_m)."""
@@ -133,11 +161,22 @@ class TorqueDrive:
     gain: Annotated[
         float, key("torque_per_command", above=0.0, help="Torque per commanded torque; 1: the drive is calibrated.")
     ] = 1.0
+    static: Annotated[float | None, _STATIC] = None
+    stribeck: Annotated[float | None, _STRIBECK] = None
+    limit: Annotated[
+        float | None,
+        key(
+            "torque_limit_n_m",
+            above=0.0,
+            help="Largest command that the drive follows, its current limit for one, either sign; absent: any.",
+        ),
+    ] = None
 
     unit = "N m"
 
     def __post_init__(self) -> None:
         _checked(self)
+        _check_friction(self)
 
     def matrices(self) -> ShaftMatrices:
         """Matrices of (torque, speed, theta_m); without lag of (speed, theta_m)."""
@@ -175,8 +214,14 @@ class VelocityDrive:
     """
 
     lag: Annotated[float, key("velocity_loop_time_s", above=0.0, help="Time constant of the drive's velocity loop.")]
+    limit: Annotated[
+        float | None,
+        key(
+            "speed_limit_rad_per_s", above=0.0, help="Largest command that the drive follows, either sign; absent: any."
+        ),
+    ] = None
 
-    unit, coulomb = "rad/s", 0.0
+    unit, coulomb, static, stribeck = "rad/s", 0.0, None, None
 
     def __post_init__(self) -> None:
         _checked(self)
@@ -211,7 +256,7 @@ class Stepper:
         key("smoothing_time_s", above=0.0, help="Time constant (twice) of the driver's smoothing between two steps."),
     ]
 
-    unit, coulomb = "rad", 0.0
+    unit, coulomb, static, stribeck, limit = "rad", 0.0, None, None, None
 
     def __post_init__(self) -> None:
         _checked(self)
@@ -234,6 +279,12 @@ class Stepper:
 
 Actuator: TypeAlias = DcMotor | TorqueDrive | VelocityDrive | Stepper
 ACTUATORS = {"dc_motor": DcMotor, "torque": TorqueDrive, "velocity": VelocityDrive, "stepper": Stepper}
+
+
+def static_torque(actuator: Actuator) -> float:
+    """Torque at rest per command, N m; 0 for a drive that follows its command whatever the load."""
+    shaft = actuator.polynomials()
+    return float(shaft.command[0]) / float(shaft.torque[0]) if shaft.torque[0] else 0.0
 
 
 def stacked(every: Sequence[ShaftMatrices]) -> ShaftMatrices:

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Generic, TypeVar
+from typing import Generic
 
 import numpy as np
 
@@ -47,9 +47,8 @@ from servotwin.plant.friction import (
 )
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.plant.zones import LinearPiece, Zone, controller_zones
+from servotwin.plant.zones import Driven, Piece, Zone, controller_zones, driven_pieces
 
-Piece = TypeVar("Piece", bound=LinearPiece)
 INPUTS = ("reference", "gap", "tolerance")
 
 
@@ -115,9 +114,14 @@ class ServoAutomaton:
             self, "opened", tuple(OPEN * count + mode % count for mode in range(len(self.automaton.modes)))
         )
 
-    def mode(self, zone: str) -> int:
-        """The open mode, the motor at rest, in a zone of the controller."""
-        return OPEN * self.frictions * len(self.zones) + self.zones.index(zone)
+    def mode(self, zone: str, side: int = 0) -> int:
+        """The open mode, or that on the flank of a side, the motor at rest, in a zone of the controller."""
+        return (OPEN + side) * self.modes_per_contact + self.zones.index(zone)
+
+    @property
+    def modes_per_contact(self) -> int:
+        """Number of modes of each contact mode."""
+        return self.frictions * len(self.zones)
 
     def input_values(self, name: str, coefficients: Array) -> dict[int, float]:
         """States of an input at the start of a cubic piece with ascending `coefficients`: its value and derivatives."""
@@ -217,8 +221,9 @@ def continuous_parts(servo: PlantNumbers, controller: LawNumbers, shape: Shape) 
     error = basis.row("reference") - measured
     system = LoopModes(servo, basis, controller_zones(controller, shape.dead_zone, basis, error), shape.friction)
     flows = []
-    for contact, stick_slip, zone in system.combinations:
-        flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
+    for contact, stick_slip, driven in system.combinations:
+        flow = mechanical_flow(servo, basis, contact, stick_slip, driven.command)
+        zone = driven.piece
         flow[..., basis["integral"], :], flow[..., basis["derivative"], :] = zone.integral, zone.derivative
         if controller.loop_filter_hz is not None:
             rate = 2.0 * np.pi * controller.loop_filter_hz
@@ -252,8 +257,8 @@ def sampled_parts(servo: PlantNumbers, gap_degree: int, bias: bool, friction: bo
     system = LoopModes(servo, basis, (Zone("held", basis.row("voltage"), zero, zero, zero),), friction)
     return system.parts(
         [
-            mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
-            for contact, stick_slip, zone in system.combinations
+            mechanical_flow(servo, basis, contact, stick_slip, driven.command)
+            for contact, stick_slip, driven in system.combinations
         ]
     )
 
@@ -276,11 +281,18 @@ def _loop_names(servo: PlantNumbers, controller: LawNumbers, shape: Shape) -> li
 
 def constants(servo: PlantNumbers, bias: bool, friction: bool) -> list[str]:
     """States of a plant that never change."""
+    guide = servo.guide
+    falls, load_falls = (bool(np.any(each.slope)) for each in (servo.motor_stribeck, guide.stribeck))
     present = {
         "input bias": bias,
+        "drive limit": servo.command_limit is not None,
         "friction": friction,
-        "load force": servo.guide.force != 0.0,
-        "load friction": servo.guide.friction != 0.0,
+        "friction drop": friction and falls,
+        "friction stribeck": friction and falls,
+        "load force": guide.force != 0.0,
+        "load friction": guide.friction != 0.0,
+        "load friction drop": load_falls,
+        "load friction stribeck": load_falls,
     }
     return [name for name, there in present.items() if there]
 
@@ -289,11 +301,14 @@ class LoopModes(Generic[Piece]):
     """All combinations of contact mode, stick-slip mode and zone, in the order of the automaton's modes."""
 
     def __init__(self, servo: PlantNumbers, basis: Basis, zones: Sequence[Piece], friction: bool) -> None:
-        self.servo, self.basis, self.zones = servo, basis, zones
+        self.servo, self.basis, self.zones = servo, basis, driven_pieces(zones, basis)
         self.contacts, self.frictions = contact_modes(servo), stick_slip_modes(servo, friction)
         self._resets = {side: contact_reset(servo, basis, side) for side in (-1, 1)}
         self.combinations = [
-            (contact, stick_slip, zone) for contact in self.contacts for stick_slip in self.frictions for zone in zones
+            (contact, stick_slip, zone)
+            for contact in self.contacts
+            for stick_slip in self.frictions
+            for zone in self.zones
         ]
         self.names = [(contact.name, stick_slip.name, zone.name) for contact, stick_slip, zone in self.combinations]
 
@@ -309,7 +324,7 @@ class LoopModes(Generic[Piece]):
         """(..., M, N) rows, the same in every mode."""
         return np.repeat(row[..., None, :], len(self.combinations), axis=-2)
 
-    def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Piece) -> tuple[Guard, ...]:
+    def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]) -> tuple[Guard, ...]:
         ends = [(guard, (contact.name, stick_slip.name, guard.target)) for guard in zone.guards]
         # Friction first: where the motor stops on a flank, the screw stays in contact.
         ends += [
@@ -327,32 +342,34 @@ class LoopModes(Generic[Piece]):
             Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends
         )
 
-    def _stick_slip_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Piece) -> list[GuardRow]:
+    def _stick_slip_guards(
+        self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]
+    ) -> list[GuardRow]:
         if stick_slip == FRICTIONLESS:
             return []
         force = np.zeros(len(self.basis.names))
         if stick_slip.load.stuck:
             sliding = replace(stick_slip, load=SMOOTH)
-            flow = mechanical_flow(self.servo, self.basis, contact, sliding, zone.voltage)
+            flow = mechanical_flow(self.servo, self.basis, contact, sliding, zone.command)
             force = self.servo.guide.mass * flow[..., self.basis.last_speed(self.servo), :]
         torque = self._torque(contact, zone)
         return stick_slip_guards(self.servo, self.basis, stick_slip, torque, force)
 
-    def _torque(self, contact: ContactMode, zone: Piece) -> Array:
+    def _torque(self, contact: ContactMode, zone: Driven[Piece]) -> Array:
         """Row of the torque that drives the motor's shaft against its friction, N m."""
         shaft, basis = self.servo.shaft(), self.basis
         lead = shaft.torque.shape[:-1]
         torque = np.zeros((*lead, len(basis.names)))
         torque[..., : shaft.torque.shape[-1]] = shaft.torque
         if np.any(shaft.direct):
-            torque = torque + shaft.direct * (zone.voltage + basis.row("input bias"))
+            torque = torque + shaft.direct * zone.command
         if self.servo.play is Play.FREE and contact.side:
             torque = torque - self.servo.p * screw_force(self.servo, basis, screw_rate(self.servo, basis, contact))
         return np.asarray(torque)
 
-    def _acceleration(self, side: int, zone: Piece) -> Array:
+    def _acceleration(self, side: int, zone: Driven[Piece]) -> Array:
         """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
-        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), FRICTIONLESS, zone.voltage)
+        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), FRICTIONLESS, zone.command)
         return np.asarray(flow[..., self.basis["speed"], :])
 
     def _outputs(self) -> dict[str, Array]:
@@ -361,5 +378,7 @@ class LoopModes(Generic[Piece]):
         rows |= {"position": rows[f"q{self.servo.n}"], "sensed": self.basis.sensed(self.servo)}
         rows |= {name: self.basis.row(name) for name in ("theta_m", "theta_d", "reference", "gap", "tolerance")}
         full = {name: self._everywhere(row) for name, row in rows.items()}
-        full["voltage"] = np.stack(np.broadcast_arrays(*(zone.voltage for _, _, zone in self.combinations)), axis=-2)
+        full["voltage"] = np.stack(
+            np.broadcast_arrays(*(zone.piece.voltage for _, _, zone in self.combinations)), axis=-2
+        )
         return full

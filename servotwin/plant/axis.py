@@ -16,36 +16,30 @@ import numpy as np
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
-from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller, ControllerChanges
 from servotwin.control.laws import AnyController, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
-from servotwin.plant.actuator import Actuator, DcMotor, ShaftMatrices, Stepper, TorqueDrive, VelocityDrive
+from servotwin.plant.actuator import Actuator, ShaftMatrices, static_torque
 from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
-from servotwin.plant.basis import Guide, Play
-from servotwin.plant.fit import check_fit
+from servotwin.plant.basis import Guide, Play, Stribeck
+from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
 from servotwin.plant.law_loop import LawLoop, check_encoders
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.numbers import tolerance_of
+from servotwin.plant.rest import Rest, rest_under_force
+from servotwin.plant.scaled_parts import scaled_parts
 from servotwin.plant.sensors import MOTOR, Sensors
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
 AXES = (
-    "two-mass-drive",
-    "ball-screw",
-    "robot-joint",
-    "telescope",
-    "stepper-stage",
-    "micro-positioner",
-    "gantry",
-    "emps",
-)
+    "two-mass-drive", "ball-screw", "robot-joint", "telescope", "stepper-stage", "micro-positioner", "gantry", "emps",
+)  # fmt: skip
 """Names of the presets of axes."""
 
 
@@ -61,13 +55,6 @@ class AxisChanges(ControllerChanges, total=False):
 
 # Stands for the controller where only the plant counts.
 _NONE = Controller(0.0, 0.0, 0.0, 1.0)
-_PARTS: dict[str, tuple[type, ...]] = {
-    "actuator": (DcMotor, TorqueDrive, VelocityDrive, Stepper),
-    "transmission": (Transmission,),
-    "load": (Load,),
-    "controller": (Controller, Cascade, LinearLaw),
-    "sensors": (Sensors,),
-}
 
 
 @dataclass(frozen=True, repr=False)
@@ -98,11 +85,7 @@ class Axis:
     sensors: Sensors = field(default_factory=Sensors)
 
     def __post_init__(self) -> None:
-        for each in dataclasses.fields(self):
-            part, kinds = getattr(self, each.name), _PARTS[each.name]
-            if not isinstance(part, kinds):
-                names = " or ".join(kind.__name__ for kind in kinds)
-                raise InvalidInput(f"axis {each.name} = {part!r}: must be a {names}")
+        check_kinds({name: getattr(self, name) for name in PARTS})
         check_fit(self.actuator, self.transmission, self.load, self.controller)
 
     @classmethod
@@ -184,10 +167,21 @@ class Axis:
         """Coulomb friction of the motor's shaft, N m."""
         return self.actuator.coulomb
 
+    @cached_property
+    def motor_stribeck(self) -> Stribeck:
+        """Friction of the motor's shaft above Coulomb's near standstill."""
+        return Stribeck.of(self.actuator.static, self.actuator.coulomb, self.actuator.stribeck)
+
+    @property
+    def command_limit(self) -> float | None:
+        """Largest command that the drive follows, either sign; None: any."""
+        return self.actuator.limit
+
     @property
     def own_friction(self) -> float:
-        """Coulomb friction of motor and load as a torque on the motor, N m."""
-        return self.motor_friction + self.p * self.load.friction
+        """Friction of motor and load at standstill as a torque on the motor, N m."""
+        load = self.load.friction + self.guide.stribeck.drop
+        return self.motor_friction + self.motor_stribeck.drop + self.p * load
 
     @cached_property
     def guide(self) -> Guide:
@@ -196,7 +190,8 @@ class Axis:
         behind = load.k[-1] if self.n > 1 else self.transmission.k_d
         mass = load.m[-1]
         resisting = load.c[-1] + math.sqrt(mass * behind) if math.isfinite(behind) else 1.0
-        return Guide(load.friction, load.force, mass, 1.0 / resisting)
+        falling = Stribeck.of(load.static, load.friction, load.stribeck)
+        return Guide(load.friction, load.force, mass, 1.0 / resisting, falling)
 
     @property
     def at_motor(self) -> bool:
@@ -224,8 +219,7 @@ class Axis:
 
     def __repr__(self) -> str:
         """Parts in one line."""
-        kind = type(self.actuator).__name__
-        masses = f"{self.n} mass{'es' if self.n > 1 else ''}"
+        kind, masses = type(self.actuator).__name__, f"{self.n} mass{'es' if self.n > 1 else ''}"
         return f"<Axis, model {self.version}: {kind}, {self.play.value} screw, {masses}, {self.controller!r}>"
 
     def chain(self) -> Chain:
@@ -241,6 +235,10 @@ class Axis:
             return screw, self.chain().equilibrium(self.p * screw)
         screw = screw if self.load.free else 0.0
         return screw, np.concatenate([np.full(self.n, self.p * screw), np.zeros(self.n)])
+
+    def rest_under_force(self, gap: float, screw: float) -> Rest | None:
+        """Where a load hangs that a constant force pushes; None: nothing does, or friction holds it."""
+        return rest_under_force(self, gap, screw)
 
     def shaft(self) -> ShaftMatrices:
         """Matrices of the actuator."""
@@ -268,18 +266,17 @@ class Axis:
         InvalidInput
             A name is unknown, or a value is out of its range.
         """
-        parts = {name: value for name, value in changes.items() if name in _PARTS}
-        law = {name: value for name, value in changes.items() if name not in _PARTS}
+        parts = {name: value for name, value in changes.items() if name in PARTS}
+        law = {name: value for name, value in changes.items() if name not in PARTS}
         known = [each.name for each in dataclasses.fields(parts.get("controller", self.controller))]  # type: ignore[arg-type]
         for name in law:
             if name not in known:
-                every = [*_PARTS, *known]
+                every = [*PARTS, *known]
                 hint = did_you_mean(name, every)
                 raise InvalidInput(f"axis has no part or gain named {name!r}{hint}; allowed are {', '.join(every)}")
         changed = dataclasses.replace(self, **parts)  # type: ignore[arg-type]
-        if not law:
-            return changed
-        return dataclasses.replace(changed, controller=dataclasses.replace(changed.controller, **law))  # type: ignore[arg-type]
+        tuned = dataclasses.replace(changed.controller, **law) if law else changed.controller  # type: ignore[arg-type]
+        return dataclasses.replace(changed, controller=tuned) if law else changed
 
     def scaled(self, factors: Mapping[str, float]) -> Axis:
         """A copy with some of the plant's numbers multiplied.
@@ -296,20 +293,8 @@ class Axis:
         InvalidInput
             A factor is not positive and finite.
         """
-        for name, factor in factors.items():
-            if not 0.0 < factor < math.inf:
-                raise InvalidInput(f"axis {name}: factor {factor!r} must be positive and finite")
-        k, c, m, p = (factors.get(name, 1.0) for name in ("k", "c", "m", "p"))
-        load, screw = self.load, self.transmission
-        scaled_load = dataclasses.replace(
-            load,
-            m=tuple(m * each for each in load.m),
-            k=tuple(k * each for each in load.k),
-            c=tuple(c * each for each in load.c),
-        )
-        scaled_screw = dataclasses.replace(screw, p=p * screw.p, k_d=k * screw.k_d, c_d=c * screw.c_d)
-        actuator = self.actuator.scaled(factors.get("k_T", 1.0), factors.get("k_B", 1.0))
-        return dataclasses.replace(self, actuator=actuator, load=scaled_load, transmission=scaled_screw)
+        actuator, screw, load = scaled_parts(self.actuator, self.transmission, self.load, factors)
+        return dataclasses.replace(self, actuator=actuator, load=load, transmission=screw)
 
     @property
     def pidf(self) -> Controller:
@@ -335,8 +320,7 @@ class Axis:
 
     def torque_of(self, command: float) -> float:
         """Torque at rest under a command, N m; 0 for a drive that follows its command whatever the load."""
-        shaft = self.actuator.polynomials()
-        return command * float(shaft.command[0]) / float(shaft.torque[0]) if shaft.torque[0] else 0.0
+        return command * static_torque(self.actuator)
 
     @property
     def takes_friction(self) -> bool:
@@ -345,11 +329,8 @@ class Axis:
 
     def with_position_resolution(self, resolution: float) -> Axis:
         """A copy whose measured position has another resolution, m (rotary: rad)."""
-        if self.at_motor:
-            sensors = dataclasses.replace(self.sensors, encoder_resolution=resolution / self.p)
-        else:
-            sensors = dataclasses.replace(self.sensors, position_resolution=resolution)
-        return dataclasses.replace(self, sensors=sensors)
+        sensed = {"encoder_resolution": resolution / self.p} if self.at_motor else {"position_resolution": resolution}
+        return dataclasses.replace(self, sensors=dataclasses.replace(self.sensors, **sensed))  # type: ignore[arg-type]
 
     def tolerance_for(self, gap: float, k_dz: float = 1.0) -> float:
         """Half-width of the dead zone (m, rotary: rad) for a total gap (rad at the motor): k_dz p gap (Eq 21).
@@ -411,10 +392,8 @@ class Axis:
             self._law_loop(law).check(
                 described_law(controller or self.controller, self.actuator.unit, self.load.motion)
             )
-        else:
-            if self.rigid and self.at_motor and self.n > 1 and not np.linalg.eigvals(self.chain().A).real.max() < 0.0:
-                raise InvalidInput(
-                    "load c: without damping the load swings for ever, and the motor's encoder does not see it"
-                )
-            position = "m" if self.load.motion == LINEAR else "rad"
-            loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)
+            return
+        if self.rigid and self.at_motor:
+            check_damped(self.load, self.chain())
+        position = "m" if self.load.motion == LINEAR else "rad"
+        loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)

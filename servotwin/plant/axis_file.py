@@ -77,9 +77,19 @@ def linear_load(
     ] = (0.0,),
     friction: Annotated[float, key("friction_n", minimum=0.0, help="Coulomb friction on the last mass.")] = 0.0,
     force: Annotated[float, key("force_n", help="Constant force on the last mass, gravity for one.")] = 0.0,
+    static: Annotated[
+        float | None,
+        key("static_friction_n", above=0.0, help="Friction of it at standstill; absent: the Coulomb friction."),
+    ] = None,
+    stribeck: Annotated[
+        float | None,
+        key(
+            "stribeck_speed_m_per_s", above=0.0, help="Speed at which the friction has fallen to the Coulomb friction."
+        ),
+    ] = None,
 ) -> Load:
     """Masses on a line."""
-    return Load(m, k, c, LINEAR, friction, force)
+    return Load(m, k, c, LINEAR, friction, force, static, stribeck)
 
 
 def rotary_load(
@@ -102,9 +112,21 @@ def rotary_load(
     ] = (0.0,),
     friction: Annotated[float, key("friction_n_m", minimum=0.0, help="Coulomb friction on the last inertia.")] = 0.0,
     force: Annotated[float, key("torque_n_m", help="Constant torque on the last inertia, gravity for one.")] = 0.0,
+    static: Annotated[
+        float | None,
+        key("static_friction_n_m", above=0.0, help="Friction of it at standstill; absent: the Coulomb friction."),
+    ] = None,
+    stribeck: Annotated[
+        float | None,
+        key(
+            "stribeck_speed_rad_per_s",
+            above=0.0,
+            help="Speed at which the friction has fallen to the Coulomb friction.",
+        ),
+    ] = None,
 ) -> Load:
     """Inertias on a shaft."""
-    return Load(m, k, c, ROTARY, friction, force)
+    return Load(m, k, c, ROTARY, friction, force, static, stribeck)
 
 
 TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
@@ -133,6 +155,9 @@ def read_parts(table: Table) -> Parts:
     tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
     actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
     kind = kind_of(tables["transmission"], TRANSMISSIONS)
+    both = [name for name in ("pitch_m_per_rad", "lead_mm_per_rev") if name in tables["transmission"].values]
+    if len(both) == 2:
+        raise InvalidInput(f"{table.source}: transmission.{both[0]} and transmission.{both[1]}: give only one of them")
     transmission: Transmission = read_kind(tables["transmission"], TRANSMISSIONS, Path())
     motion = kind_of(tables["load"], LOADS)
     if motion != _MOTIONS[kind]:

@@ -24,6 +24,31 @@ class Play(Enum):
     of Nordin and Gutman)."""
 
 
+class Stribeck(NamedTuple):
+    """Friction above Coulomb's near standstill: it falls linearly with the speed, to none at a speed of its own.
+
+    Attributes
+    ----------
+    drop : float
+        Static less Coulomb friction, N m (of a linear load N).
+    speed : float
+        Speed at which nothing of it is left, rad/s (m/s).
+    slope : float, or (P, 1) array
+        drop / speed; 0: there is none.
+    """
+
+    drop: float = 0.0
+    speed: float = 0.0
+    slope: float | Array = 0.0
+
+    @staticmethod
+    def of(static: float | None, coulomb: float, speed: float | None) -> Stribeck:
+        """From static and Coulomb friction; None or no drop: none."""
+        if static is None or speed is None or static == coulomb:
+            return Stribeck()
+        return Stribeck(static - coulomb, speed, (static - coulomb) / speed)
+
+
 class Guide(NamedTuple):
     """Forces on the last mass beside those of its neighbours: of a linear load N, of a rotary one N m.
 
@@ -37,12 +62,15 @@ class Guide(NamedTuple):
         The last mass, kg or kg m^2.
     yielding : float, or (P, 1) array
         m/s (rad/s) that a force of one N (N m) takes off the last mass's speed in its own time.
+    stribeck : Stribeck
+        Friction above Coulomb's near standstill.
     """
 
     friction: float = 0.0
     force: float = 0.0
     mass: float | Array = 1.0
     yielding: float | Array = 1.0
+    stribeck: Stribeck = Stribeck()
 
 
 class PlantNumbers(Protocol):
@@ -66,6 +94,16 @@ class PlantNumbers(Protocol):
     @property
     def guide(self) -> Guide:
         """Forces on the last mass."""
+        ...
+
+    @property
+    def motor_stribeck(self) -> Stribeck:
+        """Friction of the motor's shaft above Coulomb's near standstill."""
+        ...
+
+    @property
+    def command_limit(self) -> float | None:
+        """Largest command that the drive follows, either sign; None: any."""
         ...
 
     @property

@@ -6,21 +6,28 @@ import numpy as np
 
 from servotwin.plant.backlash import ContactMode, screw_force, screw_rate
 from servotwin.plant.basis import Basis, PlantNumbers, Play, outer, rows_times, scaled
-from servotwin.plant.friction import StickSlipMode
+from servotwin.plant.friction import StickSlipMode, resistance
 from servotwin.plant.signals import Array
 
 
 def mechanical_flow(
-    servo: PlantNumbers, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, voltage: Array
+    servo: PlantNumbers, basis: Basis, contact: ContactMode, stick_slip: StickSlipMode, command: Array
 ) -> Array:
-    """(..., N, N) flow of motor, screw, chain and inputs in one mode; rows of the controller's states are zero."""
+    """(..., N, N) flow of motor, screw, chain and inputs in one mode; rows of the controller's states are zero.
+
+    Parameters
+    ----------
+    command : (..., N) array
+        Row of what the actuator gets, the input bias included.
+    """
     chain, shaft = servo.chain(), servo.shaft()
     flow = np.zeros((*shaft.A.shape[:-2], len(basis.names), len(basis.names)))
     states, screw = basis.chain_states(chain), basis["theta_d"]
     motor = slice(0, screw)
     flow[..., motor, motor] = shaft.A
-    flow[..., motor, :] += outer(shaft.B, voltage + basis.row("input bias"))
-    flow[..., motor, :] -= outer(shaft.E, stick_slip.motor.side * basis.row("friction"))
+    flow[..., motor, :] += outer(shaft.B, command)
+    resisting = resistance(basis, stick_slip.motor, "friction", basis["speed"], servo.motor_stribeck)
+    flow[..., motor, :] -= outer(shaft.E, resisting)
     flow[..., screw, :] = screw_rate(servo, basis, contact)
     if contact.side == 0 and servo.play is Play.FREE:
         flow[..., states, states] = chain.A_open
@@ -37,11 +44,9 @@ def mechanical_flow(
     if stick_slip.motor.stuck:
         flow[..., basis["speed"], :] = 0.0
     if "load force" in basis or "load friction" in basis:
-        last, pushed = (
-            basis.last_speed(servo),
-            basis.row("load force") - stick_slip.load.side * basis.row("load friction"),
-        )
-        flow[..., last, :] += pushed / servo.guide.mass
+        last, guide = basis.last_speed(servo), servo.guide
+        resisting = resistance(basis, stick_slip.load, "load friction", last, guide.stribeck)
+        flow[..., last, :] += (basis.row("load force") - resisting) / guide.mass
         if stick_slip.load.stuck:
             flow[..., last, :] = 0.0
     # A polynomial input is a chain of integrators: every derivative drives the one before it.

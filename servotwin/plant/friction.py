@@ -1,6 +1,7 @@
-"""Coulomb friction on the motor's shaft and on the last mass, as the stick-slip modes of the automaton.
+"""Friction on the motor's shaft and on the last mass, as the stick-slip modes of the automaton.
 
-Of each {stick, slip -, slip +}; without friction there is one mode only.
+Of each {stick, slip -, slip +}, with a Stribeck drop also {slow -, slow +}; without friction there is one mode only.
+The drop is linear in the speed, so that every mode is affine and nothing but the shape of the drop is approximated.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Play
+from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Play, Stribeck
 from servotwin.plant.signals import Array
 
 # A motor has stopped at this part of the speed that its friction takes off (at which a DC motor's back EMF takes as
@@ -21,11 +22,12 @@ _STOPPED = 1e-9
 
 @dataclass(frozen=True)
 class Grip:
-    """State of one friction: stuck, sliding in a direction, or none (side 0)."""
+    """State of one friction: stuck, sliding in a direction, or none (side 0); slow: where it falls with the speed."""
 
     name: str
     side: int = 0
     stuck: bool = False
+    slow: bool = False
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class StickSlipMode:
 SMOOTH = Grip("")
 _COULOMB = (Grip("stick", stuck=True), Grip("slip -", -1), Grip("slip +", 1))
 _LOAD = (Grip("load stick", stuck=True), Grip("load slip -", -1), Grip("load slip +", 1))
+_SLOW = (Grip("slow -", -1, slow=True), Grip("slow +", 1, slow=True))
+_LOAD_SLOW = (Grip("load slow -", -1, slow=True), Grip("load slow +", 1, slow=True))
 FRICTIONLESS = StickSlipMode(SMOOTH, SMOOTH)
 
 
@@ -65,8 +69,31 @@ def stick_slip_modes(servo: PlantNumbers, friction: bool) -> tuple[StickSlipMode
             "friction of a load that is one mass behind a rigid transmission acts on nothing: must be 0; "
             "give the friction at the motor instead"
         )
-    motors, loads = _COULOMB if friction else (SMOOTH,), _LOAD if servo.guide.friction else (SMOOTH,)
+    motors = _grips(_COULOMB, _SLOW, servo.motor_stribeck) if friction else (SMOOTH,)
+    loads = _grips(_LOAD, _LOAD_SLOW, servo.guide.stribeck) if servo.guide.friction else (SMOOTH,)
     return tuple(StickSlipMode(motor, load) for motor in motors for load in loads)
+
+
+def _grips(grips: tuple[Grip, ...], slow: tuple[Grip, ...], stribeck: Stribeck) -> tuple[Grip, ...]:
+    return grips + slow if np.any(stribeck.slope) else grips
+
+
+def resistance(basis: Basis, grip: Grip, friction: str, speed: int, stribeck: Stribeck) -> Array:
+    """Row of the friction (N m or N) against the motion of what slides.
+
+    Parameters
+    ----------
+    friction : str
+        Name of the state of the Coulomb friction.
+    speed : int
+        Place of the speed among the states.
+    """
+    sliding = grip.side * basis.row(friction)
+    if not grip.slow:
+        return sliding
+    return np.asarray(
+        sliding + grip.side * basis.row(f"{friction} drop") - stribeck.slope * np.eye(len(basis.names))[speed]
+    )
 
 
 def stick_slip_guards(
@@ -80,26 +107,37 @@ def stick_slip_guards(
         Rows of what drives the motor (N m) and the last mass (N) without friction.
     """
     motor, load = mode.motor, mode.load
-    shaft = _Sliding(basis["speed"], basis.row("friction"), stopping_speed(servo, basis, mode))
-    ends = [_ended(mode, "motor", guard) for guard in _guards(basis, motor, _COULOMB, shaft, torque)]
+    shaft = _sliding(basis, basis["speed"], "friction", stopping_speed(servo, basis, mode))
+    motors = _grips(_COULOMB, _SLOW, servo.motor_stribeck)
+    ends = [_ended(mode, "motor", guard) for guard in _guards(basis, motor, motors, shaft, torque)]
     if load is SMOOTH:
         return ends
     threshold = _STOPPED * servo.guide.yielding * basis.row("load friction")
-    mass = _Sliding(basis.last_speed(servo), basis.row("load friction"), threshold)
-    return ends + [_ended(mode, "load", guard) for guard in _guards(basis, load, _LOAD, mass, force)]
+    mass = _sliding(basis, basis.last_speed(servo), "load friction", threshold)
+    loads = _grips(_LOAD, _LOAD_SLOW, servo.guide.stribeck)
+    return ends + [_ended(mode, "load", guard) for guard in _guards(basis, load, loads, mass, force)]
 
 
 @dataclass(frozen=True)
 class _Sliding:
-    """Place of a speed among the states, row of its friction, and row of the speed at which it has stopped."""
+    """Place of a speed among the states, row of its friction at rest, row of the speed at which it has stopped, and row
+    of the Stribeck speed."""
 
     speed: int
     friction: Array
     stopping: Array | float
+    stribeck: Array
+
+
+def _sliding(basis: Basis, speed: int, friction: str, stopping: Array | float) -> _Sliding:
+    static = basis.row(friction) + basis.row(f"{friction} drop")
+    return _Sliding(speed, static, stopping, basis.row(f"{friction} stribeck"))
 
 
 def _guards(basis: Basis, grip: Grip, grips: tuple[Grip, ...], body: _Sliding, drive: Array) -> list[GuardRow]:
-    stick, backwards, forwards = grips
+    stick = grips[0]
+    # What begins to slide is slow at first; without a drop there is one grip of each side.
+    backwards, forwards = grips[-2:]
     if grip.stuck:
         return [
             GuardRow(s * drive - body.friction, (forwards if s > 0 else backwards).name, None, "slip", s)
@@ -107,17 +145,23 @@ def _guards(basis: Basis, grip: Grip, grips: tuple[Grip, ...], body: _Sliding, d
         ]
     if grip.side == 0:
         return []
-    # A reversal goes through the stuck mode within the instant.
     size = len(basis.names)
+    faster = grip.side * np.eye(size)[body.speed] - body.stribeck
+    if not grip.slow and len(grips) > len(_COULOMB):
+        return [GuardRow(-faster, (backwards if grip.side < 0 else forwards).name, None, "stribeck", 0)]
+    # A reversal goes through the stuck mode within the instant.
     still = np.eye(size)
     still[body.speed] = 0.0
     stopped = -grip.side * np.eye(size)[body.speed] - body.stopping
-    return [GuardRow(stopped, stick.name, still, "stick", grip.side)]
+    ends = [GuardRow(stopped, stick.name, still, "stick", grip.side)]
+    if grip.slow:
+        ends.append(GuardRow(faster, grips[1 if grip.side < 0 else 2].name, None, "stribeck", grip.side))
+    return ends
 
 
 def _ended(mode: StickSlipMode, body: str, guard: GuardRow) -> GuardRow:
     """A guard of one body, to the mode of both."""
-    grip = next(each for each in (*_COULOMB, *_LOAD) if each.name == guard.target)
+    grip = next(each for each in (*_COULOMB, *_LOAD, *_SLOW, *_LOAD_SLOW) if each.name == guard.target)
     return guard._replace(target=replace(mode, **{body: grip}).name)
 
 

@@ -51,9 +51,9 @@ def linear_parts(servo: Plant, law: LinearLaw, shape: Shape) -> LoopParts:
     modes = LoopModes(servo, basis, linear_zones(law, shape.dead_zone, basis, inputs, error), shape.friction)
     states = [basis[law_state(name)] for name in law.names]
     flows = []
-    for contact, stick_slip, zone in modes.combinations:
-        flow = mechanical_flow(servo, basis, contact, stick_slip, zone.voltage)
-        flow[states] = zone.rates
+    for contact, stick_slip, driven in modes.combinations:
+        flow = mechanical_flow(servo, basis, contact, stick_slip, driven.command)
+        flow[states] = driven.piece.rates
         if shape.offset:
             flow[basis["offset"]] = -basis.row("offset") / law.release_time
         flows.append(flow)

@@ -8,11 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.numbers import a_number
+from servotwin.plant.numbers import a_number, check_stribeck
 from servotwin.plant.signals import Array
 
 LINEAR, ROTARY = "linear", "rotary"
 _UNITS = {LINEAR: ("kg", "N/m", "N s/m", "N"), ROTARY: ("kg m^2", "N m/rad", "N m s/rad", "N m")}
+
+_KEYS = {
+    LINEAR: {"m": "mass_kg", "k": "stiffness_n_per_m", "c": "damping_n_s_per_m"},
+    ROTARY: {"m": "inertia_kg_m2", "k": "stiffness_n_m_per_rad", "c": "damping_n_m_s_per_rad"},
+}
+_FRICTION_KEYS = {
+    LINEAR: ("friction_n", "static_friction_n", "stribeck_speed_m_per_s", "N"),
+    ROTARY: ("friction_n_m", "static_friction_n_m", "stribeck_speed_rad_per_s", "N m"),
+}
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,10 @@ class Load:
         Coulomb friction on the last mass, N (rotary: N m).
     force : float
         Constant force on the last mass, gravity for one, N (rotary: N m); positive pushes forwards.
+    static : float, optional
+        Friction at standstill, N (rotary: N m); None: the Coulomb friction.
+    stribeck : float, optional
+        Speed at which the friction has fallen, linearly, from the static to the Coulomb friction, m/s (rotary: rad/s).
 
     Raises
     ------
@@ -45,6 +58,8 @@ class Load:
     motion: str = LINEAR
     friction: float = 0.0
     force: float = 0.0
+    static: float | None = None
+    stribeck: float | None = None
 
     def __post_init__(self) -> None:
         if self.motion not in _UNITS:
@@ -56,7 +71,9 @@ class Load:
             values = tuple(a_number("load", f"{name}[{i}]", value) for i, value in enumerate(given))
             object.__setattr__(self, name, values)
             if len(values) != len(self.m) or not values:
-                raise InvalidInput(f"load {name} = {values}: must have one value for each of the {len(self.m)} masses")
+                raise InvalidInput(
+                    f"load {self.described(name)} = {values}: must have one value for each of the {len(self.m)} masses"
+                )
             for i, value in enumerate(values):
                 least = "positive" if self._positive(name, i) else "0 or more"
                 if not (math.isfinite(value) and (value > 0.0 if least == "positive" else value >= 0.0)):
@@ -69,6 +86,11 @@ class Load:
             raise InvalidInput(f"load friction = {self.friction!r} {unit}: must be finite and 0 or more")
         if not math.isfinite(self.force):
             raise InvalidInput(f"load force = {self.force!r} {unit}: must be finite")
+        check_stribeck("load", self.friction, self.static, self.stribeck, _FRICTION_KEYS[self.motion])
+
+    def described(self, name: str) -> str:
+        """Name of m, k or c with its key in a file."""
+        return f"{name} ({_KEYS[self.motion][name]})"
 
     @staticmethod
     def _positive(name: str, place: int) -> bool:

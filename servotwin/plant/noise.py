@@ -32,7 +32,7 @@ class Noise:
         std is negative or not finite, the band is not 0 < stop < pass, or the kind is unknown.
     """
 
-    std: Annotated[float, key("std_mm", minimum=0.0, help="Standard deviation of the filtered noise.")]
+    std: Annotated[float, key("std_mm", "std_deg", minimum=0.0, help="Standard deviation of the filtered noise.")]
     band: Annotated[
         tuple[float, float],
         key(

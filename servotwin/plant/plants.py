@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import TypeAlias
@@ -50,8 +51,10 @@ def structure_of(plant: Plant) -> tuple[object, ...]:
         # Machines are drawn by the hundred: their matrices are not made for this.
         return type(plant), plant.n, plant.play
     guide, damped = plant.guide, bool(np.any(plant.chain().reaction_velocity))
-    forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction)
-    return type(plant), plant.n, plant.play, damped, plant.shaft().names, plant.at_motor, *forces
+    forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction), plant.command_limit is not None
+    falling = bool(plant.motor_stribeck.slope), bool(guide.stribeck.slope)
+    hangs = math.copysign(1.0, guide.force) if abs(guide.force) > guide.friction + guide.stribeck.drop else 0.0
+    return type(plant), hangs, plant.n, plant.play, damped, plant.shaft().names, plant.at_motor, *forces, *falling
 
 
 def check_homogeneous(plant: Plant, described: str) -> None:
@@ -60,12 +63,12 @@ def check_homogeneous(plant: Plant, described: str) -> None:
     Raises
     ------
     InvalidInput
-        It has Coulomb friction or a constant force.
+        It has Coulomb friction, a constant force or a drive with a limit.
     """
-    if plant.motor_friction or plant.guide.friction or plant.guide.force:
+    if plant.motor_friction or plant.guide.friction or plant.guide.force or plant.command_limit is not None:
         raise InvalidInput(
-            f"{described}: is computed for one gap and scaled to others, but Coulomb friction and constant forces of "
-            "this axis do not scale with its gap"
+            f"{described}: is computed for one gap and scaled to others, but friction, constant forces and the drive's "
+            "limit of this axis do not scale with its gap"
         )
 
 

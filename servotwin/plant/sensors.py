@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
+from servotwin.control.linear_law import LOAD, MOTOR
 
-MOTOR, LOAD = "motor", "load"
+__all__ = ["LOAD", "MOTOR", "Sensors"]
 
 
 @settings("sensors")

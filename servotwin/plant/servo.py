@@ -23,7 +23,7 @@ from servotwin.control.laws import AnyController, filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import ShaftMatrices
-from servotwin.plant.basis import Guide, Play
+from servotwin.plant.basis import Guide, Play, Stribeck
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
@@ -298,6 +298,7 @@ class Servo:
         return math.isinf(self.k_d)
 
     at_motor, guide, motor_friction, own_friction = False, Guide(), 0.0, 0.0
+    motor_stribeck, command_limit = Stribeck(), None
 
     @property
     def play(self) -> Play:
@@ -320,6 +321,10 @@ class Servo:
     def at_rest(self, screw: float) -> tuple[float, Array]:
         """Angle of the screw (rad) and state of the structure at rest, for a start of the screw at an angle."""
         return screw, self.chain().equilibrium(self.p * screw)
+
+    def rest_under_force(self, gap: float, screw: float) -> None:  # noqa: ARG002
+        """Nothing hangs: no force acts on its load."""
+        return
 
     def shaft(self) -> ShaftMatrices:
         """Matrices of the motor by name of its states."""

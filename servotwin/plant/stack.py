@@ -17,9 +17,10 @@ from servotwin.hybrid.automaton import AutomatonStack
 from servotwin.plant.actuator import ShaftMatrices, stacked
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
 from servotwin.plant.axis import Axis
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import Play, Stribeck
 from servotwin.plant.motor import Motor
 from servotwin.plant.plants import Plant
+from servotwin.plant.rest import Rest
 from servotwin.plant.servo import PerMass, Servo
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
@@ -50,6 +51,8 @@ class PlantStack:
     def __init__(self, servos: Sequence[Plant]) -> None:
         self.count, self.n, self.play = len(servos), servos[0].n, servos[0].play
         self.at_motor, self.guide = servos[0].at_motor, servos[0].guide
+        self.command_limit = servos[0].command_limit
+        self.motor_stribeck = _stacked_stribeck([each.motor_stribeck for each in servos])
         self.p = _column(servos, "p")
         self._axes = [each for each in servos if isinstance(each, Axis)]
         if self._axes:
@@ -75,7 +78,8 @@ class PlantStack:
         if axes[0].guide.friction or axes[0].guide.force:
             guides = [axis.guide for axis in axes]
             mass, yielding = (np.array([[getattr(guide, name)] for guide in guides]) for name in ("mass", "yielding"))
-            self.guide = guides[0]._replace(mass=mass, yielding=yielding)
+            stribeck = _stacked_stribeck([guide.stribeck for guide in guides])
+            self.guide = guides[0]._replace(mass=mass, yielding=yielding, stribeck=stribeck)
 
     def at_rest(self) -> tuple[Array, Array]:
         """(P,) angles and (P, N) states of the structures at rest, per angle of the screw's start."""
@@ -83,6 +87,10 @@ class PlantStack:
             every = [axis.at_rest(1.0) for axis in self._axes]
             return np.array([angle for angle, _ in every]), np.array([state for _, state in every])
         return np.ones(self.count), self._chain.equilibrium(self.p)
+
+    def rest_under_force(self, which: int, gap: float, screw: float) -> Rest | None:
+        """Where the load of one of them hangs."""
+        return self._axes[which].rest_under_force(gap, screw) if self._axes else None
 
     def chain(self) -> Chain:
         """Matrices of the structures."""
@@ -146,6 +154,12 @@ def sampled_plants(servos: Sequence[Plant], gap_degree: int, bias: bool, frictio
 
 def _column(items: Sequence[Plant] | Sequence[Controller], name: str) -> Array:
     return np.array([[getattr(item, name)] for item in items], dtype=float)
+
+
+def _stacked_stribeck(every: Sequence[Stribeck]) -> Stribeck:
+    """Friction that falls, with the slopes of many plants; of none its own zero."""
+    slopes = np.array([[each.slope] for each in every], dtype=float)
+    return every[0]._replace(slope=slopes) if slopes.any() else every[0]
 
 
 def _spread(value: PerMass, count: int) -> tuple[float, ...]:

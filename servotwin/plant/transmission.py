@@ -9,7 +9,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.basis import Play
 from servotwin.plant.numbers import a_number
 
-HELD, FREE = "held", "free"
+HELD, FREE = Play.HELD.value, Play.FREE.value
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,9 @@ class Transmission:
                 'transmission in_gap = "free": needs a finite stiffness k_d; a rigid transmission is held in the gap'
             )
         if self.c_d > 0.0 and self.play is not Play.FREE:
-            raise InvalidInput(f'transmission c_d = {self.c_d!r}: only a transmission that is "free" in the gap has it')
+            raise InvalidInput(
+                f'transmission damping (c_d) = {self.c_d!r}: only a transmission that is "free" in the gap has it'
+            )
 
     @property
     def rigid(self) -> bool:

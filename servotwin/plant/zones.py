@@ -1,9 +1,10 @@
-"""Zones of a continuous law: the linear pieces that dead zone and voltage limit divide it into."""
+"""Zones of a continuous law: the linear pieces that dead zone and limit divide it into; and the drive's own limit."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,6 +24,51 @@ class LinearPiece(Protocol):
 
     @property
     def guards(self) -> tuple[GuardRow, ...]: ...
+
+
+Piece = TypeVar("Piece", bound=LinearPiece)
+
+
+@dataclass(frozen=True)
+class Driven(Generic[Piece]):
+    """A linear piece of a law with what the drive makes of its command.
+
+    Attributes
+    ----------
+    piece : LinearPiece
+        Of the law, which does not know of the drive's limit.
+    name : str
+    command : (..., N) array
+        Row of what the actuator gets, the input bias included.
+    guards : tuple of GuardRow
+        Those of the law, and of the drive's limit.
+    """
+
+    piece: Piece
+    name: str
+    command: Array
+    guards: tuple[GuardRow, ...]
+
+
+def driven_pieces(pieces: Sequence[Piece], basis: Basis) -> tuple[Driven[Piece], ...]:
+    """Pieces of a law with an actuator's command; where the drive has a limit, each below, at and above it."""
+    every: list[Driven[Piece]] = []
+    for piece in pieces:
+        given = piece.voltage + basis.row("input bias")
+        if "drive limit" not in basis:
+            every.append(Driven(piece, piece.name, given, tuple(piece.guards)))
+            continue
+        limit, suffixes = basis.row("drive limit"), {1: " limited high", -1: " limited low"}
+        ends = [
+            GuardRow(side * given - limit, piece.name + suffix, None, "limit", side)
+            for side, suffix in suffixes.items()
+        ]
+        every.append(Driven(piece, piece.name, given, (*piece.guards, *ends)))
+        for side, suffix in suffixes.items():
+            back = GuardRow(limit - side * given, piece.name, None, "limit", 0)
+            kept = (guard._replace(target=guard.target + suffix) for guard in piece.guards)
+            every.append(Driven(piece, piece.name + suffix, side * limit, (*kept, back)))
+    return tuple(every)
 
 
 @dataclass(frozen=True)

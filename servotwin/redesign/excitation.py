@@ -50,7 +50,9 @@ class ExcitationSettings:
             help=f"Part of them before the change of the reference, below window_s{_ABSENT.format(_PRE_TRIGGER)}.",
         ),
     ] = None
-    probe: Annotated[float, key("probe_mm", minimum=0.0, help="Largest probing move; 0: none is requested.")] = 0.0
+    probe: Annotated[
+        float, key("probe_mm", "probe_deg", minimum=0.0, help="Largest probing move; 0: none is requested.")
+    ] = 0.0
     interval: Annotated[
         float | None,
         key("interval_s", above=0.0, help=f"Time from one probing move to the next{_ABSENT.format(_INTERVAL)}."),

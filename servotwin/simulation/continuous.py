@@ -22,6 +22,7 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.turns import direction_after, turns_of
 from servotwin.simulation.inputs import RunInputs, about, quantised
+from servotwin.simulation.start import holding_integral, holding_states, plant_start, set_states
 
 _NOISE_BLOCK = 4096
 
@@ -42,7 +43,8 @@ class ContinuousEngine:
         signals = {name: self._signal(name) for name in INPUTS}
         self.past: list[tuple[ServoAutomaton, Trajectory]] = []
         self.loop = self._automaton(self.controller)
-        state = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
+        start = plant_start(self.servo, self.loop, float(signals["gap"].value(0.0)), self.theta_d0)
+        state = start.state
         for name, pieces in signals.items():
             for index, value in self.loop.input_values(name, at_zero(pieces)).items():
                 state[index] = value
@@ -54,13 +56,15 @@ class ContinuousEngine:
         position = float(self.loop.rows["measured_position"][0] @ state)
         set_states(self.loop, state, dict.fromkeys(followers, position))
         if isinstance(self.controller, LinearLaw):
-            resting = law_at_rest(self.controller, LoopState(self.loop, state, 0), {})
+            resting = law_at_rest(self.controller, LoopState(self.loop, state, 0), {}, start.command)
             set_states(self.loop, state, resting)
+        else:
+            set_states(self.loop, state, {"integral": holding_integral(self.controller, start.command)})
         self.direction = direction_after(signals["reference"], 0.0, position, 0.0)
         set_states(self.loop, state, {"friction feedforward": friction_feedforward(self.controller) * self.direction})
         enter = self.controller.enter * float(signals["tolerance"].value(0.0))
         error = float(self.loop.rows["error"][0] @ state)
-        mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter))
+        mode = self.loop.mode("on" if self.inputs.tolerance is None else start_zone(error, enter), start.side)
         self.trajectory = Trajectory(self.loop.automaton, state, mode, 1.0 / self.inputs.sample_rate, self.refine)
 
     def _automaton(self, controller: Law, offset: bool = False) -> ServoAutomaton:
@@ -215,27 +219,6 @@ def friction_feedforward(controller: Law) -> float:
     return controller.friction_feedforward if isinstance(controller, Controller) else 0.0
 
 
-def set_states(loop: ServoAutomaton, state: Array, values: Mapping[str, float]) -> None:
-    """Set the named states; names that the automaton lacks are ignored."""
-    for name, value in values.items():
-        if name in loop.automaton.names:
-            state[loop.automaton.index(name)] = value
-
-
-def plant_start(servo: Plant, loop: ServoAutomaton, gap: float, theta_d0: float) -> Array:
-    """State at rest: motor at 0, screw at `theta_d0` clamped into the gap, structure in equilibrium."""
-    if not np.isfinite(theta_d0):
-        raise InvalidInput(f"theta_d0 = {theta_d0} rad: must be finite")
-    state = np.zeros(len(loop.automaton.names))
-    screw = float(np.clip(theta_d0, -0.5 * gap, 0.5 * gap))
-    if screw:
-        angle = loop.automaton.index("theta_d")
-        screw, rest = servo.at_rest(screw)
-        state[angle], state[angle + 1 : angle + 1 + rest.size] = screw, rest
-        set_states(loop, state, {"sensed": 0.0 if servo.at_motor else servo.p * screw})
-    return state
-
-
 def at_zero(pieces: PiecewiseCubic) -> Array:
     """Ascending coefficients, about time 0, of the piece in force there."""
     return about(pieces, 0.0)
@@ -288,12 +271,14 @@ def change_controller(
     return _with_states(now, controller, loop(True), {**values, "offset": offset})
 
 
-def law_at_rest(law: LinearLaw, now: LoopState, known: dict[str, float]) -> dict[str, float]:
-    """States of a linear law in the automaton, at rest under the present measurements; some of them given."""
+def law_at_rest(law: LinearLaw, now: LoopState, known: dict[str, float], command: float = 0.0) -> dict[str, float]:
+    """States of a linear law in the automaton, at rest under the present measurements; some of them given, or all of
+    them such that they give a command, where they can."""
     y_motor, y_load = now.output("theta_m"), now.output("sensed")
     by_motor, by_load = law.error
     reference = by_motor * y_motor + by_load * y_load if not known else now.value("reference")
-    resting = law.rest((reference, y_motor, y_load), known)
+    inputs = (reference, y_motor, y_load)
+    resting = holding_states(law, inputs, command) or law.rest(inputs, known)
     return {law_state(name): value for name, value in zip(law.names, resting, strict=True)}
 
 

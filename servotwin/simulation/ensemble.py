@@ -21,6 +21,7 @@ from servotwin.plant.signals import check_gap
 from servotwin.plant.stack import LoopStack, continuous_loops
 from servotwin.simulation.continuous import controller_constants
 from servotwin.simulation.inputs import with_forces
+from servotwin.simulation.start import holding_integral
 
 NOT_NEGATIVE = ("gap", "tolerance", "friction")
 
@@ -124,13 +125,16 @@ class EnsembleMembers:
         automaton = np.array([places.setdefault(pair, len(places)) for pair in pairs])
         loops = continuous_loops([servo for servo, _ in places], [law for _, law in places], shape)
         constants = {name: values[which] for name, values in self.constants.items()} | _constants_of(laws)
-        states = starts_of(loops, automaton, constants)
+        starts = starts_of(loops, automaton, constants)
+        states = starts.states
+        held = [holding_integral(law, each) for law, each in zip(laws, starts.commands.tolist(), strict=True)]
+        states[:, loops.first.automaton.index("integral")] = held
         if shape.friction_feedforward:
             moved = constants["reference"] - np.sum(states * loops.rows["measured_position"][automaton, 0], axis=1)
             fed = np.array([law.friction_feedforward for law in laws])
             states[:, loops.first.automaton.index("friction feedforward")] = fed * np.sign(moved)
         enter = np.array([law.enter for law in laws]) * constants["tolerance"]
-        modes = _modes_at(loops, automaton, states, enter)
+        modes = _modes_at(loops, automaton, states, enter) + starts.sides * loops.first.modes_per_contact
         for name in outputs:
             if name not in loops.rows:
                 raise InvalidInput(f"an ensemble has no output {name!r}; allowed are {', '.join(loops.rows)}")
@@ -356,8 +360,17 @@ def _constants_of(laws: list[Controller]) -> dict[str, Array]:
     return {name: np.array([each[id(law)][name] for law in laws]) for name in controller_constants(laws[0])}
 
 
-def starts_of(loops: LoopStack, which: NDArray[np.int64], constants: dict[str, Array]) -> Array:
-    """(k, n) states at rest, each of the automaton of its number: `plant_start` for many members."""
+class Starts(NamedTuple):
+    """Starts of members: (k, n) states at rest, (k,) commands that keep them there, and (k,) flanks on which the loads
+    hang (0: none)."""
+
+    states: Array
+    commands: Array
+    sides: NDArray[np.int64]
+
+
+def starts_of(loops: LoopStack, which: NDArray[np.int64], constants: dict[str, Array]) -> Starts:
+    """Members at rest, each of the automaton of its number: `plant_start` for many members."""
     names, index = loops.first.automaton.names, loops.first.automaton.index
     states = np.zeros((len(constants["gap"]), len(names)))
     for name, values in constants.items():
@@ -369,12 +382,31 @@ def starts_of(loops: LoopStack, which: NDArray[np.int64], constants: dict[str, A
     angle, rest = (each[which] for each in loops.plants.at_rest())
     states[:, first - 1] = angle * screw
     states[:, first : first + rest.shape[1]] = screw[:, None] * rest
+    commands, sides = np.zeros(len(states)), np.zeros(len(states), dtype=np.int64)
     if "sensed" in names and not loops.plants.at_motor:
         states[:, index("sensed")] = loops.plants.p[which, 0] * states[:, first - 1]
     for follower in ("filtered", "lagging"):
         if follower in names:
             states[:, index(follower)] = np.sum(states * loops.rows["measured_position"][which, 0], axis=1)
-    return states
+    if loops.plants.guide.force:
+        for member, (plant, gap, angle) in enumerate(zip(which, constants["gap"], screw, strict=True)):
+            _hang(loops, int(plant), float(gap), float(angle), member, Starts(states, commands, sides))
+    return Starts(states, commands, sides)
+
+
+def _hang(loops: LoopStack, plant: int, gap: float, screw: float, member: int, starts: Starts) -> None:
+    """Hang the load of a member that a force pushes."""
+    hanging = loops.plants.rest_under_force(plant, gap, screw)
+    if hanging is None:
+        return
+    first = loops.first.automaton.index("theta_d")
+    state = starts.states[member]
+    state[:first], state[first] = hanging.motor, hanging.screw
+    state[first + 1 : first + 1 + hanging.load.size] = hanging.load
+    for name in ("sensed", "filtered", "lagging"):
+        if name in loops.first.automaton.names:
+            state[loops.first.automaton.index(name)] = 0.0
+    starts.commands[member], starts.sides[member] = hanging.command, hanging.side
 
 
 def start_modes(loop: ServoAutomaton, states: Array, enter: float) -> NDArray[np.int64]:

@@ -50,10 +50,16 @@ class RunInputs:
 
 def plant_forces(servo: Plant) -> dict[str, float]:
     """States of a plant's automaton that are constant forces of the plant, by name."""
+    guide, shaft = servo.guide, servo.motor_stribeck
     return {
         "friction": servo.motor_friction,
-        "load force": servo.guide.force,
-        "load friction": servo.guide.friction,
+        "friction drop": shaft.drop,
+        "friction stribeck": shaft.speed,
+        "load force": guide.force,
+        "load friction": guide.friction,
+        "load friction drop": guide.stribeck.drop,
+        "load friction stribeck": guide.stribeck.speed,
+        "drive limit": servo.command_limit or 0.0,
     }
 
 
@@ -61,7 +67,7 @@ def with_forces(constants: dict[str, Array], plants: Sequence[Plant]) -> dict[st
     """Constants of members, with the plants' own forces beside or among them."""
     # Thousands of members share a few plants.
     different = {id(plant): plant for plant in plants}.values()
-    if not any(plant.motor_friction or plant.guide.friction or plant.guide.force for plant in different):
+    if not any(any(plant_forces(plant).values()) for plant in different):
         return constants
     own = {name: np.array([plant_forces(plant)[name] for plant in plants]) for name in plant_forces(plants[0])}
     friction = constants["friction"] + own.pop("friction")

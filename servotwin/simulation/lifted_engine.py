@@ -24,7 +24,7 @@ from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, t
 from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.simulation.continuous import at_zero, plant_start, set_states
+from servotwin.simulation.continuous import at_zero
 from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.lifted import (
     TICKED,
@@ -38,6 +38,7 @@ from servotwin.simulation.lifted import (
 )
 from servotwin.simulation.lifted_output import sample_lifted
 from servotwin.simulation.lifted_tables import KINDS, LiftedLoop, LiftedMemory, Place, Places, fill_here
+from servotwin.simulation.start import plant_start, set_states, started
 
 _ROOM = 4096
 # Ticks, of a run and per piece of the inputs, below which blocks do not pay.
@@ -105,6 +106,16 @@ def places_of(
     )
 
 
+def start_law(state: Array, places: Places, law: Controller, command: float) -> None:
+    """Set the law's states of a run that begins with a command that holds the load."""
+    law_state = started(law, float(state[places.position]), command)
+    state[places.integral] = law_state.integral
+    waiting = range(places.waiting, places.waiting + places.delay) if places.delay else ()
+    for place in (places.voltage, places.rate, *waiting):
+        if place >= 0:
+            state[place] = law_state.voltage
+
+
 def watches_of(plant: ServoAutomaton, controller: Controller, dead_zone: bool, counts: bool = False) -> int:
     """Largest number of quantities that a block must bound."""
     guards = max(len(mode.guards) for mode in plant.automaton.modes)
@@ -157,7 +168,7 @@ class LiftedEngine:
         resolution = self.servo.position_resolution
         counts = resolution > 0.0
         self.places = places_of(self.plant, self.controller, self.delay, degree(self.inputs.reference), counts)
-        start = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
+        start, command, side = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             start[index] = value
         set_states(self.plant, start, constants)
@@ -168,6 +179,7 @@ class LiftedEngine:
                 self.state[follower] = start[self.places.position]
         if self.places.feedforward >= 0:
             self.state[self.places.feedforward] = self.controller.feedforward
+        start_law(self.state, self.places, self.controller, command)
         self.past, self.direction = float(start[self.places.position]), 0.0
         modes, law = len(self.plant.automaton.modes), self.controller.law(None)
         dead_zone = self.inputs.tolerance is not None and bool(np.any(self.inputs.tolerance.coeffs[:, 0] > 0.0))
@@ -178,7 +190,8 @@ class LiftedEngine:
         self.segments = new_segments(self.places.states, _ROOM)
         self.record = new_record(self.places.plant)
         self.scratch = new_scratch(self.tables)
-        self.place = Place(np.array([0, self.plant.mode("held"), 1, 0, 0, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
+        mode = self.plant.mode("held", side)
+        self.place = Place(np.array([0, mode, 1, 0, 0, 0, 0, 0, 0], dtype=np.int64), np.zeros(1))
 
     def advance(self, index: int) -> None:
         """Run from the start to the last sample; `index` must be that one."""

@@ -107,8 +107,9 @@ class Run:
 
         Kinds: contact and release of the backlash (with an elastic screw also hold: the motor stops at the flank),
         stick and slip of the motor under friction (side: its direction; a reversal without a stop is both at once),
-        enter and leave of the dead zone, saturate (side 0: ends; continuous law only), reference and parameter (jumps
-        of the inputs). `state_triggered` is false for those two and for what they flip at once.
+        stribeck (something slides faster than its Stribeck speed, side 0: slower again), limit (of the drive, side 0:
+        ends), enter and leave of the dead zone, saturate (side 0: ends; continuous law only), reference and parameter
+        (jumps of the inputs). `state_triggered` is false for those two and for what they flip at once.
         """
         end = (self.samples - 1) / self.sample_rate
         jumps = [(time, kind, 0, False) for time, kind in self.inputs.jumps(end)]

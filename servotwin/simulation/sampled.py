@@ -31,8 +31,9 @@ from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.simulation.continuous import at_zero, plant_start, set_states
+from servotwin.simulation.continuous import at_zero
 from servotwin.simulation.inputs import RunInputs, quantised
+from servotwin.simulation.start import plant_start, set_states, started
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
 _CHUNK, _LARGEST_CHUNK = 1 << 15, 1 << 16
@@ -63,23 +64,31 @@ class SampledEngine:
         self.plant = sampled_plant(self.servo, degree(self.inputs.gap), bias, friction)
         step, searches = search_step(self.plant.automaton, 1.0 / self.rate)
         self.step, self.tables = step, tables_for(self.plant.automaton, step)
-        self.state = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
+        start = plant_start(self.servo, self.plant, float(self.inputs.gap.value(0.0)), self.theta_d0)
+        self.state = start.state
         for index, value in self.plant.input_values("gap", at_zero(self.inputs.gap)).items():
             self.state[index] = value
         set_states(self.plant, self.state, constants)
-        self.mode, self.base, self.finished = self.plant.mode("held"), 0, False
+        self.mode, self.base, self.finished = self.plant.mode("held", start.side), 0, False
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
-        self.law_state, self.parameters = self._started()
+        self.law_state, self.parameters = self._started(start.command)
         source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
         self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
 
-    def _started(self) -> tuple[Any, Any]:
-        """State of the law at rest, and its parameters, of the kind that this engine's ticks take."""
-        return law.start(float(self.plant.rows["sensed"][0] @ self.state)), self.controller.law(None)
+    def _started(self, command: float) -> tuple[Any, Any]:
+        """State of the law at rest under a command that holds the load, and its parameters, of the kind that this
+        engine's ticks take."""
+        measured = float(self.plant.rows["sensed"][0] @ self.state)
+        return started(self.controller, measured, command), self.controller.law(None)
+
+    @property
+    def _applied(self) -> float:
+        """Command before the first tick."""
+        return float(self.law_state.voltage)
 
     def _make_port(self, searches: int) -> Port:
         names = self.plant.automaton.names
@@ -93,7 +102,7 @@ class SampledEngine:
             self.record_every,
             searches,
             len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
-            np.zeros(self.delay),
+            np.full(self.delay, self._applied),
         )
 
     def _recorded(self) -> list[int]:

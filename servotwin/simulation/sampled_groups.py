@@ -25,7 +25,7 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.stack import LoopStack, sampled_plants
 from servotwin.simulation.ensemble import starts_of
 from servotwin.simulation.lifted import more_segments, new_segments
-from servotwin.simulation.lifted_engine import new_memory, places_of, watches_of
+from servotwin.simulation.lifted_engine import new_memory, places_of, start_law, watches_of
 from servotwin.simulation.lifted_tables import KINDS, Place, Places
 from servotwin.simulation.sampled_members import (
     SampledFamily,
@@ -79,6 +79,9 @@ def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
     law = members.controllers[member]
     if not isinstance(law, Controller) or (law.friction_feedforward != 0.0 and degree(span.shape) > 0):
         return False
+    servo = members.servos[member]
+    if servo.at_motor and servo.guide.force:
+        return False  # the flank on which its load hangs depends on the gap
     ratio = (law.sample_rate or 0.0) / span.rate
     whole = round(ratio)
     return whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
@@ -133,22 +136,27 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     counts = bool(constants["resolution"][0] > 0.0)
     places = places_of(loops.first, laws[0], delay, degree(span.shape), counts)
     states = np.zeros((len(which), places.states))
-    states[:, : places.plant] = starts_of(loops, plant, constants)
+    starts = starts_of(loops, plant, constants)
+    states[:, : places.plant] = starts.states
     for follower in (places.filtered, places.past, places.counted):
         if follower >= 0:
             states[:, follower] = states[:, places.position]
     if places.feedforward >= 0:
         states[:, places.feedforward] = [each.feedforward for each in laws]
+    if starts.commands.any():
+        for state, each, command in zip(states, laws, starts.commands.tolist(), strict=True):
+            start_law(state, places, each, command)
     rates = np.array([rate for _, rate in plant_places])
-    family = _family(loops, rates, list(law_places), places, span, dead_zone)
+    # Loads of one structure hang on one side.
+    family = _family(loops, rates, list(law_places), places, span, dead_zone, int(starts.sides[0]))
     thresholds = [each.thresholds(float(t)) for each, t in zip(laws, constants["tolerance"], strict=True)]
     enter, leave = np.array(thresholds).T.copy()
     order = np.lexsort((law, plant))
     limits = np.zeros((len(which), len(span.outputs)))
-    starts = SampledStarts(
+    begun = SampledStarts(
         order, plant, law, states, constants["reference"], enter, leave, constants["resolution"], limits
     )
-    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone, counts), family, starts)
+    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone, counts), family, begun)
 
 
 def _family(
@@ -158,6 +166,7 @@ def _family(
     places: Places,
     span: SampledSpan,
     dead_zone: bool,
+    side: int,
 ) -> SampledFamily:
     stack, period = loops.automata, 1.0 / rates
     searches = divisors(*speeds(stack.flows), period)
@@ -173,7 +182,7 @@ def _family(
         span.shape.times,
         span.shape.coeffs,
         dead_zone,
-        loops.first.mode("held"),
+        loops.first.mode("held", side),
         len(loops.first.automaton.modes),
     )
 

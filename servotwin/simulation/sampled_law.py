@@ -11,6 +11,7 @@ from servotwin.control.linear_tick import LinearParameters, LinearState
 from servotwin.simulation.inputs import quantised
 from servotwin.simulation.law_ticks import TwoSensors, law_tick_and_record, run_law_ticks
 from servotwin.simulation.sampled import SampledEngine
+from servotwin.simulation.start import linear_start
 from servotwin.simulation.ticks import TickInputs
 
 
@@ -20,8 +21,12 @@ class SampledLawEngine(SampledEngine):
 
     controller: LinearLaw  # type: ignore[assignment]
 
-    def _started(self) -> tuple[LinearState, LinearParameters]:
-        return self.controller.start(*self._present()), _with_arrays(self.controller.parameters())
+    def _started(self, command: float) -> tuple[LinearState, LinearParameters]:
+        return linear_start(self.controller, *self._present(), command), _with_arrays(self.controller.parameters())
+
+    @property
+    def _applied(self) -> float:
+        return float(self.law_state.command)
 
     @property
     def sensors(self) -> TwoSensors:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import Maker, check, key, settings
 from servotwin.config.table import Table
 from servotwin.config.toml import attribute, part, read
 from servotwin.errors import InvalidInput
@@ -15,6 +16,8 @@ from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.trend_settings import TrendSettings, trend_maker, wear
+from servotwin.plant.axis import Axis
+from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.certificate import Demands
@@ -236,8 +239,31 @@ class TwinSettings:
         return replace(self, **changes)
 
 
-def read_twin_settings(table: Table, folder: Path = Path()) -> TwinSettings:
-    """Read [twin] with its inner tables; the method declares the keys of [estimator]."""
+TWIN_UNITS: Mapping[str, Sequence[Maker]] = {"uncertainty": (Uncertainty,), "excitation": (ExcitationSettings,)}
+"""Inner tables of [twin] whose keys are in the units of the servo."""
+
+
+def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None = None) -> TwinSettings:
+    """Read [twin] with its inner tables; the method declares the keys of [estimator].
+
+    Parameters
+    ----------
+    table : Table
+    folder : Path
+        That paths are relative to.
+    plant : Servo or Axis, optional
+        Steps and input bias of the uncertainty that the file does not state are those of the preset `paper` in the
+        axis's own metre and volt; a servo's are as they are.
+    """
     estimator = part(table, "estimator", METHODS[attribute(table, TwinSettings, "method")].settings)
+    given = table.values.get("uncertainty", {})
     settings: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
-    return settings
+    if not isinstance(plant, Axis) or not isinstance(given, Mapping):
+        return settings
+    known, own = settings.uncertainty, scales(plant)
+    changed = {}
+    if not {"step_mm", "step_deg"} & given.keys():
+        changed["step"] = (own.length * known.step[0], own.length * known.step[1])
+    if not set(INPUT_BIAS_KEYS) & given.keys():
+        changed["input_bias"] = (own.voltage * known.input_bias[0], own.voltage * known.input_bias[1])
+    return replace(settings, uncertainty=known.replace(**changed)) if changed else settings

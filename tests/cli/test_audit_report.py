@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from servotwin.cli.audit_report import HEAD, lines_of
+from servotwin.cli.audit_report import HEAD, _sent_update, lines_of
 from servotwin.messages import Cause
 
 SERVO = {
@@ -175,3 +175,9 @@ def test_an_invalid_body_does_not_fail_the_report() -> None:
         update = {"update": found("update", body=body), "answers": [receipt], "effect": None}
         events = [found(kind, "odd", body=body) for kind in ("fallback", "hello", "answer")]
         assert chain(link(1, *of, steps=[update]), events=events)
+
+
+def test_an_update_of_a_cascade_shows_its_numbers() -> None:
+    law = {"type": "cascade", "position_gain": 20.0, "integral_time": 0.0, "integral_only": True}
+    update = {"version": 4, "body": {"setting": {"tolerance": 2e-5, "law": law}}}
+    assert _sent_update(update) == "version 4 sent: dead zone 20 um, position_gain 20"

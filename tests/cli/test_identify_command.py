@@ -93,8 +93,8 @@ def test_json_is_for_machines(folder):
 
 @pytest.mark.slow
 def test_a_log_of_another_maker_needs_a_servo(folder, tmp_path):
-    result = run(folder / "plain.csv")
-    assert (result.exit_code, "give --servo" in result.stderr) == (2, True)
+    with pytest.raises(InvalidInput, match="give --servo"):
+        identify(IdentifyOptions(folder / "plain.csv"))
     (tmp_path / "mine.toml").write_text(Servo.preset("paper").dumps())
     ours, named = (
         identify(IdentifyOptions(folder / "plain.csv", servo=s)) for s in (str(tmp_path / "mine.toml"), "paper")
@@ -176,8 +176,8 @@ BAD = {
     "no rows": (lambda lines: lines[:1], "n >= 16 samples"),
     "blank rows": (lambda lines: [lines[0], "", ""], "n >= 16 samples"),
     "zeros": (lambda _lines: ["\0" * 100], "is not a text file"),
-    "other names": (lambda lines: [lines[0].replace("theta_m_rad", "theta_m_deg"), *lines[1:]], "no theta_m"),
-    "no position": (lambda lines: [lines[0].replace("position_m", "position_mm"), *lines[1:]], "mean 'position_mm'"),
+    "other names": (lambda lines: [lines[0].replace("theta_m_rad", "theta_m_turns"), *lines[1:]], "no theta_m"),
+    "no position": (lambda lines: [lines[0].replace("position_m", "positon_m"), *lines[1:]], "mean 'positon_m'"),
     "no time": (lambda lines: [lines[0].replace("time_s", "t"), *lines[1:]], "column 'time_s' is missing"),
     "a word": (lambda lines: [*lines[:5], "1,two,3,4", *lines[5:]], "no table of numbers"),
     "a short row": (lambda lines: [*lines[:5], "1,2", *lines[5:]], "no table of numbers"),

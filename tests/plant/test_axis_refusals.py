@@ -48,7 +48,26 @@ def cascade(**changes: object) -> st.Cascade:
         ),
         (
             lambda: policy_of(BALL_SCREW.replace(voltage_limit=None), TwinSettings(policy="margin")),
-            "Coulomb friction and constant forces of this axis do not scale",
+            "limit of this axis do not scale",
+        ),
+        (
+            lambda: TWO_MASS.replace(
+                actuator=st.TorqueDrive(0.4, limit=1.0), load=st.Load((5.6,), (0.0,), (0.3,), "rotary", force=-2.0)
+            ),
+            "torque_limit_n_m = 1.0 N m: gives 1 N m, and the load's force takes 2 N m",
+        ),
+        (
+            lambda: st.TorqueDrive(0.4, coulomb=0.2, static=0.1, stribeck=0.1),
+            "static_friction_n_m = 0.1 N m: must be at least coulomb_friction_n_m = 0.2 N m",
+        ),
+        (
+            lambda: st.estimate_gap(
+                st.Window(np.zeros(500), theta_m=np.zeros(500), sample_rate=100.0),
+                TWO_MASS.replace(
+                    load=st.Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.1, static=0.2, stribeck=0.1)
+                ),
+            ),
+            "knows no friction of the load that falls with its speed",
         ),
     ],
 )  # fmt: skip

@@ -69,6 +69,40 @@ AXES = {
         1e-3,
         0.3,
     ),
+    "friction that falls with the speed": (
+        TWO_MASS.replace(
+            actuator=TorqueDrive(J=0.4, lag=1e-3, friction=0.05, coulomb=0.2, static=0.5, stribeck=0.03),
+            load=Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.6, static=0.9, stribeck=0.02),
+            controller=SOFT,
+        ),
+        0.2,
+        0.03,
+    ),
+    "friction that falls, of a motor on a screw": (
+        Axis(
+            DcMotor(5e-6, 12.0, 0.8, 0.1, 1e-3, coulomb=0.01, static=0.015, stribeck=2.0),
+            SCREW,
+            ON_SCREW,
+            Controller(300.0, 900.0, 0.0, 0.1),
+        ),
+        1e-3,
+        0.3,
+    ),
+    "drive with a limit": (
+        TWO_MASS.replace(actuator=TorqueDrive(J=0.4, lag=1e-3, friction=0.05, limit=2.5)),
+        0.2,
+        0.03,
+    ),
+    "velocity drive with a limit": (
+        Axis(VelocityDrive(5e-3, limit=12.0), SCREW, Load((20.0,)), Controller(3e4, 1e4, 0.0, 0.1)),
+        1e-3,
+        0.3,
+    ),
+    "a load that hangs": (
+        TWO_MASS.replace(load=Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.4, force=-2.0), controller=SOFT),
+        0.2,
+        0.03,
+    ),
     "DC motor without inductance": (
         Axis(DcMotor(5e-6, 12.0, 0.8, 0.1), SCREW, ON_SCREW, PAPER.controller),
         1e-3,

@@ -34,8 +34,17 @@ class AxisOracle:
     slips: list[float] = field(default_factory=list)
 
     def start(self) -> Array:
-        """At rest, the motor in the middle of the gap."""
-        return np.zeros(6 + 2 * self.axis.n)
+        """At rest, the motor in the middle of the gap; a pushed load of one mass hangs from its flank at zero."""
+        x = np.zeros(6 + 2 * self.axis.n)
+        load, shaft, p = self.axis.load, self.axis.transmission, self.axis.p
+        if abs(load.force) > (load.static or load.friction):
+            assert self.axis.n == 1
+            assert not self.axis.rigid
+            self.side = -1 if load.force > 0.0 else 1
+            x[3] = 0.5 * self.gap * self.side
+            x[2] = x[3] - load.force / (shaft.k_d * p)
+            x[0] = x[-2] = -p * load.force
+        return x
 
     def motor(self, x: Array, command: float, load: float) -> tuple[float, float]:
         """Rates of the first state and of the speed under a load torque."""
@@ -85,10 +94,15 @@ class AxisOracle:
         m, k, c = self.axis.load.m, self.axis.load.k, self.axis.load.c
         q, v = x[4 : 4 + n], x[4 + n : 4 + 2 * n]
         u, error = self.command(x)
+        u = (
+            u
+            if self.axis.actuator.limit is None
+            else float(np.clip(u, -self.axis.actuator.limit, self.axis.actuator.limit))
+        )
         dx = np.zeros_like(x)
         rigid = self.axis.rigid
         force = 0.0 if rigid else self.force(x)
-        dx[0], dx[1] = self.motor(x, u, -p * force - self.sliding[0] * self.axis.motor_friction)
+        dx[0], dx[1] = self.motor(x, u, -p * force - self.sliding[0] * self.friction(0, x[1]))
         if self.axis.motor_friction and not self.sliding[0]:
             dx[1] = 0.0
         dx[2] = x[1]
@@ -105,12 +119,20 @@ class AxisOracle:
             pull = -k[i] * (q[i] - (q[i - 1] if i else 0.0)) - c[i] * (v[i] - (v[i - 1] if i else 0.0))
             if i + 1 < n:
                 pull += k[i + 1] * (q[i + 1] - q[i]) + c[i + 1] * (v[i + 1] - v[i])
-            pull += self.axis.load.force - self.sliding[1] * self.axis.load.friction if i == n - 1 else 0.0
+            pull += self.axis.load.force - self.sliding[1] * self.friction(1, v[-1]) if i == n - 1 else 0.0
             dx[4 + i], dx[4 + n + i] = v[i], (pull + (force if i == 0 else 0.0)) / m[i]
         if self.axis.load.friction and not self.sliding[1]:
             dx[3 + 2 * n] = 0.0
         dx[-2], dx[-1] = law.Ki * error, (error - x[-1]) / law.Tf
         return dx
+
+    def friction(self, body: int, speed: float = 0.0) -> float:
+        """Friction of motor (0) or last mass (1) at a speed, N m or N; above Coulomb's up to the Stribeck speed."""
+        part = (self.axis.actuator, self.axis.load)[body]
+        coulomb = (self.axis.motor_friction, self.axis.load.friction)[body]
+        if part.static is None:
+            return coulomb
+        return coulomb + (part.static - coulomb) * max(0.0, 1.0 - abs(speed) / part.stribeck)
 
     def run(self, x: Array, begin: float, end: float, times: Array) -> tuple[Array, Array]:
         """State at the end and states at times in [begin, end)."""
@@ -134,7 +156,7 @@ class AxisOracle:
 
     def slide_off(self, x: Array) -> None:
         """What the reference's jump or a contact drives beyond its friction slides at once."""
-        for body, friction in enumerate((self.axis.motor_friction, self.axis.load.friction)):
+        for body, friction in enumerate((self.friction(0), self.friction(1))):
             if friction and not self.sliding[body] and abs(self.driven(body, x)) > friction * (1.0 + 1e-9):
                 self.sliding[body] = int(np.sign(self.driven(body, x)))
 
@@ -151,7 +173,7 @@ class AxisOracle:
         # A motor with friction leaves its flank as it slides off.
         grips = self.side != 0 and rigid and self.axis.motor_friction > 0.0
         chosen = [lambda _t, _x: 1.0] if grips else [apart if self.side == 0 else leaving]
-        for body, friction in enumerate((self.axis.motor_friction, self.axis.load.friction)):
+        for body, friction in enumerate((self.friction(0), self.friction(1))):
             if friction:
                 chosen.append(self.grip(body, friction))
         for each in chosen:
@@ -165,7 +187,7 @@ class AxisOracle:
     def driven(self, body: int, x: Array) -> float:
         """Torque on the motor or force on the last mass without friction."""
         before, self.sliding[body] = self.sliding[body], 2  # neither stuck nor, of no friction, sliding
-        friction = (self.axis.motor_friction, self.axis.load.friction)[body]
+        friction = self.friction(body, x[self.speed(body)])
         inertia = (getattr(self.axis.actuator, "J", 1.0), self.axis.load.m[-1])[body]
         rate = self.rates(0.0, x)[self.speed(body)] * inertia
         self.sliding[body] = before
@@ -181,7 +203,7 @@ class AxisOracle:
         """The mode behind an event."""
         if which:
             body = 0 if self.axis.motor_friction and which == 1 else 1
-            friction = (self.axis.motor_friction, self.axis.load.friction)[body]
+            friction = self.friction(body)
             x[self.speed(body)] = 0.0
             drive = self.driven(body, x)
             stays = self.sliding[body] != 0 and abs(drive) <= friction

@@ -103,7 +103,7 @@ def limit_cycle(
     loop = scaled_loop(servo, gap, tolerance, controller, step)
     law = law_of(servo.controller if controller is None else controller)
     limit = law.voltage_limit
-    if gap == 0.0 and not tolerance and limit is None:
+    if gap == 0.0 and not tolerance and limit is None and servo.command_limit is None:
         return _linear(servo, law)
     try:
         return _searched(loop)

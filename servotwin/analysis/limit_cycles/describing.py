@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.polynomial import polynomial as poly
 
-from servotwin.analysis.limit_cycles.cycle import CycleResult, CycleStatus
+from servotwin.analysis.limit_cycles.cycle import CycleResult, CycleStatus, limit_cycle
 from servotwin.analysis.limit_cycles.orbit import closed_orbit
 from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section
+from servotwin.analysis.limit_cycles.prediction import Prediction
 from servotwin.analysis.limit_cycles.scaled import ScaledLoop, scaled_loop
+from servotwin.analysis.limit_cycles.shaft import shaft_predictions
 from servotwin.control.controller import Controller
 from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
+from servotwin.plant.basis import Play
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
 from servotwin.plant.plants import Plant
@@ -27,28 +29,6 @@ from servotwin.plant.plants import Plant
 _GRID = 500
 # From an amplitude of 1e12 gaps to one that exceeds half the gap by 2.5e-9 of it, where N is 3e-9.
 _ANGLES = (1e-6, math.pi - 1e-4)
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """A solution of N(A) L(j omega) = -1.
-
-    Attributes
-    ----------
-    frequency : float
-        Hz.
-    motor_amplitude : float
-        rad, of the first harmonic of the motor's angle, A: the input of the backlash.
-    amplitude : float
-        m, of the first harmonic of the position: A abs(N(A) G2(j omega)).
-    stable : bool
-        True when a larger amplitude would decay and a smaller one grow, by the describing function.
-    """
-
-    frequency: float
-    motor_amplitude: float
-    amplitude: float
-    stable: bool
 
 
 def play_function(amplitude: float, gap: float) -> complex:
@@ -76,11 +56,14 @@ def predictions(servo: Plant, gap: float, controller: Controller | None = None) 
     Raises
     ------
     InvalidInput
-        The screw is elastic (its load on the motor is no function of theta_d alone), the controller is sampled or
+        The screw is elastic and held in the gap (its load on the motor is no function of theta_d alone), there is
+        friction or a constant force, the controller is sampled or
         saturates, or the gap is not a number above 0.
     """
     law = filtered_pid(servo.controller) if controller is None else controller
     _check(servo, law, gap)
+    if servo.play is Play.FREE:
+        return shaft_predictions(servo, gap, law)
     loop = servo.loop(law)
     solutions = [omega for low, high in _bands(loop) for omega in _solutions(loop, low, high)]
     return tuple(_prediction(servo, loop, gap, omega) for omega in solutions)
@@ -100,17 +83,19 @@ def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
 
 
 def _check(servo: Plant, law: Controller, gap: float) -> None:
-    if not servo.rigid:
+    if servo.play is Play.HELD:
         raise InvalidInput(
-            "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), "
-            "since a load that acts back on the motor only in contact is no function of the screw's angle"
+            "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), or a shaft that is free in "
+            "the gap, since a held load that acts back only in contact is no function of the screw's angle"
         )
-    if servo.at_motor:
+    if servo.at_motor and servo.rigid:
         raise InvalidInput(
             'sensors feedback = "motor": the gap is outside of a loop on the motor\'s encoder, behind a rigid screw'
         )
-    if servo.motor_friction or servo.guide.friction:
-        raise InvalidInput("the describing function is that of the gap alone; the axis has Coulomb friction too")
+    if servo.motor_friction or servo.guide.friction or servo.guide.force:
+        raise InvalidInput("the describing function is that of the gap alone; the axis has friction or a force too")
+    if servo.command_limit is not None:
+        raise InvalidInput(f"actuator limit = {servo.command_limit:g}: the describing function knows no limit")
     if law.voltage_limit is not None:
         raise InvalidInput(
             f"controller voltage_limit = {law.voltage_limit:g} V: the describing function knows no limit"
@@ -209,6 +194,9 @@ def limit_cycle_near(
         Status CYCLE or, when the prediction leads to no orbit, IRREGULAR with the reason.
     """
     law = filtered_pid(servo.controller) if controller is None else controller
+    if servo.play is Play.FREE:
+        # What follows a contact of a shaft is no harmonic: the run from a larger swing leads to the orbit.
+        return limit_cycle(servo, gap, None, controller=law, step=2.0 * prediction.amplitude)
     # Only the scaling is used: this step is never simulated.
     loop = scaled_loop(servo, gap, None, law, step=gap * servo.p)
     start = crest(servo, loop, prediction, law) / loop.unit

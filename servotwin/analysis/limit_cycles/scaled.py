@@ -24,7 +24,7 @@ from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.simulate import Simulation
 
 # Lengths of a symmetric interval are not mirrored.
-_WIDTHS = ("gap", "tolerance", "voltage limit")
+_WIDTHS = ("gap", "tolerance", "voltage limit", "drive limit")
 _SWAPPED = str.maketrans("-+", "+-")
 _ROUNDING = 1e-9
 

@@ -13,6 +13,7 @@ from servotwin.analysis.maps.settings import MapSettings
 from servotwin.control.laws import filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import resolve_plant
+from servotwin.plant.shown import ShownUnit, position_unit
 
 _MAX_VALUES = 4096
 _MAX_PANELS = 36
@@ -30,6 +31,7 @@ class MapOptions:
     estimate_deg: str | None = None
     k_dz: str | None = None
     amplitude_mm: str | None = None
+    amplitude_deg: str | None = None
     enter: float | None = None
     leave: float | None = None
     members: int = 16
@@ -52,7 +54,7 @@ class MapOptions:
         enter = own.enter if self.enter is None else self.enter
         leave = own.leave if self.leave is None else self.leave
         law = own.replace(sample_rate=None, rate_limit=None, enter=enter, leave=leave)
-        axes = self._axes()
+        axes = self._axes(position_unit(servo))
         _check_drawable(axes.shape)
         return MapSettings(
             servo,
@@ -66,27 +68,32 @@ class MapOptions:
             still=None if self.still_um is None else self.still_um * 1e-6,
         )
 
-    def _axes(self) -> Axes:
+    def _axes(self, position: ShownUnit) -> Axes:
         ratios = {"--tolerance": self.tolerance, "--amplitude": self.amplitude}
         physical = {"--gap-deg": self.gap_deg, "--estimate-deg": self.estimate_deg, "--k-dz": self.k_dz}
-        physical["--amplitude-mm"] = self.amplitude_mm
+        steps = {"--amplitude-mm": self.amplitude_mm, "--amplitude-deg": self.amplitude_deg}
+        own = f"--amplitude-{position.name}"
+        for name, text in steps.items():
+            if text is not None and name != own:
+                raise InvalidInput(f"{name}: {self.servo} counts its position in {position.name}; give {own}")
+        physical[own] = steps[own]
         given = [[name for name, text in group.items() if text is not None] for group in (ratios, physical)]
         if all(given):
             raise InvalidInput(
                 f"{given[0][0]} is in units of p b and {given[1][0]} is not: give axes of one kind, {', '.join(ratios)}"
                 f" or {', '.join(physical)}"
             )
-        return self._physical() if given[1] else self._ratios()
+        return self._physical(own, steps[own] or "1", position) if given[1] else self._ratios()
 
     def _ratios(self) -> RatioAxes:
         tolerance = parsed("--tolerance", self.tolerance or TOLERANCE)
         return RatioAxes(tolerance, parsed("--amplitude", self.amplitude or AMPLITUDE))
 
-    def _physical(self) -> PhysicalAxes:
+    def _physical(self, name: str, step: str, position: ShownUnit) -> PhysicalAxes:
         return PhysicalAxes(
             parsed("--gap-deg", self.gap_deg or "10", math.pi / 180.0),
             parsed("--k-dz", self.k_dz or "1"),
-            parsed("--amplitude-mm", self.amplitude_mm or "1", 1e-3),
+            parsed(name, step, position.si_of(1.0)),
             () if self.estimate_deg is None else parsed("--estimate-deg", self.estimate_deg, math.pi / 180.0),
         )
 

@@ -75,6 +75,11 @@ def estimate(
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
     """The motor's angle of a window that can be fitted."""
+    if axis.guide.stribeck.slope:
+        raise InvalidInput(
+            "load static_friction: the estimate of the gap knows no friction of the load that falls with its speed; "
+            "leave static friction and Stribeck speed out of the model for an estimate with Coulomb friction"
+        )
     if isinstance(axis, Servo) or has_servo(axis):
         raise InvalidInput(
             f"method {METHOD!r} is for a shaft that is free in the gap, or one mass behind a rigid transmission: "

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.sobol import sobol
 
@@ -105,13 +106,18 @@ class Uncertainty:
         Range,
         key(
             "step_mm",
+            "step_deg",
             above=0.0,
             help="Range of the steps that the reference makes; one size is as likely as another on a logarithmic "
             "scale.",
         ),
     ] = (1e-4, 2.5e-3)
     input_bias: Annotated[
-        Range, key("input_bias_v", help="Range of the voltage that is added behind the controller.")
+        Range,
+        key(
+            *INPUT_BIAS_KEYS,
+            help="Range of the command that is added behind the controller.",
+        ),
     ] = (0.0, 0.0)
     friction: Annotated[
         Range, key("friction_n_m", minimum=0.0, help="Range of the Coulomb friction on the motor's shaft.")

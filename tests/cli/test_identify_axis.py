@@ -1,0 +1,61 @@
+"""`servotwin identify` on logs of axes made of parts."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import servotwin as st
+from servotwin.cli.identify import IdentifyOptions, identify
+from servotwin.errors import InvalidInput
+from servotwin.logs.columns import SignalTable
+from servotwin.logs.log import read_log, write_log
+
+DRIVE, GAP = st.Axis.preset("two-mass-drive"), math.radians(1.0)
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of a rotary axis as it is recorded, and as another maker writes it: degrees, no metadata."""
+    folder = tmp_path_factory.mktemp("logs")
+    run = st.simulate(DRIVE, 4.0, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=2000.0)
+    write_log(SignalTable(run.columns, {"servo": DRIVE.dumps()}), folder / "own.npz")
+    names = {"time_s": "time_s", "position_deg": "measured_position_rad", "theta_m_deg": "theta_m_rad"}
+    names |= {"reference_deg": "reference_rad", "command_n_m": "command_n_m"}
+    factors = {name: np.degrees(1.0) if name.endswith("deg") else 1.0 for name in names}
+    foreign = {name: factors[name] * run.columns[own] for name, own in names.items()}
+    write_log(SignalTable(foreign, {}), folder / "foreign.npz")
+    write_log(
+        SignalTable({"time_s": run.time, "position_m": run.position, "theta_m_rad": run.theta_m}, {}),
+        folder / "metres.npz",
+    )
+    return folder
+
+
+@pytest.mark.parametrize(("name", "servo"), [("own", None), ("foreign", "two-mass-drive")])
+def test_a_log_of_a_rotary_axis_shows_its_gap(logs: Path, name: str, servo: str | None) -> None:
+    found = identify(IdentifyOptions(logs / f"{name}.npz", servo, start=0.0, duration=3.9))
+    (estimate,) = found.estimates
+    assert estimate.ok
+    assert estimate.interval[0] <= GAP <= estimate.interval[1]
+    assert estimate.gap == pytest.approx(GAP, rel=0.01)
+
+
+def test_a_log_in_degrees_is_the_log_in_radians(logs: Path) -> None:
+    own, foreign = (read_log(logs / f"{name}.npz").table().columns for name in ("own", "foreign"))
+    assert own.keys() == foreign.keys()
+    for name, values in own.items():
+        assert foreign[name] == pytest.approx(values, rel=1e-12, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("name", "servo", "words"),
+    [
+        ("metres", "two-mass-drive", "column 'position_m' is in m, and the machine counts it in rad"),
+        ("own", "ball-screw", "column 'measured_position_rad' is in rad, and the machine counts it in m"),
+    ],
+)
+def test_a_log_of_another_machine_is_refused(logs: Path, name: str, servo: str, words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        identify(IdentifyOptions(logs / f"{name}.npz", servo, start=0.0, duration=2.0))
