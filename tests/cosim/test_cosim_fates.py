@@ -86,7 +86,7 @@ SEEDS = st.integers(0, 2**63)
 
 
 @pytest.mark.slow
-@examples(30)
+@examples(60)
 @given(LINKS, LINKS, SEEDS, TWINS, st.sampled_from([0.0, 4.0]))
 def test_nothing_twice_nothing_older_nothing_unaccounted_for(uplink, downlink, seed, twin, interval_s):
     loop = run(uplink, downlink, seed, twin, interval_s)
