@@ -28,7 +28,18 @@ from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Outbox
-from servotwin.messages import PROTOCOL, Acknowledge, Fallback, Hello, LearntResponse, Message, Request, Setting, Update
+from servotwin.messages import (
+    PROTOCOL,
+    Acknowledge,
+    Fallback,
+    Hello,
+    LearntResponse,
+    Message,
+    Request,
+    Resend,
+    Setting,
+    Update,
+)
 
 
 class ScheduledMessage(NamedTuple):
@@ -169,6 +180,9 @@ class Agent:
             self.outlet.adopt(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
             self._twin_answered(message.servo)
+        if isinstance(message, Resend) and message.servo == self.settings.servo and message.boot is None:
+            # The twin may not know this boot, and cannot tell it from those that have ended meanwhile.
+            return [ScheduledMessage(self.samples, self.hello())]
         return []
 
     def outlet_changed(self) -> None:
