@@ -298,7 +298,7 @@ def search(problem: Problem, gap: float) -> Search:
 def _from_anew(problem: Problem, noise: Autoregression, free: Array, gap: float) -> list[Fit]:
     """Minima from the grid of starts in the noise that was learnt, the best first.
 
-    Minima that were followed from white noise on can have led the model's numbers astray: these begin at the model's own.
+    Minima that were followed from white noise on can have led the model's numbers astray: these begin at its own.
     """
     rate = _SLOWEST * problem.model.speed
     tried = starts(problem, gap)
