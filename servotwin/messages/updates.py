@@ -140,8 +140,7 @@ class UpdateWithNeeds(Update, frozen=True, omit_defaults=True, tag="update/3"):
 
 
 _EVERY_VERSION = frozenset(
-    ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "feedforward")
-    + ("integral_only", "velocity_feedforward", "velocity_time")
+    ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "feedforward", "integral_only", "velocity_feedforward", "velocity_time")
 )
 """Fields of the gains that edges of every version know."""
 _LAW = "law"
