@@ -96,11 +96,6 @@ def identify(
     from servotwin.logs.recordings import RecordingColumns
 
     columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
-    if columns != RecordingColumns() or (servo is None and not describes_its_machine(logs[0])):
-        show_lost_motion(logs, columns, json, page)
-        return
-    if len(logs) > 1:
-        raise InvalidInput("servotwin identify: one log at a time with --servo or a log that describes its servo")
     options = IdentifyOptions(
         log=logs[0],
         servo=servo,
@@ -113,6 +108,19 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
+    if columns != RecordingColumns() or (servo is None and not describes_its_machine(logs[0])):
+        if options != IdentifyOptions(log=logs[0]):
+            raise InvalidInput(
+                "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
+                "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
+            )
+        show_lost_motion(logs, columns, json, page)
+        return
+    if len(logs) > 1 or page is not None:
+        raise InvalidInput(
+            "servotwin identify: with a model (--servo, or the log's own) one log at a time and no --page; give "
+            "--motor and --load for the gap between two encoders alone"
+        )
     show(options, json)
 
 

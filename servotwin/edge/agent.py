@@ -28,7 +28,7 @@ from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Outbox
-from servotwin.messages import PROTOCOL, Acknowledge, Fallback, Hello, LearntResponse, Message, Request, Setting, Update
+from servotwin.messages import Acknowledge, Fallback, Hello, LearntResponse, Message, Request, Setting, Update
 
 
 class ScheduledMessage(NamedTuple):
@@ -196,7 +196,7 @@ class Agent:
         s, p, law = self.settings, self.parameters, self.controller
         # The gains in force, which an earlier boot may have stored, and not the configured ones.
         setting = Setting.of(p.setting.tolerance, None if law is None else gains_of(law))
-        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version, PROTOCOL)
+        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
         """End of the part of a block in which nothing happens: the deadline, or after a change of the reference."""

@@ -16,6 +16,7 @@ from servotwin.logs.columns import LogColumns, SignalTable, parsed
 from servotwin.plant.signals import Array
 
 _ROWS = 50_000  # read or written at a time
+_SAMPLE = 65536  # bytes from which the encoding is guessed
 _LOOKED_AT = 40  # lines from which the layout is guessed
 _METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
 _COMMENTS = ("#", "%", "//")
@@ -58,7 +59,7 @@ def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
     layout = _layout(path)
     wanted = [name for name in layout.names if name in requested]
     metadata = layout.metadata
-    with path.open(encoding=layout.encoding, newline=None) as file:
+    with path.open(encoding=layout.encoding, errors="replace") as file:
         for _ in islice(file, layout.first):
             pass
         if not metadata and layout.names and layout.names[-1] == _METADATA:
@@ -76,34 +77,53 @@ def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
 
 
 def _layout(path: Path) -> _Layout:
-    with path.open("rb") as opened:
-        begin = opened.read(4)
-    encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if begin.startswith(mark)), "utf-8")
-    try:
-        with path.open(encoding=encoding) as file:
-            lines = [line.rstrip("\r\n") for line in islice(file, 4 * _LOOKED_AT)]
-    except UnicodeDecodeError as error:
-        raise InvalidInput(f"log {path}: is not a text file (byte {error.start} is not UTF-8)") from None
+    encoding = _encoding(path)
+    with path.open(encoding=encoding, errors="replace") as file:
+        lines = [line.rstrip("\r\n") for line in islice(file, 4 * _LOOKED_AT)]
     metadata = parsed(lines[0].removeprefix("#")) if lines and lines[0].startswith("#") else {}
     kept = [(place, line) for place, line in enumerate(lines) if line.strip() and not line.startswith(_COMMENTS)]
     if not kept:
         raise InvalidInput(f"log {path}: line 1 must name the columns; the file holds no row")
-    if any("\0" in line for _, line in kept):
-        raise InvalidInput(f"log {path}: is not a text file (line {kept[0][0] + 1} holds binary data)")
     separator = _separator([line for _, line in kept[1:_LOOKED_AT]] or [kept[0][1]])
     comma = separator != "," and any(re.search(r"\d,\d", line) for _, line in kept[1:_LOOKED_AT])
-    first = next((i for i, (_, line) in enumerate(kept) if _numeric(line, separator, comma)), len(kept))
-    names = (
-        _cells(kept[0][1], separator) if first else [f"col{i + 1}" for i in range(len(_cells(kept[0][1], separator)))]
-    )
-    units = _cells(kept[1][1], separator) if first == 2 else []
-    if len(units) == len(names):
-        names = [
-            f"{name} [{unit.strip('[]()')}]" if unit.strip("[]()") else name
-            for name, unit in zip(names, units, strict=True)
-        ]
+    rows = [_cells(line, separator) for _, line in kept]
+    size = _usual_size(rows[1:_LOOKED_AT] or rows)
+    first = next((i for i, cells in enumerate(rows) if _numeric(cells[:size], comma)), len(rows))
+    # Above the names there may be prose.
+    heads = [cells for cells in rows[:first] if len(cells) == size] or rows[: min(first, 1)]
+    names = heads[0] if heads else [f"col{i + 1}" for i in range(size)]
+    if len(heads) > 1 and len(heads[1]) == len(names):
+        names = [_with_unit(name, unit) for name, unit in zip(names, heads[1], strict=True)]
     last = kept[first][0] if first < len(kept) else len(lines)
-    return _Layout(encoding, separator, comma, tuple(names), first > 0, last, metadata)
+    return _Layout(encoding, separator, comma, tuple(names), bool(heads), last, metadata)
+
+
+def _encoding(path: Path) -> str:
+    """UTF-8, UTF-16 by its mark, or Latin-1, in which older programs write degrees and micrometres."""
+    with path.open("rb") as file:
+        begin = file.read(_SAMPLE)
+    for mark, name in _BYTE_ORDER_MARKS.items():
+        if begin.startswith(mark):
+            return name
+    if any(byte < 9 or 13 < byte < 32 for byte in begin):
+        place = next(i for i, byte in enumerate(begin) if byte < 9 or 13 < byte < 32)
+        raise InvalidInput(f"log {path}: is not a text file (byte {place} is binary data)")
+    try:
+        begin.decode("utf-8")
+    except UnicodeDecodeError as error:
+        # The sample may end within a character.
+        return "utf-8" if error.start >= len(begin) - 3 else "latin-1"
+    return "utf-8"
+
+
+def _usual_size(rows: Sequence[Sequence[str]]) -> int:
+    counts = [len(cells) for cells in rows]
+    return max(set(counts), key=counts.count)
+
+
+def _with_unit(name: str, unit: str) -> str:
+    bare = unit.strip("[]()")
+    return f"{name} [{bare}]" if bare else name
 
 
 def _separator(lines: Sequence[str]) -> str | None:
@@ -123,10 +143,9 @@ def _cells(line: str, separator: str | None) -> list[str]:
     return [cell.strip().strip('"') for cell in line.split(separator)]
 
 
-def _numeric(line: str, separator: str | None, comma: bool) -> bool:
+def _numeric(cells: Sequence[str], comma: bool) -> bool:
     """True for a row of which the first cell is a number or a date, and half of all."""
-    cells = [cell for cell in _cells(line, separator) if cell]
-    good = [_number(cell, comma) is not None for cell in cells]
+    good = [_number(cell, comma) is not None for cell in cells if cell]
     return bool(good) and good[0] and 2 * sum(good) >= len(good)
 
 
@@ -183,7 +202,7 @@ def _patiently(
 
 
 def _first_metadata(path: Path, layout: _Layout) -> Mapping[str, Any]:
-    with path.open(encoding=layout.encoding) as file:
+    with path.open(encoding=layout.encoding, errors="replace") as file:
         line = next(islice(file, layout.first, None), "")
     quoted = line.partition(',"')[2].rstrip().removesuffix('"')
     return parsed(quoted.replace('""', '"'))

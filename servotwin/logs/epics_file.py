@@ -47,9 +47,7 @@ def read_epics(path: Path, requested: Collection[str]) -> LogColumns:
     names = [TIME, *events]
     wanted = [name for name in events if name in requested] or list(events)
     time = np.unique(np.concatenate([np.sort(events[name][0]) for name in wanted]))
-    columns: dict[str, Array] = {
-        name: _between(time, *map(np.array, events[name])) for name in wanted if events[name][0]
-    }
+    columns: dict[str, Array] = {name: _between(time, *map(np.array, events[name])) for name in wanted}
     columns[TIME] = time
     chosen = {name: column for name, column in columns.items() if name in requested}
     return LogColumns(chosen, names, {}, {name: text for name, text in damaged.items() if name in chosen})
@@ -57,6 +55,8 @@ def read_epics(path: Path, requested: Collection[str]) -> LogColumns:
 
 def _between(time: Array, at: Array, values: Array) -> Array:
     """Values at other times: interpolated between near events, held before a far one, NaN before the first."""
+    if not at.size:
+        return np.full(time.size, np.nan)
     order = np.argsort(at, kind="stable")
     at, values = at[order], values[order]
     steps = np.diff(at)

@@ -21,7 +21,8 @@ _LEAST = 100  # samples
 _MOST_LOST = 0.5  # of the samples: beyond, the log is not what it seems
 # A number in brackets is a row of a matrix.
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
-_ENDINGS = ("deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n_m", "n")
+# Longer ones first: the end of _n_m is no metre.
+_ENDINGS = ("n_m", "deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n")
 _SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}
 # Names by which columns are found where none is given, in order of preference.
@@ -137,6 +138,8 @@ def _check_left(path: Path, clean: Cleaned, size: int, columns: LogColumns) -> N
 def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[str, str]:
     """Name of the column of each part."""
     result: dict[str, str] = {}
+    if wanted.rate is not None and wanted.time is not None:
+        raise InvalidInput(f"log {path}: --time {wanted.time!r} and --rate {wanted.rate:g}: give one of the two")
     for part in ("time", "motor", "load", "command"):
         given = getattr(wanted, part)
         name = _given(path, part, given, names) if given is not None else _guessed(part, names)
@@ -169,7 +172,7 @@ def _bare(name: str) -> str:
     found = _UNIT.match(name)
     if found:
         return found["name"]
-    ending = next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), None)
+    ending = _ending(name)
     return name[: -len(ending) - 1] if ending else name
 
 
@@ -178,11 +181,18 @@ def _unit(name: str) -> str:
     found = _UNIT.match(name)
     if found:
         return found["unit"].strip()
+    return _ending(name)
+
+
+def _ending(name: str) -> str:
+    """The unit at the end of a name; `theta_m` is a name without one."""
+    if any(name.lower() in guesses for guesses in _GUESSES.values()):
+        return ""
     return next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
 
 
 def _times(path: Path, time: Array | None, unit: str, rate: float | None, size: int) -> Array:
-    if time is not None:
+    if time is not None and rate is None:
         if unit and unit.lower() not in _SECONDS:
             raise InvalidInput(f"log {path}: times in {unit!r}: allowed are {', '.join(_SECONDS)}")
         return time * _SECONDS.get(unit.lower(), 1.0)

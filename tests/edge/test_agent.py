@@ -18,7 +18,6 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.messages import (
-    PROTOCOL,
     Acknowledge,
     Hello,
     Reason,
@@ -149,7 +148,7 @@ def test_updates_are_applied_through_the_guard_and_answered() -> None:
 def test_a_hello_names_the_parameters_in_force() -> None:
     agent = SendingAgent(settings(parameters=Parameters(7, Setting(2e-4))))
     feed(agent, [0.0] * 5)
-    assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, Setting(2e-4), "paper", PROTOCOL)
+    assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, Setting(2e-4), "paper")
 
 
 def test_messages_for_others_are_ignored() -> None:

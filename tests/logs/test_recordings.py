@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from servotwin.cli.app import app
 from servotwin.errors import InvalidInput
 from servotwin.logs.cleaning import cleaned
+from servotwin.logs.columns import SignalTable
+from servotwin.logs.log import read_log, write_log
 from servotwin.logs.recordings import RecordingColumns, read_recording
 
 GAP, RATIO = 0.05, 0.1
@@ -53,6 +55,43 @@ def test_tables_of_text(tmp_path, made):
     bare = tmp_path / "e.dat"
     np.savetxt(bare, values)
     seen(bare, made, RecordingColumns(time="col1", motor="col2", load="col3"))
+
+
+def test_other_encodings_prose_and_units(tmp_path, made):
+    values = rows(made)
+    text = "\n".join(
+        ["Recorded by X, on rig 7", "t [s];Winkel [°];Weg [µm]", *(";".join(f"{x:.9g}" for x in row) for row in values)]
+    )
+    (tmp_path / "a.csv").write_bytes(text.encode("latin-1"))
+    log = seen(tmp_path / "a.csv", made, RecordingColumns(motor="Winkel", load="Weg"))
+    assert (log.recording.motor_unit, log.recording.load_unit) == ("°", "µm")
+    named = np.column_stack([values, values[:, 1]])
+    path = csv(tmp_path / "b.csv", named, "time_s,theta_m,position_mm,command_n_m")
+    assert seen(path, made).columns["command"] == "command_n_m"
+
+
+def test_a_converted_log_keeps_its_first_sample_and_its_metadata(tmp_path, made):
+    columns = {"time_s": made.time, "position_m": made.load, "theta_m_rad": made.motor}
+    described = {"servo": "k = [1, 2, 3]\nname = 'a, b, c'", "window_s": 1.0, "text": "d, e, f, g"}
+    write_log(SignalTable(columns, described), tmp_path / "run.csv")
+    log = read_log(tmp_path / "run.csv")
+    assert log.whole.time.size == made.time.size
+    assert log.metadata == described
+
+
+def test_a_given_rate_takes_the_place_of_times(tmp_path, made):
+    values = rows(made) * [1e3, 1.0, 1.0]
+    path = csv(tmp_path / "a.csv", values, "timestamp,motor,load")
+    assert read_recording(path, RecordingColumns(rate=200.0)).recording.time[-1] == pytest.approx(made.time[-1])
+    with pytest.raises(InvalidInput, match="give one of the two"):
+        read_recording(path, RecordingColumns(rate=200.0, time="timestamp"))
+
+
+def test_options_of_the_other_way_are_refused(tmp_path, made):
+    path = csv(tmp_path / "a.csv", rows(made))
+    result = CliRunner().invoke(app, ["identify", str(path), "--motor", "motor", "--start", "3"])
+    assert result.exit_code == 2
+    assert "need a model of the machine" in result.stderr
 
 
 def test_milliseconds(tmp_path, made):

@@ -125,9 +125,11 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     InvalidInput
         The motor or the load does not move, or the motor never reverses.
     """
-    least = _least_motion(recording)
+    least = _least_motion(recording.motor)
     strokes = strokes_of(recording, least)
     _check(recording, least, strokes.reversals)
+    if float(np.ptp(recording.load)) <= _least_motion(recording.load):
+        return _bound(recording)
     prepared = regression(recording, strokes, 0)
     coarse = _coarse(prepared, least)
     # Until the gap has been taken up once nobody knows where the load is within it.
@@ -146,12 +148,11 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     return replace(found, curves=_curves(recording, prepared, best.model, found, grid, rms))
 
 
-def _least_motion(recording: EncoderRecording) -> float:
-    """Motion of the motor that is more than its encoder's counts and noise."""
-    motor = recording.motor
-    second = np.diff(motor, 2)
+def _least_motion(values: Array) -> float:
+    """Motion that is more than an encoder's counts and noise."""
+    second = np.diff(values, 2)
     noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6.0)
-    return max(_COUNTS * resolution(motor), 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(motor)))
+    return max(_COUNTS * resolution(values), 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(values)))
 
 
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
@@ -178,16 +179,23 @@ def _settled(recording: EncoderRecording, gap: float) -> int | None:
 
 
 def _coarse(prepared: Regression, least: float) -> float:
-    """Gap of the least mean square on a geometric grid, everything else free but the lag."""
+    """Gap of the least sum of squares on a geometric grid, everything else free but the lag.
+
+    Until the first contact the load rests, wherever in the gap: its motion until then counts against the gap.
+    """
     reach = float(np.ptp(prepared.recording.motor))
     grid = np.concatenate([[0.0], np.geomspace(0.1 * least, 0.95 * reach, _GAPS)])
     used = Model("", (RATIO, "offset")).places(prepared)
     squares = []
     for gap in grid:
         values, side = columns(prepared, gap)
-        known = values[:, side != 0]
-        squares.append(float(solved(known @ known.T, used).squares) / max(known.shape[1], 1))
+        known, resting = values[:, side != 0], values[0, side == 0]
+        squares.append(float(solved(known @ known.T, used).squares) + resting.size * _variance(resting))
     return float(grid[int(np.argmin(squares))])
+
+
+def _variance(values: Array) -> float:
+    return float(np.var(values)) if values.size else 0.0
 
 
 def _cycles(prepared: Regression, gap: float) -> tuple[float, ...]:

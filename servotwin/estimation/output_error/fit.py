@@ -21,6 +21,7 @@ _PLACES = tuple(0.1 * step for step in range(-5, 6))  # of the lead's range
 _FIRST, _SECOND = 4, 2  # minima that are followed in white noise, and in the window's own
 _WIDE, _SINGLE_STEPS = 5.0, 8  # of the lead's range
 _SLOWER, _SLOWEST = (0.5,), 0.15  # speeds of the observer over its first
+_AGAIN = ((3, 3), (10, 2))  # steps in the noise that was learnt, from each start of the grid, and minima kept
 _SAME = 0.02  # of a gap: minima that are one
 _GAIN = 1e-3  # of the residual's variance: what a step must promise
 _FLOOR = 1e-3  # of half the gap: the model's own error, which is no noise to learn
@@ -284,7 +285,28 @@ def search(problem: Problem, gap: float) -> Search:
         rate = _SLOWEST * speed
         fits = [descend(problem, fit.values, noise, free, 10, rate) for fit in _distinct(fits)[:_SECOND]]
         fits.sort(key=lambda fit: fit.cost)
+    again = _from_anew(problem, noise, free, gap)
+    if again[0].cost < fits[0].cost:
+        # The noise was learnt from what a worse minimum had left.
+        noise = noise_of(again[0].raw, max(_FLOOR * again[0].values[HALF], 1e-9 * problem.range))
+        again = [descend(problem, fit.values, noise, free, 10, _SLOWEST * speed) for fit in _distinct(again)[:_SECOND]]
+        fits = [descend(problem, fit.values, noise, free, 10, _SLOWEST * speed) for fit in fits]
+    fits = _distinct(sorted([*fits, *again], key=lambda fit: fit.cost))
     return Search(problem, noise, fits[0], tuple(fits[1:]), free)
+
+
+def _from_anew(problem: Problem, noise: Autoregression, free: Array, gap: float) -> list[Fit]:
+    """Minima from the grid of starts in the noise that was learnt, the best first.
+
+    Minima that were followed from white noise on can have led the model's numbers astray: these begin at its own.
+    """
+    rate = _SLOWEST * problem.model.speed
+    tried = starts(problem, gap)
+    for steps, kept in _AGAIN:
+        fits = [descend(problem, values, noise, free, steps, rate) for values in tried]
+        fits = _distinct(sorted(fits, key=lambda fit: fit.cost))[:kept]
+        tried = [fit.values for fit in fits]
+    return fits
 
 
 def one_flank(found: Search) -> tuple[Fit, float]:

@@ -54,6 +54,14 @@ def test_a_load_that_never_follows_is_a_bound():
     assert not math.isfinite(found.interval_motor[1])
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.7, 1.9, 3.1])
+def test_a_short_recording_gives_no_false_bound(shift):
+    time = np.arange(0.0, 4.5, 0.002)
+    motor = 3.0 * np.sin(np.pi * time + shift) + 1.3 * np.sin(5.2 * time + 2.0 * shift)
+    found = estimate_lost_motion(EncoderRecording(time, motor, 0.1 * play(motor, 0.2)))
+    assert found.interval_motor[0] <= 0.2 <= found.interval_motor[1]
+
+
 def test_a_swinging_load_is_no_gap():
     # A resonance in place of a gap: y'' + 2 d w y' + w^2 y = w^2 r m.
     time, motor = swings()
