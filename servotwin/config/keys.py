@@ -78,6 +78,7 @@ class Key:
     dump: Callable[[Any], dict[str, Any]] | None = None
     form: Form | None = None
     in_file: bool = True
+    later: bool = False
 
 
 def key(
@@ -100,6 +101,7 @@ def key(
     parse: Callable[[Table, str, Any, Path], Any] | None = None,
     dump: Callable[[Any], dict[str, Any]] | None = None,
     form: Form | None = None,
+    later: bool = False,
 ) -> Key:
     """Declare the TOML key of an attribute.
 
@@ -133,11 +135,14 @@ def key(
         Keys and values of an attribute that `makers` makes.
     form : Form
         Form in a file of what `parse` converts.
+    later : bool
+        Released versions refuse the key: the default is not written, so that they read a file that does not need it.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key(
         names=names, unit=unit, range=allowed, help=help, table=table, choices=choices, prefix=prefix, switch=switch,
         relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump, form=form,
+        later=later,
     )  # fmt: skip
 
 

@@ -194,7 +194,7 @@ def _whole(table: Table, maker: Maker, folder: Path) -> Any:
 
 
 def values_of(described: Any, maker: Any = None, only: Collection[str] | None = None) -> Values:
-    """The keys and values of a table that reads as these settings; what is None is left out.
+    """The keys and values of a table that reads as these settings; left out is what is None, or a later key's default.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def values_of(described: Any, maker: Any = None, only: Collection[str] | None = 
         given = getattr(described, item.name)
         if item.key.switch:
             here[item.key.switch] = given is not None
-        if given is None:
+        if given is None or (item.key.later and given == item.default):
             continue
         if item.key.prefix is not None:
             here.update({item.key.prefix + name: each for name, each in values_of(given).items()})

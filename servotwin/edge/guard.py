@@ -150,17 +150,17 @@ class Limits:
         integral = self._integral_in_box(getattr(gains, gains.integral), getattr(own, own.integral))
         fed = max(abs(getattr(gains, name)) for name in gains.fed) <= self.feedforward
         ahead = self._allows_motion(gains, own) and self._allows_notch(gains)
-        return scaled and integral and gains.leave <= self.gain_factor * own.leave and fed and ahead
+        return scaled and integral and gains.leave <= _times(self.gain_factor, own.leave) and fed and ahead
 
     def _allows_motion(self, gains: AnyGains, own: AnyGains) -> bool:
         """True where the feedforwards of the reference's motion are in bounds."""
         if isinstance(gains, Gains) and isinstance(own, Gains):
-            kick = abs(gains.velocity_feedforward) <= self.gain_factor * abs(own.Kp) * gains.velocity_time
+            kick = abs(gains.velocity_feedforward) <= _times(self.gain_factor, abs(own.Kp)) * gains.velocity_time
             return kick or gains.velocity_feedforward == 0.0
         if isinstance(gains, CascadeGains) and isinstance(own, CascadeGains):
             # All of the reference's speed is fed forward by a share of one; more would overtake it.
             speed = gains.velocity_feedforward <= max(1.0, own.velocity_feedforward)
-            return speed and gains.acceleration_feedforward <= self.gain_factor * own.acceleration_feedforward
+            return speed and gains.acceleration_feedforward <= _times(self.gain_factor, own.acceleration_feedforward)
         return True
 
     def _allows_notch(self, gains: AnyGains) -> bool:
@@ -186,10 +186,16 @@ class Limits:
         )
 
     def _integral_in_box(self, value: float, own: float) -> bool:
-        return value * own >= 0.0 and abs(value) <= abs(own) * self.integral_factor
+        return value * own >= 0.0 and abs(value) <= _times(self.integral_factor, abs(own))
 
     def _in_box(self, value: float, own: float) -> bool:
-        return value * own >= 0.0 and abs(own) <= self.gain_factor * abs(value) <= self.gain_factor**2 * abs(own)
+        raised, highest = _times(self.gain_factor, abs(value)), _times(self.gain_factor * self.gain_factor, abs(own))
+        return value * own >= 0.0 and abs(own) <= raised <= highest
+
+
+def _times(factor: float, size: float) -> float:
+    """Product of a factor, which may be infinite, and a size: of zero it is zero."""
+    return factor * size if size else 0.0
 
 
 def _in_step(old: float, new: float, smallest: float, factor: float, falls_at_once: bool) -> bool:

@@ -137,6 +137,17 @@ def restore(state: Switch, former: Parameters, here: Instant) -> Transition:
     return _replace(state, new, former.setting.gains, Violation(Cause.DRIVE, 0.0, 0.0), _REFUSE_AFTER_DRIVE_S, here)
 
 
+def refuse_pending(state: Switch, here: Instant) -> Transition:
+    """Refuse the pending update; the parameters in force stay."""
+    return Transition(replace(state, pending=None), _refused_pending(state, state.current, here))
+
+
+def _refused_pending(state: Switch, current: Parameters, here: Instant) -> tuple[Receipt, ...]:
+    if state.pending is None:
+        return ()
+    return (receipt(state.pending.update, Reason.AFTER_FALLBACK, here.sample, current, here),)
+
+
 def _replace(
     state: Switch, new: Parameters, gains: AnyGains | None, violation: Violation, refuse_s: float, here: Instant
 ) -> Transition:
@@ -149,8 +160,7 @@ def _replace(
     message = Fallback(
         here.servo, here.boot, here.sample, *violation, old.version, version, Setting.of(new.setting.tolerance, gains)
     )
-    refused = () if pending is None else (receipt(pending.update, Reason.AFTER_FALLBACK, here.sample, new, here),)
-    return Transition(Switch(new, None, state.fallbacks + 1), (*refused, message))
+    return Transition(Switch(new, None, state.fallbacks + 1), (*_refused_pending(state, new, here), message))
 
 
 def is_safe(old: Parameters, new: Parameters, controller: AnyController | None, error: float | None) -> bool:
@@ -243,9 +253,12 @@ class Supervisor:
         return self._advance(restore(self._state, former, self._here))
 
     def superseded(self) -> Messages:
-        """Fall back, since another edge of the servo has taken over, and its updates are not for this one."""
+        """Fall back where there is a fallback set, since another edge of the servo has taken over.
+
+        The twin's updates are not for this one any more, so the pending one is refused in every case.
+        """
         if self._fallback is None or self.parameters.fallback:
-            return ()
+            return self._advance(refuse_pending(self._state, self._here))
         violation = Violation(Cause.CONFLICT, 0.0, 0.0)
         return self._advance(fall_back(self._state, self._fallback, violation, self._here))
 

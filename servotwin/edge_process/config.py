@@ -91,10 +91,12 @@ class StoredFiles:
             minimum=0,
             help="Largest size of the acknowledged windows that stay, for a twin that was restored from a backup and "
             "asks for them; 0: none.",
+            later=True,
         ),
     ] = 128 * MB
     acknowledged_s: Annotated[
-        float, key(minimum=0.0, help="Time for which they stay; it should reach back to the twin's last backup.")
+        float,
+        key(minimum=0.0, help="Time for which they stay; it should reach back to the twin's last backup.", later=True),
     ] = 172_800.0
 
     def __post_init__(self) -> None:

@@ -139,7 +139,9 @@ class UpdateWithNeeds(Update, frozen=True, omit_defaults=True, tag="update/3"):
     """An update whose `needs` are not empty, as it travels; `servotwin.messages.codec` alone makes and reads it."""
 
 
-_EVERY_VERSION = frozenset(("Kp", "Ki", "Kd", "Tf", "enter", "leave", "feedforward"))
+_EVERY_VERSION = frozenset(
+    ("Kp", "Ki", "Kd", "Tf", "enter", "leave", "feedforward", "integral_only", "velocity_feedforward", "velocity_time")
+)
 """Fields of the gains that edges of every version know."""
 _LAW = "law"
 """Gains of a law other than the filtered PID: edges of versions before would set the dead zone alone."""

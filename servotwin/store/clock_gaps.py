@@ -71,8 +71,19 @@ def _gaps(
     if middle is None:
         yield first.received, last.received
         return
+    if middle.received > last.received:
+        # It came on a clock that was ahead, and was set back since: it is as old as the first one after that.
+        middle = middle._replace(received=_set_back(middle, last, between).received)
     yield from _gaps(middle, last, longest, between)
     yield from _gaps(first, middle, longest, between)
+
+
+def _set_back(ahead: _Receipt, last: _Receipt, between: Callable[[_Receipt, _Receipt], _Receipt | None]) -> _Receipt:
+    """The first message, as far as halving tells, that was received no later than `last`, after one that was."""
+    first, until = ahead, last
+    while (middle := between(first, until)) is not None:
+        first, until = (middle, until) if middle.received > last.received else (first, middle)
+    return until
 
 
 def _receipt(connection: sa.Connection, query: sa.Select[tuple[int, float]], id_: int = 0) -> _Receipt | None:

@@ -128,7 +128,7 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
     except _CALLERS_FAULT:
         raise
     except DBAPIError as error:
-        if _damaged(error.orig):
+        if is_damage(error.orig):
             raise StoreDamaged(f"store {public_address(engine.url)}: is damaged ({error.orig})") from error.orig
         raise _unavailable(engine, str(error.orig)) from error.orig
     except (PoolTimeout, sqlite3.Error) as error:
@@ -140,7 +140,7 @@ def lost_race(error: StoreUnavailable) -> bool:
     return getattr(error.__cause__, "sqlstate", None) in _LOST_RACES
 
 
-def _damaged(error: BaseException | None) -> bool:
+def is_damage(error: BaseException | None) -> bool:
     """Test for the errors of SQLite and PostgreSQL that name damage: CORRUPT, NOTADB; data or index corrupted."""
     code = getattr(error, "sqlite_errorcode", None)
     return (code is not None and code & 0xFF in _SQLITE_DAMAGE) or getattr(error, "sqlstate", None) in _SQL_DAMAGE

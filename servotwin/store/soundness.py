@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sqlite3
 import time
 from contextlib import closing
@@ -14,9 +15,11 @@ import sqlalchemy as sa
 
 from servotwin.messages import MAX_BYTES, InvalidMessage
 from servotwin.messages.codec import decompress
-from servotwin.store.engine import StoreDamaged, sqlite_file, transaction
+from servotwin.store.engine import StoreDamaged, is_damage, sqlite_file, transaction
 from servotwin.store.schema import WINDOWS, bodies, messages
 from servotwin.store.store import Store
+
+log = logging.getLogger(__name__)
 
 _TABLES = ("twins", "states", "contexts", "outgoing", "evidence", "messages", "bodies")
 """By size, the smallest first: in a bounded time as many as possible are checked."""
@@ -75,12 +78,13 @@ def check_pages(store: Store, seconds: float) -> Soundness:
                 if faults:
                     return Soundness(faults, False, checked)
                 checked += 1
-    except sqlite3.OperationalError as error:
-        if time.monotonic() < until:
+    except sqlite3.Error as error:
+        if is_damage(error):
             return Soundness((str(error),), False, checked)
+        # The time is over, or something passes: no free file descriptor, a locked file. The next check tells.
+        if time.monotonic() < until:
+            log.warning("store not checked", extra={"why": str(error)})
         return Soundness((), False, checked)
-    except sqlite3.DatabaseError as error:
-        return Soundness((str(error),), False, checked)
     return Soundness((), True, checked)
 
 

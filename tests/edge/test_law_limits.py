@@ -1,12 +1,15 @@
 """The edge bounds the numbers of every kind of law, and carries them over a restart."""
 
+from math import inf
 from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
 
 from servotwin.control.cascade import Cascade
+from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
+from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
 from servotwin.edge.guard import Instant, Limits, judge
 from servotwin.edge.parameters import Parameters
@@ -113,3 +116,12 @@ def test_limits_on_a_notch_fit_the_rate_of_a_cascade() -> None:
         InvalidInput, match=r"notch_max_hz = 500.0 Hz: must be below half of the controller's 1000.0 Hz"
     ):
         AgentSettings("axis-1", "b1", 1e3, controller=CASCADE, limits=Limits(notch_max_hz=500.0))
+
+
+@pytest.mark.parametrize("own", [Cascade(10.0, 2.0, velocity_gain=0.1), Controller(1.0, 0.0, 0.0, 0.1)])
+def test_an_infinite_factor_allows_a_law_its_own_numbers_and_keeps_zeros(own: AnyController) -> None:
+    limits, gains = Limits(gain_factor=inf, integral_factor=inf), gains_of(own)
+    assert judged(gains, limits, gains) is Reason.APPLIED
+    zero = "acceleration_feedforward" if isinstance(own, Cascade) else "Kd"
+    assert judged(replace(gains, **{zero: 1.0}), limits, gains) is Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(gains, **{gains.scaled[0]: 1e6}), limits, gains) is Reason.APPLIED

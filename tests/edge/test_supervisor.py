@@ -70,6 +70,20 @@ def test_a_limit_cycle_under_an_update_ends_in_the_fallback_set() -> None:
     assert agent.controller == PAPER.replace(Ki=0.0)
 
 
+@pytest.mark.parametrize("fallback", [None, FallbackSet(Setting(0.0))])
+def test_an_edge_that_was_superseded_drops_the_update_that_waits(fallback: FallbackSet | None) -> None:
+    agent = SendingAgent(agent_settings(patience_s=2.0, fallback=fallback))
+    feed(agent, 2.0)
+    agent.absorb_block(*([value] * 200 for value in (1e-3, 0.0, 0.95e-3, 0.0)))  # between the two dead zones
+    assert agent.receive(update(1, 0, 1.0)) == []
+    receipt, *rest = (out.message for out in agent.superseded())
+    assert isinstance(receipt, Receipt)
+    assert (receipt.version, receipt.reason) == (1, Reason.AFTER_FALLBACK)
+    assert len(rest) == (fallback is not None)
+    feed(agent, 5.0)
+    assert agent.parameters.version == (0 if fallback is None else 2)
+
+
 def test_a_calm_loop_is_left_alone() -> None:
     agent = SendingAgent(agent_settings())
     feed(agent, 3.0)

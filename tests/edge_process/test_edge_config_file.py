@@ -175,6 +175,14 @@ def test_a_file_of_the_version_before_is_read_and_written_as_it_was() -> None:
     ):
         gains.update(integral_only=False, velocity_feedforward_v_s_per_m=0.0, velocity_time_s=0.1)
         gains.update(friction_feedforward_v=0.0, notch_hz=0.0, notch_damping=0.5, notch_depth=0.1)
-    before["keep"].update(acknowledged_megabytes=128.0, acknowledged_s=172800.0)
     before["limits"].update(notch_min_hz=0.0, notch_max_hz=0.0, notch_max_damping=0.5)
     assert tomllib.loads(edge_toml(load(folder / "edge.toml"))) == before
+
+
+def test_a_key_that_released_edges_refuse_is_written_only_where_it_says_something() -> None:
+    config = read_config(parse_toml(PLAIN, "edge.toml"))
+    assert "acknowledged" not in edge_toml(config)
+    config = replace(config, files=StoredFiles(acknowledged_s=60.0))
+    assert "acknowledged_s = 60.0" in edge_toml(config)
+    assert "acknowledged_megabytes" not in edge_toml(config)
+    assert again(config) == config

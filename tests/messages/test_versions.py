@@ -38,6 +38,9 @@ NOTCH = msgspec.structs.replace(GAINS, notch_hz=80.0, friction_feedforward=0.1)
 def test_an_update_names_the_fields_that_not_every_edge_knows() -> None:
     assert update().needs == update(None).needs == ()
     assert update(NOTCH).needs == ("friction_feedforward", "notch_hz")
+    # Edges had these before they read `needs`, and most updates set them.
+    known = msgspec.structs.replace(GAINS, integral_only=True, velocity_feedforward=0.5, velocity_time=0.2)
+    assert update(known).needs == ()
 
 
 @pytest.mark.parametrize(("sent", "tag"), [(update(), "update/2"), (update(NOTCH), "update/3")])

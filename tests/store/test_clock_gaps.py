@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+import pytest
 from store_cases import claim, outcome, window
 
 from servotwin.store.clock_gaps import received_before
@@ -50,6 +51,16 @@ def test_a_clock_that_was_set_back_deletes_nothing_new(store: Store) -> None:
         store, [*(0.5 * n for n in range(20)), *(60.0 + 0.5 * n for n in range(4)), *(10.0 + 0.5 * n for n in range(9))]
     )
     assert age_limit(store, 14.5) <= 14.5 - 30.0
+
+
+@pytest.mark.parametrize("ahead", [2.0, 20.0, 365.0])
+@pytest.mark.parametrize("length", [1, 20, 150])
+def test_a_clock_that_was_set_forward_and_back_is_forgotten(ahead: float, length: int) -> None:
+    before, wrong, after = range(200), range(200, 200 + length), range(200 + length, 600)
+    days = [0.5 * n for n in before], [ahead + 0.5 * n for n in wrong], [0.5 * n for n in after]
+    store = filled(open_store("sqlite://"), [day for part in days for day in part])
+    assert math.isclose(age_limit(store, 300.0), 270.0)
+    store.close()
 
 
 def test_few_messages_are_read(store: Store, monkeypatch) -> None:

@@ -102,3 +102,15 @@ def test_a_message_is_posted_to_an_edge_besides_results(store: Store) -> None:
     store.post({"a": b"again"}, 100.0)
     assert [(each.serial, each.body) for each in store.outgoing("a", 0)] == [(1, b"asking"), (2, b"again")]
     assert store.posted(["a", "unknown"]) == {"a": 2}
+
+
+def test_an_error_that_passes_is_no_damage(url: str, caplog: pytest.LogCaptureFixture) -> None:
+    """The file cannot be opened for a moment; the next check finds the store sound."""
+    file = filled(url, 2)
+    store = open_store(url)
+    aside = file.rename(file.with_suffix(".aside"))
+    assert check_pages(store, math.inf) == Soundness((), False, 0)
+    assert "store not checked" in caplog.messages
+    aside.rename(file)
+    assert check_pages(store, math.inf).complete
+    store.close()
