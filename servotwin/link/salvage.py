@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from servotwin.link.outbox import Key
-from servotwin.link.sqlite_file import BESIDE, connect
+from servotwin.link.sqlite_file import AGAIN, BESIDE, connect
 from servotwin.messages import InvalidMessage, WindowMessage, decode
 from servotwin.messages.codec import DEFLATE, MAX_BYTES, decompress
 
@@ -89,7 +89,7 @@ def salvage(path: Path) -> Salvaged:
 def _read_into(found: Salvaged, copy: Path) -> None:
     with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as connection:
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # raises where the first page is damaged
-        acknowledged = set(_rows(connection, "SELECT boot, sequence FROM acknowledged"))
+        acknowledged = set(_rows(connection, f"SELECT boot, sequence FROM acknowledged WHERE at != {AGAIN}"))
         for place, *row in _by_place(connection, _WINDOWS):
             boot, sequence, _, encoding, body = row
             if (boot, sequence) in acknowledged:
