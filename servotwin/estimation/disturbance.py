@@ -80,10 +80,11 @@ def disturbance(window: Window, servo: Plant) -> Disturbance:
     Parameters
     ----------
     window : Window
-        With reference, voltage and theta_m; the voltage as the motor gets it, feedforward included, bias not.
+        With reference, voltage and theta_m; the voltage as commanded, feedforward included, bias not.
     servo : Servo or Axis
-        For its back EMF and pitch.
+        For its back EMF, its pitch, and the limit of its drive.
     """
+    window = window.driven(servo.command_limit)
     effort = math.nan if window.voltage is None else float(np.sqrt(np.mean(window.voltage**2)))
     if holds_position(servo):
         return nothing_known(effort, "a stepper holds its position: its command at rest is no bias")
@@ -113,6 +114,7 @@ def quick_bias(window: Window, servo: Plant) -> tuple[float, float]:
     """
     if holds_position(servo) or any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
         return math.nan, math.inf
+    window = window.driven(servo.command_limit)
     size, least = _sizes(window, scales(servo))
     ends = {last: first for first, last in reversed(_constant(window, size, least))}
     shortest = [(first, last) for last, first in reversed(ends.items())]

@@ -141,6 +141,12 @@ class Window:
         """Copy the window with other samples in some channels; they are validated again."""
         return replace(self, **channels)  # type: ignore[arg-type]
 
+    def driven(self, limit: float | None) -> Window:
+        """The window with the voltage that a drive gives that follows commands up to `limit` (V); None: any command."""
+        if self.voltage is None or limit is None or float(np.max(np.abs(self.voltage))) <= limit:
+            return self
+        return self.replace(voltage=np.clip(self.voltage, -limit, limit))
+
     @property
     def channels(self) -> Mapping[str, Array]:
         """The channels that were measured, by name."""

@@ -108,9 +108,8 @@ def motor_learning_of(servo: Plant, settings: TwinSettings) -> MotorLearning | N
     known = settings.uncertainty
     # Half-widths within which every value is as likely.
     back_emf, lag = known.k_B / math.sqrt(3.0), known.k_T / math.sqrt(3.0)
-    return MotorLearning(
-        model, settings.learning, max(back_emf, settings.learning.motor_floor), max(lag, settings.learning.motor)
-    )
+    back_emf, lag = max(back_emf, settings.learning.motor_floor), max(lag, settings.learning.motor)
+    return MotorLearning(model, settings.learning, back_emf, lag, servo.command_limit)
 
 
 def known_gap(gap: SignalLike, duration: float) -> Estimator:

@@ -1,5 +1,6 @@
 """Input bias and noise from the rest in a window: simulated loops, windows made by hand, and refusals."""
 
+import dataclasses
 import math
 from functools import cache
 
@@ -7,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from servotwin.estimation.disturbance import SHORTEST, Disturbance, disturbance
+from servotwin.estimation.disturbance import SHORTEST, Disturbance, disturbance, quick_bias
 from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -81,6 +83,14 @@ def by_hand(voltage, position=None, theta_m=None, reference=None) -> Window:
     still = np.zeros(voltage.size)
     given = (position, theta_m, voltage, reference)
     return Window(*(still if value is None else value for value in given), sample_rate=RATE)
+
+
+def test_of_a_command_beyond_the_drive_s_limit_the_drive_s_part_counts():
+    """A motor that an input bias holds against all that its drive gives."""
+    axis = Axis.preset("ball-screw")
+    axis = axis.replace(actuator=dataclasses.replace(axis.actuator, limit=3.0))
+    window = by_hand(np.full(5000, 8.0))
+    assert disturbance(window, axis).bias == quick_bias(window, axis)[0] == -3.0
 
 
 def coloured(rng: np.random.Generator, memory: float, size: int) -> np.ndarray:

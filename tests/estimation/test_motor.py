@@ -7,10 +7,12 @@ import pytest
 from scaling import scaled
 from scipy.linalg import expm
 
-from servotwin import Servo, SquareWave, Window, simulate
+from servotwin import Axis, DcMotor, Load, Servo, SquareWave, Transmission, Window, simulate
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.motor import BACK_EMF, BIAS, FRICTION, LearntMotor, MotorLearning, motor_rows
 from servotwin.plant.signals import Array
+from servotwin.twin.estimating import motor_learning_of
+from servotwin.twin.settings import TwinSettings
 
 PAPER = Servo.preset("paper")
 RATE = 5000.0
@@ -90,6 +92,22 @@ def test_friction_and_bias_take_two_directions() -> None:
     assert two.mean == pytest.approx((-0.07, 0.0, torque, bias), abs=2e-4)
     assert two.friction[0] > 0.9 * torque
     assert two.windows == 2
+
+
+@pytest.mark.parametrize("limit", [4.0, 2.0])
+def test_a_drive_that_cuts_the_commands_is_no_other_motor(limit: float) -> None:
+    """Windows hold the law's commands, here up to 7 V; the drive cuts them and the bias together."""
+    motor = DcMotor(PAPER.J, PAPER.R, PAPER.k_T, PAPER.k_B, PAPER.L, limit=limit)
+    load = Load(tuple(PAPER.masses), tuple(PAPER.stiffnesses), tuple(PAPER.dampings))
+    axis = Axis(motor, Transmission(PAPER.p), load, PAPER.controller.replace(sample_rate=RATE))
+    of, bias = motor_learning_of(axis, TwinSettings()), 0.05
+    run = simulate(axis, 9.0, reference=SquareWave(1e-3, 8.0), gap=math.radians(10.0), input_bias=bias)
+    known = learnt([Window.from_run(run, start, 1.0) for start in (3.8, 7.8)], of)
+    off = np.abs(np.array(known.mean) - (0.0, 0.0, 0.0, bias))
+    assert not known.alarm
+    assert np.all(off < 1.96 * np.sqrt(np.diag(known.matrix)))
+    assert off[BACK_EMF] < 1e-4
+    assert known.windows == 2
 
 
 def test_intervals_hold_for_many_motors() -> None:

@@ -37,6 +37,7 @@ _FEWEST = 8  # rows
 _MOST_UNEXPLAINED = 0.1  # of the voltage: with more of it unexplained the window is not of this motor
 _EXACT = 1e-3  # of the voltage: no model is more exact than that
 _WIDE = 10.0  # times the window's voltage: nothing is known of friction and bias before the first window
+_NEAR_LIMIT = 0.1  # of the drive's limit: the input bias may take a command that is so close to it beyond it
 _SURPRISE = 5.0  # standard deviations, of a window's back EMF and lag from what was learnt
 _BIAS_DRIFT, _FRICTION_DRIFT = 1e-3, 0.1  # V/sqrt(s) on the paper's servo: random walk of the bias; over it, friction's
 _DAY_S = 86400.0
@@ -108,15 +109,17 @@ class MotorRows(NamedTuple):
     design: Array
 
 
-def motor_rows(window: Window, servo: Servo) -> MotorRows | None:
+def motor_rows(window: Window, servo: Servo, limit: float | None = None) -> MotorRows | None:
     """Make the equations that a window gives; None where it has too few, or no voltage or angle.
 
     Parameters
     ----------
     window : Window
-        With the voltage as the motor gets it, each value held until the next sample, and the motor's angle.
+        With the commanded voltage, each value held until the next sample, and the motor's angle.
     servo : Servo
         The model; its screw must be rigid, or the load acts back on the motor.
+    limit : float, optional
+        V, largest command that the drive follows; rows that reach close to it do not count. None: any.
     """
     if window.voltage is None or window.theta_m is None or not servo.rigid:
         return None
@@ -131,6 +134,7 @@ def motor_rows(window: Window, servo: Servo) -> MotorRows | None:
     # The speed at every sample, because a reversal anywhere in a filter's reach spoils its friction.
     speed = np.convolve(window.theta_m - window.theta_m[0], filters[1][::-1], mode="valid") / interval
     sliding = _sliding(speed, math.ceil(_REACH * width), _least_speed(window, servo, speed, filters[1]))[::stride]
+    counts = np.logical_and(sliding, _followed(window.voltage, limit, size)[::stride])
     acceleration, jerk = (angle[::stride] @ filters[k] / interval**k for k in (2, 3))
     lag = servo.J * servo.R / servo.k_T
     design = np.column_stack(
@@ -141,9 +145,9 @@ def motor_rows(window: Window, servo: Servo) -> MotorRows | None:
             np.full(volts.size, -1.0),
         ]
     )
-    if int(np.sum(sliding)) < _FEWEST:
+    if int(np.sum(counts)) < _FEWEST:
         return None
-    return MotorRows(volts[sliding], design[sliding])
+    return MotorRows(volts[counts], design[counts])
 
 
 @dataclass(frozen=True)
@@ -157,12 +161,15 @@ class MotorLearning:
     settings : LearningSettings
     back_emf, lag : float
         Relative standard deviations of the model's numbers before any window.
+    limit : float, optional
+        V, largest command that the drive follows; windows hold commands. None: any.
     """
 
     servo: Servo
     settings: LearningSettings
     back_emf: float
     lag: float
+    limit: float | None = None
 
     def updated(self, before: LearntMotor | None, window: Window, now: float) -> LearntMotor | None:
         """Update what is known of the motor by a window.
@@ -180,7 +187,7 @@ class MotorLearning:
         LearntMotor or None
             `before` where the window tells nothing of the motor.
         """
-        rows = motor_rows(window, self.servo)
+        rows = motor_rows(window, self.servo, self.limit)
         if rows is None:
             return before
         delay = _delay_as_lag(self.servo, window.sample_rate)
@@ -298,6 +305,16 @@ def _sliding(speed: Array, reach: int, least: float) -> Array:
     places = np.arange(speed.size)
     first, last = np.maximum(places - reach, 0), np.minimum(places + reach, speed.size - 1)
     return np.asarray((ways != 0.0) & (changes[first] == changes[last]))
+
+
+def _followed(voltage: Array, limit: float | None, size: int) -> Array:
+    """Tell in which stretches of `size` samples the drive follows every command.
+
+    Cutting the commands would not do: the input bias counts before the limit, so that the motor gets none of it there.
+    """
+    cut = np.abs(voltage) > (1.0 - _NEAR_LIMIT) * (math.inf if limit is None else limit)
+    total = np.concatenate(([0], np.cumsum(cut)))
+    return np.asarray(total[size:] == total[:-size])
 
 
 def _least_speed(window: Window, servo: Servo, speed: Array, kernel: Array) -> float:
