@@ -28,7 +28,18 @@ from servotwin.edge.store import ParameterStore
 from servotwin.edge.supervisor import Supervisor
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import Outbox
-from servotwin.messages import Acknowledge, Fallback, Hello, LearntResponse, Message, Request, Setting, Update
+from servotwin.messages import (
+    PROTOCOL,
+    Acknowledge,
+    Fallback,
+    Hello,
+    LearntResponse,
+    Message,
+    Request,
+    Resend,
+    Setting,
+    Update,
+)
 
 
 class ScheduledMessage(NamedTuple):
@@ -169,6 +180,9 @@ class Agent:
             self.outlet.adopt(message)
         if isinstance(message, Acknowledge) and message.servo == self.settings.servo:
             self._twin_answered(message.servo)
+        if isinstance(message, Resend) and message.servo == self.settings.servo and message.boot is None:
+            # The twin may not know this boot, and cannot tell it from those that have ended meanwhile.
+            return [ScheduledMessage(self.samples, self.hello())]
         return []
 
     def outlet_changed(self) -> None:
@@ -196,7 +210,7 @@ class Agent:
         s, p, law = self.settings, self.parameters, self.controller
         # The gains in force, which an earlier boot may have stored, and not the configured ones.
         setting = Setting.of(p.setting.tolerance, None if law is None else gains_of(law))
-        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version)
+        return Hello(s.servo, s.boot, self.time, s.sample_rate, p.version, setting, s.model_version, PROTOCOL)
 
     def _stop(self, reference: "array[float]", done: int) -> int:
         """End of the part of a block in which nothing happens: the deadline, or after a change of the reference."""

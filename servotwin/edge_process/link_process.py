@@ -214,7 +214,7 @@ class LinkProcess:
             self._stopping.wait(received.wait_s if received.messages else max(received.wait_s, _SHORTEST_POLL_S))
 
     def _resend(self, body: bytes) -> None:
-        """Send acknowledged windows again where the twin asks for them; the agent ignores that message."""
+        """Send acknowledged windows again where the twin asks for them; the agent introduces itself again."""
         message = decode(body)
         if isinstance(message, Resend) and message.servo == self._config.agent.servo:
             number = self.outbox.resend(message.asks_for)

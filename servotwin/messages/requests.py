@@ -139,7 +139,8 @@ class Resend(Struct, frozen=True, omit_defaults=True, tag="resend/1"):
     """Request for windows that the twin misses: its store was restored from a backup, or lost them.
 
     An edge keeps windows for a while after they were acknowledged. It sends those that are asked for once more, in the
-    ordinary way, and ignores the rest; there is no answer. The twin stores each window once, whatever it asks for.
+    ordinary way, and ignores the rest. Asked for windows of every boot, it sends a hello too, so that the twin knows
+    which boot is the current one. The twin stores each window once, whatever it asks for.
 
     Attributes
     ----------

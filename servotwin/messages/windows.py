@@ -190,6 +190,8 @@ class Hello(Struct, frozen=True, tag="hello/2"):
         none at this edge.
     model_version : str
         Version of the servo's model on the edge.
+    protocol : int
+        Version of the edge's protocol; 1 where it does not tell.
     """
 
     servo: Name
@@ -199,6 +201,7 @@ class Hello(Struct, frozen=True, tag="hello/2"):
     parameter_version: Count
     setting: Setting
     model_version: Text
+    protocol: Count = 1
 
     def __post_init__(self) -> None:
         require(

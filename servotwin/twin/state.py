@@ -199,6 +199,9 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         Windows in a row whose voltage is not that of the controller stated for them.
     newest : (str, float) or None
         Boot and start (s) of the newest window that was processed.
+    introduced : bool
+        The edge introduces each boot by a hello, so that no window begins one: after a restore, windows come again of
+        boots that ended before it and that the twin does not know.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
     """
@@ -217,10 +220,16 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     responses: ResponseState | None = None
     other_controller: int = 0
     newest: tuple[str, float] | None = None
+    introduced: bool = False
+
+    def is_of_other_boot(self, window: WindowMessage) -> bool:
+        """True for a window of a boot that has ended, or was not introduced though the edge introduces each."""
+        unknown = self.introduced and window.boot != self.versions.boot
+        return unknown or self.versions.has_ended(window.boot)
 
     def has_overtaken(self, window: WindowMessage) -> bool:
-        """True where a newer window was processed before this one."""
-        if self.versions.has_ended(window.boot):
+        """True where a newer window was processed before this one, or it is not of the edge's current boot."""
+        if self.is_of_other_boot(window):
             return True
         return self.newest is not None and window.boot == self.newest[0] and window.start < self.newest[1]
 

@@ -57,6 +57,8 @@ _OVERTAKEN = "a newer window of this servo has come: the setting follows from th
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
+# Protocol from which on an edge sends a hello for every boot, and another where it is asked for windows of every boot.
+_INTRODUCES_ITSELF = 2
 # Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
 _RESTS = 3
 # Windows whose step is remembered.
@@ -175,7 +177,8 @@ class _Learnt(NamedTuple):
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
     """Process a window: estimate, redesign, and request."""
     message, arrived = event.window, event.time
-    state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
+    if not state.is_of_other_boot(message):
+        state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
     state, glance = _glance(model, state, decoded, arrived)
     if glance is None and event.overtaken and event.unseen:
@@ -355,7 +358,8 @@ def _take_hello(state: TwinState, hello: Hello) -> StepResult:
     if versions.has_ended(hello.boot):
         return StepResult(state, (), (hello,))
     known = noted_setting(state.known, hello.parameter_version, hello.setting, hello.parameter_version)
-    return StepResult(replace(state, versions=versions, known=known), (), (hello,))
+    introduced = hello.protocol >= _INTRODUCES_ITSELF
+    return StepResult(replace(state, versions=versions, known=known, introduced=introduced), (), (hello,))
 
 
 def _take_fallback(state: TwinState, fallback: Fallback) -> StepResult:

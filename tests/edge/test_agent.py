@@ -18,10 +18,12 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.messages import (
+    PROTOCOL,
     Acknowledge,
     Hello,
     Reason,
     Receipt,
+    Resend,
     Setting,
     Update,
     WindowMessage,
@@ -148,7 +150,14 @@ def test_updates_are_applied_through_the_guard_and_answered() -> None:
 def test_a_hello_names_the_parameters_in_force() -> None:
     agent = SendingAgent(settings(parameters=Parameters(7, Setting(2e-4))))
     feed(agent, [0.0] * 5)
-    assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, Setting(2e-4), "paper")
+    assert agent.hello() == Hello("axis-1", "b0", 0.5, 10.0, 7, Setting(2e-4), "paper", PROTOCOL)
+
+
+def test_an_edge_introduces_itself_again_where_it_is_asked_for_windows_of_every_boot() -> None:
+    agent = SendingAgent(settings(boot="b1"))
+    feed(agent, [0.0] * 5)
+    assert agent.receive(Resend("axis-1")) == [ScheduledMessage(5, agent.hello())]
+    assert agent.receive(Resend("axis-1", "b0", 3, 4)) == agent.receive(Resend("axis-2")) == []
 
 
 def test_messages_for_others_are_ignored() -> None:

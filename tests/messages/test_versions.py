@@ -64,10 +64,13 @@ def test_an_edge_refuses_an_update_that_needs_what_it_does_not_know() -> None:
     assert set(KNOWN_FIELDS) >= set(update(NOTCH).needs)
 
 
-def test_a_hello_with_more_fields_is_read_and_one_of_another_schema_is_not() -> None:
-    hello = Hello("axis", "b1", 0.0, 10.0, 0, Setting(0.0), "model")
+def test_a_hello_without_a_protocol_is_of_version_1_and_one_with_more_fields_is_read() -> None:
+    hello = Hello("axis", "b1", 0.0, 10.0, 0, Setting(0.0), "model", 2)
     document = msgspec.msgpack.decode(encode(hello))
-    assert decode(msgspec.msgpack.encode({**document, "protocol": 2})) == hello
+    assert document.pop("protocol") == 2
+    read = decode(msgspec.msgpack.encode({**document, "colour": "red"}))
+    assert isinstance(read, Hello)
+    assert read.protocol == 1
     with pytest.raises(InvalidMessage) as error:
         decode(msgspec.msgpack.encode({"type": "hello/9"}))
     assert error.value.refusal is Refusal.UNKNOWN_SCHEMA

@@ -318,6 +318,40 @@ def test_what_is_remembered_is_bounded():
     assert versions.noted(f"boot-{MAX_ENDED_BOOTS}", 7) is versions
 
 
+def hello(boot, time, protocol):
+    return Hello("axis", boot, time, 100.0, 0, Setting(0.0), "m", protocol)
+
+
+def test_after_a_restore_windows_of_a_boot_that_has_ended_meanwhile_do_not_end_the_live_one():
+    twin, _ = make()
+    twin.receive(hello("backup", 0.0, 2), 0.0)
+    twin.receive(window_message(0, 1.0, "backup"), 1.0)
+    twin.receive(window_message(3, 60.0, "live"), 101.0)
+    twin.receive(hello("live", 62.0, 2), 102.0)
+    twin.receive(window_message(7, 500.0, "between"), 103.0)
+    versions = decode_state("axis", twin.state()).versions
+    assert (versions.boot, versions.ended_boots) == ("live", ("backup",))
+    assert [type(each) for each in twin.receive(window_message(4, 70.0, "live"), 104.0)] == [Acknowledge, Update]
+    twin.receive(hello("next", 1.0, 2), 105.0)  # a hello begins a boot as before
+    assert decode_state("axis", twin.state()).versions.boot == "next"
+
+
+def test_a_boot_of_an_edge_that_does_not_introduce_itself_again_begins_with_its_first_window():
+    """Edges before protocol 2 send no window of an ended boot once more, and no hello after a restore."""
+    twin, _ = make()
+    twin.receive(hello("backup", 0.0, 1), 0.0)
+    twin.receive(window_message(0, 1.0, "backup"), 1.0)
+    assert [type(each) for each in twin.receive(window_message(3, 60.0, "live"), 101.0)] == [Acknowledge, Update]
+
+
+def test_a_state_from_before_boots_were_introduced_is_read():
+    twin, _ = make()
+    twin.receive(window_message(0, 1.0), 2.0)
+    document = msgspec.msgpack.decode(twin.state())
+    assert document.pop("introduced") is False
+    assert encode_state(decode_state("axis", msgspec.msgpack.encode(document))) == twin.state()
+
+
 def test_what_runs_is_remembered_however_many_updates_follow():
     twin, _ = make()
     twin.receive(Hello("axis", "boot-1", 0.0, 100.0, 3, Setting(1e-5), "m"), 0.0)
