@@ -60,6 +60,15 @@ def fits(controller: AnyController, gains: AnyGains) -> bool:
     return isinstance(gains, _KINDS[type(controller)])
 
 
+def holds(controller: AnyController, gains: AnyGains | None) -> bool:
+    """True where `with_gains` makes a controller."""
+    try:
+        with_gains(controller, gains)
+    except InvalidInput:
+        return False
+    return True
+
+
 def read_gains(table: Table, running: AnyController) -> AnyGains:
     """The gains that a table gives, with those of the running controller for the others."""
     if isinstance(running, LinearLaw):
@@ -73,11 +82,20 @@ def has_gains(table: Table, kind: type = Controller) -> bool:
 
 
 def written_gains(gains: AnyGains, running: AnyController | None = None) -> Values:
-    """The keys and values of a table that `read_gains` reads as these gains."""
+    """The keys and values of a table that `read_gains` reads as these gains.
+
+    Raises
+    ------
+    InvalidInput
+        The gains are those of a linear law, or not those of the running law.
+    """
     if isinstance(gains, Gains):
         written: AnyController = Controller(**msgspec.structs.asdict(gains))
     else:
-        assert running is not None
+        if isinstance(gains, LinearGains):
+            raise InvalidInput(f"gains = {gains!r}: no table holds them, because a linear law is from Python only")
+        if running is None:
+            raise InvalidInput(f"gains = {gains!r}: must come with the law that they belong to")
         written = with_gains(running, gains)
     values = values_of(written, only=settable(type(written)))
     # Where nothing is said of them, a reader takes those of the running law.

@@ -18,6 +18,9 @@ from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import KNOWN_FIELDS, AnyGains, CascadeGains, Gains, LinearGains, Reason, Receipt, Update
 
+# A law whose gain is scaled and whose integral gain is not has its own integral gain but for rounding.
+_ROUNDED = 1.0 + 1e-9
+
 
 @settings("limits")
 @dataclass(frozen=True, slots=True)
@@ -149,7 +152,7 @@ class Limits:
         scaled = all(self._in_box(getattr(gains, name), getattr(own, name)) for name in gains.scaled)
         integral = self._integral_in_box(getattr(gains, gains.integral), getattr(own, own.integral))
         fed = max(abs(getattr(gains, name)) for name in gains.fed) <= self.feedforward
-        ahead = self._allows_motion(gains, own) and self._allows_notch(gains)
+        ahead = self._allows_motion(gains, own) and self._allows_notch(gains, own)
         return scaled and integral and gains.leave <= _times(self.gain_factor, own.leave) and fed and ahead
 
     def _allows_motion(self, gains: AnyGains, own: AnyGains) -> bool:
@@ -163,8 +166,11 @@ class Limits:
             return speed and gains.acceleration_feedforward <= _times(self.gain_factor, own.acceleration_feedforward)
         return True
 
-    def _allows_notch(self, gains: AnyGains) -> bool:
-        if isinstance(gains, LinearGains):
+    def _allows_notch(self, gains: AnyGains, own: AnyGains) -> bool:
+        """True where a notch is in bounds, or the servo's own."""
+        if isinstance(gains, LinearGains) or isinstance(own, LinearGains):
+            return True
+        if all(getattr(gains, name) == getattr(own, name) for name in ("notch_hz", "notch_damping", "notch_depth")):
             return True
         within = self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
         return gains.notch_hz == 0.0 or (within and gains.notch_damping <= self.notch_damping)
@@ -186,7 +192,7 @@ class Limits:
         )
 
     def _integral_in_box(self, value: float, own: float) -> bool:
-        return value * own >= 0.0 and abs(value) <= _times(self.integral_factor, abs(own))
+        return value * own >= 0.0 and abs(value) <= _times(self.integral_factor, abs(own)) * _ROUNDED
 
     def _in_box(self, value: float, own: float) -> bool:
         raised, highest = _times(self.gain_factor, abs(value)), _times(self.gain_factor * self.gain_factor, abs(own))

@@ -21,7 +21,7 @@ from dataclasses import dataclass, replace
 from math import ceil, inf
 from typing import NamedTuple
 
-from servotwin.control.gains import gains_of, with_gains
+from servotwin.control.gains import gains_of, holds, with_gains
 from servotwin.control.laws import AnyController, law_of
 from servotwin.edge.guard import Instant, Limits, is_repeat, judge, receipt, updated_parameters
 from servotwin.edge.parameters import FallbackSet, Parameters
@@ -112,7 +112,7 @@ def apply_pending(state: Switch, rules: Rules, here: Instant, error: float | Non
     if pending is None:
         return Transition(state)
     update, current = pending.update, state.current
-    reason = judge(update, current, rules.limits, here, rules.centre)
+    reason = _judge(update, current, rules, here)
     after = updated_parameters(update, current, here.sample)
     if reason is not Reason.APPLIED:
         return Transition(replace(state, pending=None), (receipt(update, reason, here.sample, current, here),))
@@ -187,9 +187,17 @@ def _thresholds(parameters: Parameters, controller: AnyController | None) -> tup
     return law_of(with_gains(controller, parameters.setting.gains)).thresholds(parameters.setting.tolerance)
 
 
+def _judge(update: Update, current: Parameters, rules: Rules, here: Instant) -> Reason:
+    """Judge as the guard does, and refuse gains of which the controller cannot be made."""
+    reason = judge(update, current, rules.limits, here, rules.centre)
+    if reason is Reason.APPLIED and rules.controller is not None and not holds(rules.controller, update.setting.gains):
+        return Reason.GAINS_OUT_OF_BOUNDS
+    return reason
+
+
 def _judge_with_pending(update: Update, state: Switch, rules: Rules, here: Instant) -> Reason:
-    """Judge as the guard does, and refuse an update that is not newer than the pending one."""
-    reason = judge(update, state.current, rules.limits, here, rules.centre)
+    """Judge as `_judge` does, and refuse an update that is not newer than the pending one."""
+    reason = _judge(update, state.current, rules, here)
     if reason is not Reason.APPLIED or state.pending is None:
         return reason
     other = state.pending.update
@@ -299,12 +307,11 @@ class Supervisor:
         return last["reference"][0] - last["position"][0]
 
     def _first_parameters(self) -> Parameters:
-        """Parameters stored by the last boot, otherwise the configured ones."""
+        """Parameters stored by the last boot, otherwise the configured ones; gains of another law do not count."""
         stored = None if self._store is None else self._store.load()
-        first = self._settings.parameters if stored is None else stored
-        if first.setting.gains is None and self._settings.controller is not None:
-            setting = first.setting.with_gains(gains_of(self._settings.controller))
-            return replace(first, setting=setting)
+        first, controller = self._settings.parameters if stored is None else stored, self._settings.controller
+        if controller is not None and (first.setting.gains is None or not holds(controller, first.setting.gains)):
+            return replace(first, setting=first.setting.with_gains(gains_of(controller)))
         return first
 
     def _new_watch(self) -> Watch | None:

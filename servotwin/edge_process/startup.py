@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from servotwin.control.gains import holds
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import FileParameterStore
@@ -109,12 +110,13 @@ def stored_parameters(path: Path) -> Parameters | None:
 
 
 def permitted(stored: Parameters | None, agent: AgentSettings) -> Parameters | None:
-    """Return the parameters of an earlier start where today's limits would allow an update to them; else None."""
-    if stored is None or stored.fallback:
-        return stored
+    """Return the parameters of an earlier start where today's limits and law allow an update to them; else None."""
+    if stored is None:
+        return None
     centre, gains = Rules(agent.limits, agent.controller, agent.own).centre, stored.setting.gains
     good = gains is None or (centre is not None and agent.limits.allows_gains(gains, centre))
-    if good and agent.limits.allows_tolerance(stored.setting.tolerance):
+    allowed = stored.fallback or (good and agent.limits.allows_tolerance(stored.setting.tolerance))
+    if allowed and (agent.controller is None or holds(agent.controller, gains)):
         return stored
     log("last parameters not allowed any more", version=stored.version, tolerance_m=stored.setting.tolerance)
     return None

@@ -2,7 +2,8 @@
 
 SQLite finds a row by its place through the table's tree: a damaged page hides the rows on it and below it, and no
 others. The keys of all windows are in an index too, on other pages; so what is lost is known where that can be read.
-Only a copy is opened. Where the first page is damaged, that of an empty outbox replaces it there.
+A copy is opened; where its first page is damaged, that of an empty outbox replaces it. Without room for a copy the file
+itself is read, without its log, and not changed.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import shutil
 import sqlite3
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -69,31 +70,40 @@ class Salvaged:
 
 
 def salvage(path: Path) -> Salvaged:
-    """Read what can be read of a corrupt outbox; nothing where not even a copy can be made."""
+    """Read what can be read of a corrupt outbox."""
     found = Salvaged()
-    with suppress(OSError), tempfile.TemporaryDirectory(dir=path.parent, prefix=".salvage-") as folder:
-        if path.stat().st_size > _MOST_COPIED:
-            return found
+    with (
+        suppress(OSError, sqlite3.Error),
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=".salvage-") as folder,
+    ):
         copy = Path(folder) / "copy.sqlite"
-        for end in ("", *BESIDE[:1]):  # not the shared memory, which SQLite makes again from the log
-            source = path.with_name(path.name + end)
-            if source.exists():
-                shutil.copyfile(source, copy.with_name(copy.name + end))
-        _read_into(found, copy)
+        _copy(path, copy)
+        _read_into(found, copy.absolute().as_uri())
         if not found.windows and not found.lost:
             _replace_first_page(copy)
-            _read_into(found, copy)
+            _read_into(found, copy.absolute().as_uri())
+        return found
+    # No room for a copy: immutable, so that SQLite writes no file beside it either.
+    if not found.windows and not found.lost:
+        _read_into(found, f"{path.absolute().as_uri()}?mode=ro&immutable=1")
     return found
 
 
-def _read_into(found: Salvaged, copy: Path) -> None:
-    with suppress(sqlite3.Error), closing(sqlite3.connect(copy)) as connection:
+def _copy(path: Path, copy: Path) -> None:
+    if path.stat().st_size > _MOST_COPIED:
+        raise OSError(f"{path}: too large for a copy")
+    for end in ("", *BESIDE[:1]):  # not the shared memory, which SQLite makes again from the log
+        source = path.with_name(path.name + end)
+        if source.exists():
+            shutil.copyfile(source, copy.with_name(copy.name + end))
+
+
+def _read_into(found: Salvaged, address: str) -> None:
+    with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True)) as connection:
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # raises where the first page is damaged
         acknowledged = set(_rows(connection, f"SELECT boot, sequence FROM acknowledged WHERE at != {AGAIN}"))
-        for place, *row in _by_place(connection, _WINDOWS):
+        for place, *row in _by_place(connection, _WINDOWS, lambda row: row[1:3] not in acknowledged):
             boot, sequence, _, encoding, body = row
-            if (boot, sequence) in acknowledged:
-                continue
             if _is_window(place, boot, sequence, encoding, body):
                 found.windows.append((boot, sequence, row[2], encoding, body))
             elif isinstance(boot, str) and isinstance(sequence, int):
@@ -118,15 +128,28 @@ def _rows(connection: sqlite3.Connection, text: str) -> Iterator[tuple[Any, ...]
         yield from connection.execute(text)
 
 
-def _by_place(connection: sqlite3.Connection, text: str) -> list[tuple[Any, ...]]:
-    """Read a table from both ends up to a damaged page, and what is between by places one by one."""
-    rows = {row[0]: row for row in _rows(connection, f"{text} ORDER BY place")}
-    first = max(rows, default=0)
-    later = {row[0]: row for row in _rows(connection, f"{text} WHERE place > {first} ORDER BY place DESC")}
-    last = min(later, default=_last_place(connection, text))
+def _by_place(
+    connection: sqlite3.Connection, text: str, wanted: Callable[[tuple[Any, ...]], bool] = lambda _: True
+) -> list[tuple[Any, ...]]:
+    """Read a table from both ends up to a damaged page, and what is between by places one by one.
+
+    Only the wanted rows are held in memory: the acknowledged windows may be most of a file.
+    """
+    rows, first, last = dict[int, tuple[Any, ...]](), 0, _last_place(connection, text)
+
+    def read(condition: str) -> Iterator[int]:
+        for row in _rows(connection, f"{text} {condition}"):
+            if wanted(row):
+                rows[row[0]] = row
+            yield row[0]
+
+    for first in read("ORDER BY place"):  # noqa: B007
+        pass
+    for last in read(f"WHERE place > {first} ORDER BY place DESC"):  # noqa: B007
+        pass
     for place in range(first + 1, min(last, first + 1 + _MOST_PROBED)):
-        rows |= {row[0]: row for row in _rows(connection, f"{text} WHERE place = {place}")}
-    return [row for _, row in sorted((rows | later).items())]
+        list(read(f"WHERE place = {place}"))
+    return [row for _, row in sorted(rows.items())]
 
 
 def _last_place(connection: sqlite3.Connection, text: str) -> int:

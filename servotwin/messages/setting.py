@@ -101,6 +101,8 @@ class CascadeGains(Struct, frozen=True, tag="cascade"):
             require(getattr(self, name) >= 0.0, f"gains {name} {getattr(self, name)} is negative")
         for name in ("velocity_feedforward", "acceleration_feedforward"):
             require(getattr(self, name) >= 0.0, f"gains {name} {getattr(self, name)} is negative")
+        both = self.velocity_gain > 0.0 or self.integral_time == 0.0
+        require(both, f"gains integral_time {self.integral_time} needs a velocity_gain")
 
     @property
     def integral_gain(self) -> float:

@@ -85,7 +85,7 @@ def _empty(store: Store, old: Sequence[Any]) -> RetentionResult:
     deleted = [row for row in old if not row.stays]
     if deleted:
         ids = [row.id for row in deleted]
-        with transaction(store.engines.writer) as connection:
+        with store.writing() as connection:
             connection.execute(sa.delete(bodies).where(bodies.c.message.in_(ids)))
         _shrink(store)
     return RetentionResult(len(deleted), sum(row.size for row in deleted), len(old) - len(deleted))
@@ -94,7 +94,7 @@ def _empty(store: Store, old: Sequence[Any]) -> RetentionResult:
 def _shrink(store: Store) -> None:
     """Return free pages to the file system; PostgreSQL reuses them by itself."""
     if store.engines.writer.dialect.name == SQLITE:
-        with transaction(store.engines.writer) as connection:
+        with store.writing() as connection:
             # Each step frees one page and returns no row; the driver takes all steps only of a script.
             connection.connection.cursor().executescript(f"PRAGMA incremental_vacuum({_PAGES})")
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TypeVar
 
 import sqlalchemy as sa
@@ -55,10 +56,16 @@ class Store:
     ----------
     engines : Engines
         Of a migrated database, as `open_store` makes them.
+
+    Attributes
+    ----------
+    damaged : bool
+        Set it where the database is found damaged: from then on everything that writes raises StoreUnavailable.
     """
 
     def __init__(self, engines: Engines) -> None:
         self.engines = engines
+        self.damaged = False
 
     @property
     def name(self) -> str:
@@ -152,7 +159,9 @@ class Store:
         backup: the next message gets a serial that the edge does not take for a duplicate.
         """
         messages = self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
-        if not messages and self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
+        if messages or self.damaged:
+            return messages
+        if self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
             self._write(lambda connection: posting.skip_to_serial(connection, servo, after))
         return messages
 
@@ -233,6 +242,14 @@ class Store:
         """JSON texts of contexts by key; unknown keys are left out."""
         return self._read(lambda connection: queries.contexts(connection, keys))
 
+    @contextmanager
+    def writing(self) -> Iterator[sa.Connection]:
+        """Run a block in a transaction that writes; raises StoreUnavailable."""
+        if self.damaged:
+            raise StoreUnavailable(f"store {self.name}: is damaged and not written any more")
+        with transaction(self.engines.writer) as connection:
+            yield connection
+
     def _read(self, action: Callable[[sa.Connection], _Result]) -> _Result:
         with transaction(self.engines.reader) as connection:
             return action(connection)
@@ -241,7 +258,7 @@ class Store:
         """Run the action in a transaction; retry it where it only lost a race with another process."""
         for _ in range(_RACES):
             try:
-                with transaction(self.engines.writer) as connection:
+                with self.writing() as connection:
                     return action(connection)
             except StoreUnavailable as error:
                 if not lost_race(error):

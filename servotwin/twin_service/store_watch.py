@@ -76,8 +76,6 @@ class StoreWatch:
         return await self._guarded(self._commit, result)
 
     async def _guarded(self, write: Callable[[_Record], Awaitable[_Result]], record: _Record) -> _Result:
-        if self.fault:
-            raise StoreUnavailable(f"store {self._store.name}: is damaged and not written any more")
         try:
             return await write(record)
         except StoreDamaged as error:
@@ -148,7 +146,7 @@ class StoreWatch:
 
     def _found(self, result: Soundness) -> None:
         if result.faults and not self.fault:
-            self.fault = result.faults[0]
+            self.fault, self._store.damaged = result.faults[0], True
             log.error("store damaged: it is not written any more", extra={"why": "; ".join(result.faults)})
 
 

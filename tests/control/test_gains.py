@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of, with_gains
+from servotwin.control.gains import gains_of, holds, with_gains, written_gains
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import answer, integrates, scaled, without_integral
 from servotwin.control.running_law import RunningLaw, command_of
@@ -66,6 +66,23 @@ def test_gains_out_of_their_range_are_no_message(text: bytes) -> None:
 def test_gains_of_another_law_are_refused(law: AnyController, gains: AnyGains) -> None:
     with pytest.raises(InvalidInput, match="must be those of a"):
         with_gains(law, gains)
+
+
+def test_a_cascade_cannot_hold_an_integral_without_a_velocity_loop_nor_a_notch_beyond_its_rate() -> None:
+    with pytest.raises(msgspec.ValidationError, match=r"integral_time 0\.5 needs a velocity_gain"):
+        msgspec.json.decode(b'{"type":"cascade","position_gain":1,"integral_time":0.5}', type=CascadeGains)
+    gains = gains_of(CASCADE)
+    assert holds(CASCADE, gains)
+    assert not holds(CASCADE, msgspec.structs.replace(gains, notch_hz=500.0))
+
+
+@pytest.mark.parametrize(
+    ("law", "gains", "words"),
+    [(LINEAR, gains_of(LINEAR), "from Python only"), (None, gains_of(CASCADE), "with the law that they belong to")],
+)
+def test_gains_that_no_table_holds_are_refused(law: AnyController | None, gains: AnyGains, words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        written_gains(gains, law)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])

@@ -25,7 +25,7 @@ ENTRIES = {
 NOT_COUNTED = {
     "types and checks": (
         "messages/checks.py", "messages/setting.py", "estimation/window.py", "estimation/estimate.py",
-        "edge/parameters.py", "control/gains.py",
+        "edge/parameters.py", "control/gains.py", "control/retuning.py",
     ),
     "settings": ("config/", "control/controller.py", "control/laws.py", "edge/settings.py"),
     "plumbing": ("runtime/retry.py",),

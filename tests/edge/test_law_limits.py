@@ -3,21 +3,25 @@
 from math import inf
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
+from sending_agent import SendingAgent
 
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
+from servotwin.control.retuning import scaled
 from servotwin.edge.guard import Instant, Limits, judge
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import FileParameterStore
+from servotwin.edge.store import FileParameterStore, MemoryParameterStore
+from servotwin.edge.supervisor import Rules, Switch, offer
 from servotwin.edge_process.startup import permitted
 from servotwin.errors import InvalidInput
-from servotwin.messages import AnyGains, Gains, Reason, Setting, Update
+from servotwin.messages import AnyGains, Gains, Reason, Receipt, Setting, Update
 
 CASCADE = Cascade(
     20.0,
@@ -29,14 +33,18 @@ CASCADE = Cascade(
     sample_rate=1e3,
 )  # fmt: skip
 LINEAR = LinearLaw([[0.0]], [[2.0, 0.0, -2.0]], [1.0], [3.0, 0.0, -3.0], 1e3, names=("integral",), holds=("integral",))
+PID = Controller(4e3, 1e3, 90.0, 0.02, sample_rate=1e3)
 OWN, LINEAR_OWN = gains_of(CASCADE), gains_of(LINEAR)
 
 
-def judged(gains: AnyGains, limits: Limits, own: AnyGains = OWN, seconds: float = 10.0) -> Reason:
+def updated(gains: AnyGains) -> Update:
     known = (None, None, (None, None))
-    update = Update("axis-1", 1, 0, ("b0", 0), 9.0, *known, "OK", Setting.of(1e-4, gains), 60.0)
+    return Update("axis-1", 1, 0, ("b0", 0), 9.0, *known, "OK", Setting.of(1e-4, gains), 60.0)
+
+
+def judged(gains: AnyGains, limits: Limits, own: AnyGains = OWN, seconds: float = 10.0) -> Reason:
     current = Parameters(setting=Setting.of(1e-4, own))
-    return judge(update, current, limits, Instant("axis-1", "b0", round(seconds * 1000), 1000.0), own)
+    return judge(updated(gains), current, limits, Instant("axis-1", "b0", round(seconds * 1000), 1000.0), own)
 
 
 @pytest.mark.parametrize(
@@ -47,7 +55,7 @@ def judged(gains: AnyGains, limits: Limits, own: AnyGains = OWN, seconds: float 
         ({"position_gain": 80.1}, False),
         ({"position_gain": 4.9}, False),
         ({"velocity_gain": 12.1}, False),
-        ({"velocity_gain": 0.0}, False),
+        ({"velocity_gain": 0.0, "integral_time": 0.0}, False),
         ({"speed_filter": 4.1e-3}, False),
         ({"integral_time": 0.0}, True),
         ({"integral_time": 0.0999}, False),
@@ -81,6 +89,46 @@ def test_the_numbers_of_a_cascade_stay_in_the_box(changes: dict[str, float], ins
 def test_the_numbers_of_a_linear_law_stay_in_the_box(changes: dict[str, float], inside: bool) -> None:
     expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
     assert judged(replace(LINEAR_OWN, **changes), Limits(), LINEAR_OWN) is expected
+
+
+@pytest.mark.parametrize("law", [CASCADE, LINEAR, PID], ids=["cascade", "linear", "pid"])
+def test_the_own_integral_action_is_in_the_box_but_for_rounding(law: AnyController) -> None:
+    """Scaled, an integral gain that stays may be the next number up."""
+    for scale in np.linspace(0.3, 3.7, 50):
+        kept = gains_of(scaled(law, float(scale), (1.0, 1.0), 1.0))
+        assert judged(kept, Limits(), gains_of(law)) is Reason.APPLIED
+
+
+@pytest.mark.parametrize("law", [CASCADE, PID], ids=["cascade", "pid"])
+def test_a_law_keeps_a_notch_of_its_own(law: AnyController) -> None:
+    own = gains_of(law.replace(notch_hz=80.0, notch_damping=0.7))
+    assert judged(own, Limits(), own) is Reason.APPLIED
+    assert judged(replace(own, notch_hz=0.0), Limits(), own) is Reason.APPLIED
+    for other in ({"notch_hz": 81.0}, {"notch_damping": 0.71}, {"notch_depth": 0.2}):
+        assert judged(replace(own, **other), Limits(), own) is Reason.GAINS_OUT_OF_BOUNDS
+
+
+def test_an_update_of_which_the_law_cannot_be_made_is_refused() -> None:
+    """A notch beyond the law's rate."""
+    rules = Rules(Limits(notch_max_hz=inf), CASCADE)
+    here, switch = Instant("axis-1", "b0", 10_000, 1000.0), Switch(Parameters(setting=Setting.of(1e-4, OWN)))
+    gains = replace(OWN, notch_hz=500.0)
+    assert rules.limits.allows_gains(gains, OWN)
+    after = offer(switch, updated(gains), rules, here, None)
+    (answer,) = after.messages
+    assert isinstance(answer, Receipt)
+    assert answer.reason is Reason.GAINS_OUT_OF_BOUNDS
+    assert after.state.current is switch.current
+
+
+@pytest.mark.parametrize("fallback", [False, True])
+def test_stored_gains_of_another_law_do_not_end_the_edge(fallback: bool) -> None:
+    store = MemoryParameterStore()
+    store.save(Parameters(version=7, setting=Setting.of(2e-4, Gains(1.0, 0.0, 0.0, 1.0)), fallback=fallback))
+    agent = SendingAgent(AgentSettings("axis-1", "b1", 1e3, 1.0, controller=CASCADE), store=store)
+    assert agent.controller == CASCADE
+    assert agent.parameters.setting == Setting.of(2e-4, OWN)
+    assert permitted(store.load(), AgentSettings("axis-1", "b1", 1e3, 1.0, controller=CASCADE)) is None
 
 
 def test_gains_of_another_kind_of_law_are_refused() -> None:

@@ -1,6 +1,8 @@
 """An outbox that was corrupted between two runs: what can be read is sent, the rest is counted, the file stays."""
 
+import errno
 import os
+import shutil
 import sqlite3
 from pathlib import Path
 
@@ -8,6 +10,7 @@ import pytest
 from outbox_cases import filled, window
 
 from servotwin.link.outbox_index import AcknowledgedLimits
+from servotwin.link.salvage import salvage
 from servotwin.link.sqlite_outbox import BROKEN, SqliteOutbox
 
 WINDOWS = 80
@@ -50,6 +53,39 @@ def test_damaged_pages_lose_their_own_windows_which_are_counted(tmp_path: Path, 
     again = reopened(path)
     assert (len(again.pending()), again.salvages, again.dropped) == (found.rescued, [], {BROKEN: found.lost})
     again.close()
+
+
+def test_without_room_for_a_copy_the_file_itself_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = filled(tmp_path, WINDOWS)
+    overwrite(path, leaves(path)[3:4])
+    with_room = {row[:2] for row in salvage(path).windows}
+    before = path.read_bytes()
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(shutil, "copyfile", full)
+    box = reopened(path)
+    [found] = box.salvages
+    assert set(box.pending()) == with_room
+    assert found.rescued == WINDOWS - found.lost >= WINDOWS - 8
+    assert found.file.read_bytes() == before
+    box.close()
+
+
+def test_windows_that_were_acknowledged_are_not_salvaged(tmp_path: Path) -> None:
+    path = tmp_path / "outbox.sqlite"
+    box = SqliteOutbox(path, "axis-1", kept=AcknowledgedLimits(10**7, 3600.0))
+    for k in range(WINDOWS):
+        box.put(window(k))
+    for k in (*range(30), *range(50, WINDOWS)):  # the first and the last ones
+        box.remove(("b0", k))
+    box.close()
+    overwrite(path, leaves(path)[-3:-2])
+    found = salvage(path)
+    rescued = {row[:2] for row in found.windows}
+    assert rescued | found.lost == {("b0", k) for k in range(30, 50)}
+    assert len(rescued) >= 12
 
 
 def test_a_damaged_first_page_loses_no_window(tmp_path: Path) -> None:

@@ -5,10 +5,12 @@ import os
 from pathlib import Path
 
 import pytest
-from store_cases import window
+from store_cases import claim, outcome, window
 
 from servotwin.errors import InvalidInput
-from servotwin.store.engine import sqlite_file
+from servotwin.store.claims import StoredClaim
+from servotwin.store.engine import StoreUnavailable, sqlite_file
+from servotwin.store.retention import delete_old_bodies
 from servotwin.store.soundness import (
     Soundness,
     check_bodies,
@@ -102,6 +104,28 @@ def test_a_message_is_posted_to_an_edge_besides_results(store: Store) -> None:
     store.post({"a": b"again"}, 100.0)
     assert [(each.serial, each.body) for each in store.outgoing("a", 0)] == [(1, b"asking"), (2, b"again")]
     assert store.posted(["a", "unknown"]) == {"a": 2}
+
+
+def test_a_damaged_store_is_read_and_not_written(store: Store) -> None:
+    store.put([window()])
+    store.commit([outcome(one) for one in claim(store)], 200.0)
+    before = newest_message(store), store.posted(["a"]), store.claim_of("a"), check_bodies(store, 0, 3)[0].checked
+    store.damaged = True
+    try:
+        for write in (
+            lambda: store.put([window(sequence=1)]),
+            lambda: store.post({"a": b"asking"}, 100.0),
+            lambda: store.raise_claim("a", StoredClaim("run", 1), 1, 100.0),
+            lambda: store.hold("a", 100.0),
+            lambda: delete_old_bodies(store, math.inf),
+        ):
+            with pytest.raises(StoreUnavailable, match="is damaged and not written any more"):
+                write()
+        assert store.outgoing("a", 7) == []  # nor is the next serial raised above those of an earlier life
+    finally:
+        store.damaged = False
+    after = newest_message(store), store.posted(["a"]), store.claim_of("a"), check_bodies(store, 0, 3)[0].checked
+    assert after == before
 
 
 def test_an_error_that_passes_is_no_damage(url: str, caplog: pytest.LogCaptureFixture) -> None:
