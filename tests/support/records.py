@@ -28,9 +28,13 @@ def count_witnessed(fleet: Fleet) -> int:
     return sum(ask(box, "SELECT count(*) FROM witness")[0][0] for box in boxes)
 
 
+# Acknowledged windows stay in an outbox for a while.
+UNACKNOWLEDGED = "(boot, sequence) NOT IN (SELECT boot, sequence FROM acknowledged)"
+
+
 def pending(fleet: Fleet) -> int:
-    """Windows and letters that the edges still keep."""
-    text = "SELECT (SELECT count(*) FROM windows) + (SELECT count(*) FROM letters)"
+    """Windows and letters that the edges have not delivered."""
+    text = f"SELECT (SELECT count(*) FROM windows WHERE {UNACKNOWLEDGED}) + (SELECT count(*) FROM letters)"
     return sum(ask(fleet.folder / servo / "outbox.sqlite", text)[0][0] for servo in fleet.roles)
 
 

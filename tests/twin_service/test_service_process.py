@@ -174,7 +174,10 @@ def test_workers_end_with_a_service_that_is_killed_and_its_work_is_taken_up_agai
     with process(path) as (_running, url), httpx.Client(base_url=url, timeout=PATIENCE) as client:
         until(lambda: client.get("/v1/servos/ax-1", headers=bearer(OPERATOR)).json()["waiting"] == 0)
         links = client.get("/v1/servos/ax-1/audit", headers=bearer(OPERATOR)).json()
-    assert [len([f for f in link["evidence"] if f["kind"] == "estimate"]) for link in links] == [1] * 20
+    # A window that a newer one has overtaken may be stored with a glance alone.
+    processed = [[f["kind"] for f in link["evidence"] if f["kind"] in ("estimate", "glance")] for link in links]
+    assert [len(kinds) for kinds in processed] == [1] * 20
+    assert "estimate" in processed[0]
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import msgspec
 import pytest
 from deployment import Process
 from machines import machine
+from records import UNACKNOWLEDGED
 from services import service
 
 from servotwin.cosim import cosimulate
@@ -138,7 +139,7 @@ def reached(folder: Path) -> int:
 
 def settled(folder: Path) -> bool:
     """True once the edge has sent all windows and all messages are processed."""
-    sent = ask(folder / "axis" / "outbox.sqlite", "select count(*) from windows") == [(0,)]
+    sent = ask(folder / "axis" / "outbox.sqlite", f"select count(*) from windows where {UNACKNOWLEDGED}") == [(0,)]
     return sent and ask(folder / "twin.db", "select count(*) from messages where done is null") == [(0,)]
 
 

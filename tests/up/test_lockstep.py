@@ -132,7 +132,9 @@ def test_deployed_is_simulated(
         encode(decode(encode(update))) for update in loop.updates
     )
     estimates = {key: msgspec.msgpack.decode(body)["estimate"] for key, body in stored(tmp_path, "estimate").items()}
-    assert estimates == {key: msgspec.msgpack.decode(body) for key, body in in_memory(loop).items()}
+    simulated = {key: msgspec.msgpack.decode(body) for key, body in in_memory(loop).items()}
+    # As text: a window that shows nothing has NaN, which equals nothing.
+    assert sorted(map(repr, estimates.items())) == sorted(map(repr, simulated.items()))
     assert len(estimates) == len(loop.windows) >= 5
 
 
