@@ -73,10 +73,21 @@ _UNINFORMATIVE = ("periodic",)
 
 
 class Entry(NamedTuple):
-    """Entry of the index for a window: its size in bytes; True where its reason is one of `_UNINFORMATIVE`."""
+    """Entry of the index for a window.
+
+    Attributes
+    ----------
+    size : int
+        bytes.
+    uninformative : bool
+        Its reason is one of `_UNINFORMATIVE`.
+    again : bool
+        It was acknowledged, and is sent once more because the twin has asked for it.
+    """
 
     size: int
     uninformative: bool
+    again: bool = False
 
 
 def is_uninformative(reason: str) -> bool:
@@ -85,10 +96,14 @@ def is_uninformative(reason: str) -> bool:
 
 
 def excess(index: Mapping[Key, Entry], windows: int, size: int) -> list[Key]:
-    """Choose keys to drop until at most `windows` windows and `size` bytes are left; `index` is in order of age."""
+    """Choose keys to drop until at most `windows` windows and `size` bytes are left; `index` is in order of age.
+
+    Windows that the twin had acknowledged go first, then uninformative ones.
+    """
     over, heavy = len(index) - windows, sum(entry.size for entry in index.values()) - size
     dropped: list[Key] = []
-    for key, entry in sorted(index.items(), key=lambda item: not item[1].uninformative):  # stable: by age within each
+    # Stable: by age within each.
+    for key, entry in sorted(index.items(), key=lambda item: (not item[1].again, not item[1].uninformative)):
         if over <= 0 and heavy <= 0:
             break
         dropped.append(key)

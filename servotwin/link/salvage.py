@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from servotwin.link.outbox import Key
-from servotwin.link.sqlite_file import BESIDE, connect
+from servotwin.link.sqlite_file import AGAIN, BESIDE, connect
 from servotwin.messages import InvalidMessage, WindowMessage, decode
 from servotwin.messages.codec import DEFLATE, MAX_BYTES, decompress
 
@@ -101,7 +101,7 @@ def _copy(path: Path, copy: Path) -> None:
 def _read_into(found: Salvaged, address: str) -> None:
     with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True)) as connection:
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # raises where the first page is damaged
-        acknowledged = set(_rows(connection, "SELECT boot, sequence FROM acknowledged"))
+        acknowledged = set(_rows(connection, f"SELECT boot, sequence FROM acknowledged WHERE at != {AGAIN}"))
         for place, *row in _by_place(connection, _WINDOWS, lambda row: row[1:3] not in acknowledged):
             boot, sequence, _, encoding, body = row
             if _is_window(place, boot, sequence, encoding, body):

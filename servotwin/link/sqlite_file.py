@@ -28,6 +28,8 @@ CREATE TABLE IF NOT EXISTS acknowledged (
 INSERT = "INSERT OR IGNORE INTO windows (boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?)"
 DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
 ACKNOWLEDGE = "INSERT OR REPLACE INTO acknowledged (boot, sequence, at) VALUES (?, ?, ?)"
+AGAIN = -1.0
+"""In place of the time of the acknowledgement: the window is sent once more, because the twin has asked for it."""
 ASKED_FOR = "DELETE FROM acknowledged WHERE boot = ? AND sequence = ?"
 POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
 TAKE = "DELETE FROM letters WHERE digest = ?"

@@ -23,6 +23,7 @@ from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows,
 from servotwin.link.salvage import Salvage, Salvaged, salvage
 from servotwin.link.sqlite_file import (
     ACKNOWLEDGE,
+    AGAIN,
     ASKED_FOR,
     COUNT,
     DELETE,
@@ -50,7 +51,7 @@ _DROPPED = "dropped: "
 class SqliteOutbox:
     """Unacknowledged windows and letters, counts and values; for use from any thread.
 
-    A full outbox drops the oldest uninformative windows first, then the oldest.
+    A full outbox takes back windows that are sent once more, then drops the oldest uninformative ones, then the oldest.
 
     Parameters
     ----------
@@ -121,9 +122,7 @@ class SqliteOutbox:
                 return []
             self._index[key] = Entry(len(body), is_uninformative(window.reason))
             self._unwritten["window", key] = Statement(INSERT, (*key, window.reason, encoding, body))
-            drops = [Dropped(each, FULL) for each in excess(self._index, self._windows, self._size)]
-            for drop in drops:
-                self._forget(drop.key, drop.reason)
+            drops = self._make_room()
             self.flush()
             return drops
 
@@ -156,14 +155,18 @@ class SqliteOutbox:
             return entry is not None
 
     def resend(self, wanted: Callable[[str, int], bool]) -> int:
-        """Put back acknowledged windows for which `wanted(boot, sequence)` is true; return their number."""
+        """Put back acknowledged windows for which `wanted(boot, sequence)` is true, the newest that there is room for.
+
+        Returns their number. They are sent after all others, and the first ones to give way.
+        """
         with self._lock:
             found = [key for key in self._kept.entries if wanted(*key)]
             for key in found:
-                self._index[key] = Entry(self._kept.take(key), uninformative=False)
-                self._unwritten["acknowledged", key] = Statement(ASKED_FOR, key)
+                self._index[key] = Entry(self._kept.take(key), uninformative=False, again=True)
+                self._unwritten["acknowledged", key] = Statement(ACKNOWLEDGE, (*key, AGAIN))
+            self._make_room()
             self.flush()
-            return len(found)
+            return sum(key in self._index for key in found)
 
     def drop(self, key: Key, reason: str) -> None:
         """Drop a window and count it under a reason."""
@@ -179,9 +182,9 @@ class SqliteOutbox:
             self.flush()
 
     def pending(self) -> list[Key]:
-        """Keys of all windows, oldest first."""
+        """Keys of all windows, oldest first; those that are sent once more come last."""
         with self._lock:
-            return list(self._index)
+            return sorted(self._index, key=lambda key: self._index[key].again)
 
     def put_letter(self, body: bytes) -> None:
         """Store a letter (an encoded message); equal letters are stored once."""
@@ -293,7 +296,8 @@ class SqliteOutbox:
         counts: dict[str, int] = dict(connection.execute("SELECT what, number FROM counts").fetchall())
         acknowledged = connection.execute("SELECT boot, sequence, at FROM acknowledged").fetchall()
         times = {(boot, number): at for boot, number, at in acknowledged if (boot, number) in stored}
-        self._kept.load((key, stored.pop(key).size, at) for key, at in times.items())
+        stored |= {key: stored[key]._replace(again=True) for key, at in times.items() if at == AGAIN}
+        self._kept.load((key, stored.pop(key).size, at) for key, at in times.items() if at != AGAIN)
         # Windows of the file first: they are older, and the index is in the order of age.
         self._index = {
             **{key: entry for key, entry in stored.items() if ("window", key) not in self._unwritten},
@@ -375,8 +379,21 @@ class SqliteOutbox:
             self._failed(error)
             return []
 
+    def _make_room(self) -> list[Dropped]:
+        """Drop windows until the limits are met; return them. One that was acknowledged is kept as it was before."""
+        drops = list[Dropped]()
+        for key in excess(self._index, self._windows, self._size):
+            if self._index[key].again:
+                self._keep(key, self._index[key])
+            else:
+                self._forget(key, FULL)
+                drops.append(Dropped(key, FULL))
+        return drops
+
     def _forget(self, key: Key, reason: str | None = None) -> None:
-        self._index.pop(key, None)
+        entry = self._index.pop(key, None)
+        if entry is not None and entry.again:
+            self._unwritten["acknowledged", key] = Statement(ASKED_FOR, key)
         self._unwritten["window", key] = Statement(DELETE, key)
         if reason is not None:
             self._count(_DROPPED + reason)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from servotwin import messages
 from servotwin.errors import InvalidInput
-from servotwin.messages import MAX_BYTES, Message, WindowMessage
+from servotwin.messages import MAX_BYTES, Hello, Message, WindowMessage
 from servotwin.messages.codec import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
@@ -124,7 +124,8 @@ class _Worker:
         if urgency is None:
             decoded: Iterator[tuple[int, Event]] = self._decoded(batch)
         else:
-            decoded = iter(_urgent(list(self._decoded(batch)), self.model.settings.validity, now, urgency))
+            events = list(self._decoded(batch))
+            decoded = iter(_urgent(events, self.state, self.model.settings.validity, now, urgency))
         for message, event in decoded:
             if not self.model.settings.enabled:
                 continue
@@ -157,17 +158,31 @@ class _Worker:
         return True
 
 
+def _newest(events: Sequence[Event], state: TwinState) -> WindowArrival | None:
+    """Newest window of the edge's current boot; None: there is none.
+
+    Windows of ended boots may come last: the twin asks for them again after a restore.
+    """
+    hellos = [event.boot for event in events if isinstance(event, Hello) and not state.versions.has_ended(event.boot)]
+    windows = [event for event in events if isinstance(event, WindowArrival)]
+    if hellos:
+        boot: str | None = hellos[-1]
+    elif state.introduced:
+        boot = state.versions.boot
+    else:
+        boot = next((e.window.boot for e in reversed(windows) if not state.versions.has_ended(e.window.boot)), None)
+    current = (event for event in windows if event.window.boot == boot)
+    return max(current, key=lambda event: event.window.start, default=None)
+
+
 def _urgent(
-    events: Sequence[tuple[int, Event]], validity: float, now: float, urgency: Urgency
+    events: Sequence[tuple[int, Event]], state: TwinState, validity: float, now: float, urgency: Urgency
 ) -> list[tuple[int, Event]]:
     """Events with the receipts first, so that an update names the right base, and windows that come too late marked."""
-    windows = [event for _, event in events if isinstance(event, WindowArrival)]
-    if not windows:
-        return list(events)
-    boot = windows[-1].window.boot
-    newest = max((event for event in windows if event.window.boot == boot), key=lambda event: event.window.start)
-    end = newest.window.start + (newest.window.samples - 1) / newest.window.rate
-    done_at = end + urgency.speed * max(0.0, now + urgency.expected_s - newest.time)
+    newest, done_at = _newest([event for _, event in events], state), 0.0
+    if newest is not None:
+        end = newest.window.start + (newest.window.samples - 1) / newest.window.rate
+        done_at = end + urgency.speed * max(0.0, now + urgency.expected_s - newest.time)
 
     def marked(event: Event) -> Event:
         if not isinstance(event, WindowArrival):

@@ -108,7 +108,8 @@ class SampleTimeLimiter:
     """Rejects windows from the future: the sample time of a boot passes at most `speed` times as fast as time.
 
     The first message of a boot gives its sample time. A hello may advance it: it reports the edge's time when it was
-    sent, while a window may be old.
+    sent, while a window may be old. Once a servo has sent a hello, windows of other boots pass: they are sent again
+    faster than they were recorded, after a restore or an outage, and change no setting.
 
     Parameters
     ----------
@@ -121,10 +122,15 @@ class SampleTimeLimiter:
     def __init__(self, speed: float, slack: float) -> None:
         self._speed, self._slack = speed, slack
         self._boots: OrderedDict[tuple[str, str], _SampleTime] = OrderedDict()
+        self._current: OrderedDict[str, str] = OrderedDict()
 
     def hello(self, servo: str, boot: str, sample_time: float, now: float) -> None:
         """Note the sample time that an edge reports; raises RequestRejected (FUTURE) where no edge runs that long."""
         _check_possible(sample_time)
+        self._current[servo] = boot
+        self._current.move_to_end(servo)
+        if len(self._current) > MAX_SERVOS:
+            self._current.popitem(last=False)
         known = self._boots.get((servo, boot))
         # Forwards only: a hello that was long on its way must not make windows appear early.
         if known is None or sample_time > self._reached(known, now):
@@ -139,6 +145,8 @@ class SampleTimeLimiter:
             FUTURE.
         """
         _check_possible(end)
+        if self._current.get(servo, boot) != boot:
+            return
         known = self._boots.get((servo, boot))
         if known is None:
             self._note(servo, boot, _SampleTime(now, end))

@@ -1,4 +1,4 @@
-"""Windows that never came: holes in the sequences of a boot, for which the edge is asked once."""
+"""Windows that never came: holes in the sequences of a boot, for each of which the edge is asked once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import asyncio
 import logging
 from collections import OrderedDict
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
@@ -26,6 +25,8 @@ _PATIENCE_S = 30.0
 _LOOK_S = 5.0
 _BOOTS = 50
 """Boots that are looked at together: after a start all are due."""
+_RANGES = 8
+"""Requests to an edge at once; the last one asks for windows in between too."""
 _REASON = "windows of this boot did not come"
 Boot = tuple[str, str]
 """(servo, boot)."""
@@ -70,23 +71,35 @@ class SequenceWatch:
         self._boots.move_to_end(boot)
 
     def due(self) -> list[Boot]:
-        """Boots whose sequences are to be looked at, some at a time; each is returned once."""
+        """Boots whose sequences are to be looked at, some at a time; each is due until `looked_at`."""
         now = self._now()
         due = (boot for boot, known in self._boots.items() if known.look_at is not None and known.look_at <= now)
-        boots = list(islice(due, _BOOTS))
-        for boot in boots:
-            self._boots[boot].look_at = None
-        return boots
+        return list(islice(due, _BOOTS))
+
+    def newest(self, boot: Boot) -> int:
+        """Highest sequence of a boot that came; -1: none is known."""
+        known = self._boots.get(boot)
+        return -1 if known is None else known.newest
 
     def to_ask(self, boot: Boot, missing: list[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Those of the missing ranges that were not asked for yet; from now on they were."""
+        """Those of the missing ranges that were not asked for yet."""
         known = self._boots.get(boot)
         if known is None:
             return []
-        new = [(max(first, known.asked + 1), last) for first, last in missing if last > known.asked]
-        if new:
-            known.asked = new[-1][1]
-        return new
+        return [(max(first, known.asked + 1), last) for first, last in missing if last > known.asked]
+
+    def asked(self, boot: Boot, last: int) -> None:
+        """Note that the missing windows up to a sequence were asked for."""
+        if (known := self._boots.get(boot)) is not None:
+            known.asked = max(known.asked, last)
+
+    def looked_at(self, boot: Boot, newest: int) -> None:
+        """Note that everything up to a sequence was asked for: the next look is due after the next hole.
+
+        Where later windows came meanwhile, or the look failed (`newest` is -1), it is due once more after a while.
+        """
+        if (known := self._boots.get(boot)) is not None:
+            known.look_at = None if known.newest == newest else self._now() + _PATIENCE_S
 
 
 class MissingWindows:
@@ -122,19 +135,28 @@ class MissingWindows:
             await self.look()
 
     async def look(self) -> None:
-        """Ask for what is missing of the boots that are due."""
-        for servo, boot in self._sequences.due():
-            with suppress(StoreUnavailable):
-                missing = await self._executor.run(partial(missing_windows, self._store, servo, boot))
-                if new := self._sequences.to_ask((servo, boot), missing):
-                    await self._ask(servo, boot, new)
+        """Ask for what is missing of the boots that are due; what fails is tried again later."""
+        for boot in self._sequences.due():
+            newest = self._sequences.newest(boot)
+            try:
+                missing = await self._executor.run(partial(missing_windows, self._store, *boot))
+                for first, last in _few(self._sequences.to_ask(boot, missing)):
+                    await self._ask(boot, first, last)
+            except StoreUnavailable:
+                newest = -1
+            self._sequences.looked_at(boot, newest)
 
-    async def _ask(self, servo: str, boot: str, missing: list[tuple[int, int]]) -> None:
-        first, last = missing[0][0], missing[-1][1]
-        number = sum(1 + end - begin for begin, end in missing)
+    async def _ask(self, boot: Boot, first: int, last: int) -> None:
+        body = encode(Resend(*boot, first, last, _REASON))
+        await self._executor.run(partial(self._store.post, {boot[0]: body}, self._wall()))
+        self._sequences.asked(boot, last)
+        number = 1 + last - first
         self._metrics.missing.add(by=number)
-        about = {"servo": servo, "boot": boot, "first": first, "last": last, "windows": number}
+        about = {"servo": boot[0], "boot": boot[1], "first": first, "last": last, "windows": number}
         log.warning("windows missing", extra=about)
-        body = encode(Resend(servo, boot, first, last, _REASON))
-        await self._executor.run(partial(self._store.post, {servo: body}, self._wall()))
-        self._notify(servo)
+        self._notify(boot[0])
+
+
+def _few(ranges: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Ranges of which the last one contains all that are over the limit."""
+    return [*ranges[: _RANGES - 1], *((ranges[_RANGES - 1][0], ranges[-1][1]) for _ in ranges[_RANGES - 1 : _RANGES])]

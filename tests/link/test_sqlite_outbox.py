@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.link.outbox import FULL, Dropped
+from servotwin.link.outbox_index import AcknowledgedLimits
 from servotwin.link.session import Session
 from servotwin.link.sqlite_file import connect
 from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
@@ -291,3 +292,49 @@ def test_every_window_is_kept_removed_or_counted(tmp_path_factory: pytest.TempPa
     with sqlite3.connect(path) as connection:
         assert connection.execute("SELECT count(*) FROM windows").fetchone()[0] == len(box.pending())
     connection.close()
+
+
+def acknowledged(path: Path, number: int, **limits: int) -> SqliteOutbox:
+    """An outbox with windows that are acknowledged and kept."""
+    box = SqliteOutbox(path, "axis-1", kept=AcknowledgedLimits(10**6, 3600.0), **limits)
+    for k in range(number):
+        box.put(window(k, "periodic"))
+        box.remove(("b0", k))
+    return box
+
+
+def test_windows_that_the_twin_asks_for_again_go_after_those_that_it_never_had(path: Path) -> None:
+    box = acknowledged(path, 3)
+    box.put(window(3, "periodic"))
+    assert box.resend(lambda *_: True) == 3
+    box.put(window(4))
+    for _ in range(2):
+        assert sequences(box) == [3, 4, 0, 1, 2]
+        assert box.get(("b0", 1)) == window(1, "periodic")
+        box.close()
+        box = SqliteOutbox(path, "axis-1", kept=AcknowledgedLimits(10**6, 3600.0))
+    box.remove(("b0", 0))
+    box.drop(("b0", 1), "refused")
+    assert box.resend(lambda *_: True) == 1
+    assert sequences(box) == [3, 4, 2, 0]
+    box.close()
+    box = SqliteOutbox(path, "axis-1")
+    assert sorted(sequences(box)) == [0, 2, 3, 4]
+    box.close()
+
+
+def test_windows_that_the_twin_asks_for_again_take_no_room_from_others(path: Path) -> None:
+    box = acknowledged(path, 8, windows=10)
+    for k in range(8, 17):
+        box.put(window(k, "periodic"))
+    assert box.resend(lambda *_: True) == 1
+    assert sequences(box) == [*range(8, 17), 7]
+    assert box.put(window(17)) == []
+    assert sequences(box) == [*range(8, 18)]
+    assert box.put(window(18)) == [Dropped(("b0", 8), FULL)]
+    assert box.dropped == {FULL: 1}
+    for k in range(9, 19):
+        box.remove(("b0", k))
+    # What gave way is still there for the next request.
+    assert box.resend(lambda _, sequence: sequence < 8) == 8
+    box.close()

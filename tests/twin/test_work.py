@@ -425,6 +425,38 @@ def test_while_other_servos_wait_an_overtaken_window_is_stored_only():
     assert len(outcome.outgoing) == 1
 
 
+@pytest.mark.parametrize("introduced", [True, False])
+def test_a_window_of_an_ended_boot_that_comes_last_costs_the_live_one_no_update(introduced):
+    """Two boots in one lease: the twin has asked for windows of the ended one again."""
+    ended, live = windows()[0], msgspec.structs.replace(windows()[2], boot="live")
+    state = b""
+    if introduced:
+        hello = Hello("axis", "live", live.start, live.rate, 0, START, "m", 2)
+        state = work(fleet(), claim(hello), 0.0).state
+        ended = msgspec.structs.replace(ended, boot="unknown")
+    else:
+        state = work(fleet(), claim(ended), 0.0).state
+        state = work(
+            fleet(), claim(msgspec.structs.replace(windows()[1], boot="live"), state=state, serial=1), 0.0
+        ).state
+        ended = msgspec.structs.replace(ended, sequence=77)
+    outcome = work(fleet(), claim(live, ended, state=state, serial=2, received=[1e3, 1e3]), 1e3, Urgency())
+    [update] = [each for each in map(decode, outcome.outgoing) if isinstance(each, Update)]
+    assert update.window == ("live", live.sequence)
+    assert [row.message for row in outcome.evidence if row.overtaken and row.kind == "estimate"] == [2]
+
+
+def test_a_hello_in_the_lease_tells_the_live_boot():
+    hello = Hello("axis", windows()[0].boot, 0.0, windows()[0].rate, 0, START, "m", 2)
+    state = work(fleet(), claim(hello, windows()[0]), 0.0).state
+    live = msgspec.structs.replace(windows()[2], boot="live")
+    batch = claim(
+        msgspec.structs.replace(hello, boot="live"), live, windows()[1], state=state, serial=1, received=[1e3] * 3
+    )
+    [update] = [each for each in map(decode, work(fleet(), batch, 1e3, Urgency()).outgoing) if isinstance(each, Update)]
+    assert update.window[0] == "live"
+
+
 def test_no_setting_is_computed_that_would_come_too_late():
     window = windows()[1]
     spent = window.samples / window.rate

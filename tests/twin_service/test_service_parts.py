@@ -22,6 +22,7 @@ from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
 from servotwin.twin_service.http_edge import LongPolls
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.limits import (
+    MAX_SERVOS,
     STATUS,
     Disconnected,
     RateLimiter,
@@ -68,6 +69,24 @@ def test_a_boot_s_sample_time_runs_no_faster_than_it_can(speed, slack, first, la
             assert refusal(lambda end=end, now=now: boots.check("a", "b", end, now)) is Refusal.FUTURE
     boots.check("a", "c", 5.0, now)
     boots.check("other", "b", 7.0, now)
+
+
+def test_windows_of_a_boot_that_has_ended_pass_once_the_next_one_has_said_hello():
+    boots = SampleTimeLimiter(1.0, 60.0)
+    boots.check("a", "ended", 1.0, 0.0)
+    assert refusal(lambda: boots.check("a", "ended", 500.0, 1.0)) is Refusal.FUTURE
+    boots.hello("a", "live", 1000.0, 1.0)
+    boots.check("a", "ended", 500.0, 1.0)
+    boots.check("a", "between", 72000.0, 1.0)
+    assert refusal(lambda: boots.check("a", "live", 1500.0, 1.0)) is Refusal.FUTURE
+    assert refusal(lambda: boots.check("a", "ended", 1e12, 1.0)) is Refusal.FUTURE
+    boots.check("other", "ended", 1.0, 0.0)
+    assert refusal(lambda: boots.check("other", "ended", 500.0, 1.0)) is Refusal.FUTURE
+    for k in range(MAX_SERVOS):
+        boots.hello(f"servo-{k}", "b", 0.0, 1.0)
+    assert refusal(lambda: boots.check("a", "ended", 500.0, 1.0) or boots.check("a", "ended", 600.0, 1.0)) is (
+        Refusal.FUTURE
+    )
 
 
 def test_a_hello_moves_a_boot_s_time_on_but_never_back():

@@ -10,6 +10,7 @@ import pytest
 from service_system import bearer, place, served, twin_file, window
 
 from servotwin.messages import Resend, decode, encode
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
 from servotwin.twin_service import missing_windows
 
@@ -116,6 +117,67 @@ def test_windows_that_never_came_are_asked_for_once(tmp_path, caplog, monkeypatc
 
     serve(twin_file(tmp_path), body)
     assert caplog.messages.count("windows missing") == 2
+
+
+def test_a_hole_is_asked_for_by_itself_and_not_with_all_that_is_between(tmp_path, monkeypatch):
+    monkeypatch.setattr(missing_windows, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(missing_windows, "_LOOK_S", 1e9)
+
+    async def body(system, client):
+        await send(client, 0, 1, 2, 4, 5, 6, 7, 9)
+        await system._missing.look()
+        assert [(asked.first, asked.last) for asked in posted(system)] == [(3, 3), (8, 8)]
+        assert "servotwin_windows_missing_total 2\n" in (await client.get("/metrics")).text
+        await send(client, *range(11, 51, 2))
+        await system._missing.look()
+        asked = [(asked.first, asked.last) for asked in posted(system)][2:]
+        assert asked == [*((n, n) for n in range(10, 24, 2)), (24, 48)]
+
+    serve(twin_file(tmp_path), body)
+
+
+@pytest.mark.parametrize("failing", ["read", "post"])
+def test_a_look_that_failed_is_made_again(tmp_path, monkeypatch, failing):
+    monkeypatch.setattr(missing_windows, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(missing_windows, "_LOOK_S", 1e9)
+
+    def fail(*_of):
+        raise StoreUnavailable("the disk is full")
+
+    async def body(system, client):
+        await send(client, 0, 1, 3, 4, 6)
+        with monkeypatch.context() as patched:
+            if failing == "read":
+                patched.setattr(missing_windows, "missing_windows", fail)
+            else:
+                patched.setattr(system.store, "post", fail)
+            await system._missing.look()
+            assert posted(system) == []
+            assert "servotwin_windows_missing_total 0\n" in (await client.get("/metrics")).text
+        await system._missing.look()
+        assert [(asked.first, asked.last) for asked in posted(system)] == [(2, 2), (5, 5)]
+        await system._missing.look()
+        assert len(posted(system)) == 2
+
+    serve(twin_file(tmp_path), body)
+
+
+def test_a_hole_that_comes_during_a_look_is_found_by_the_next_one():
+    now = [100.0]
+    watch = missing_windows.SequenceWatch(lambda: now[0])
+    boot = ("ax-1", "b")
+    watch.note(window(0))
+    now[0] += 30.0
+    assert watch.due() == [boot]
+    newest = watch.newest(boot)
+    watch.note(window(5))
+    watch.looked_at(boot, newest)
+    assert watch.due() == []
+    now[0] += 30.0
+    assert watch.due() == [boot]
+    watch.looked_at(boot, watch.newest(boot))
+    now[0] += 1000.0
+    assert watch.due() == []
 
 
 def test_windows_that_were_only_overtaken_are_not_asked_for(tmp_path):
