@@ -89,7 +89,13 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
 def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool) -> None:
     """Print a cascade tuned from inside outwards: crossover and margin are those of its velocity loop."""
     margin, delay = math.radians(request.phase_margin_deg), 1e-3 * request.delay_ms
+    _check_cascade(request)
     tuned = tune_cascade(axis, request.crossover, margin, delay=delay)
+    if tuned.margins.Ms > request.Ms_max:
+        raise InvalidInput(
+            f"--ms-max {request.Ms_max:g}: the cascade with this crossover and phase margin has Ms = "
+            f"{tuned.margins.Ms:.4g}; lower the crossover, or raise the margin"
+        )
     found, present = (file_values(law, axis.actuator.unit, axis.load.motion) for law in (tuned.controller, own))
     gains = {name: value for name, value in found.items() if name.startswith(_CASCADE_GAINS)}
     if as_json:
@@ -104,6 +110,14 @@ def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool)
     outer = f"{tuned.position_crossover:.4f} rad/s ({math.degrees(tuned.position_margin):.2f} deg)"
     console.print(f"position loop, crossover (phase margin): {outer}", highlight=False)
     console.print(f"Ms at the command, at the law's own rate: {tuned.margins.Ms:.4f}", highlight=False)
+
+
+def _check_cascade(request: TuneOptions) -> None:
+    """Refuse options that only a filtered PID has."""
+    plain = {"--type": (request.kind, "PIDF"), "--prefer": (request.prefer, "Ms"), "--b": (request.b, 1.0)}
+    for option, (given, default) in {**plain, "--c": (request.c, None)}.items():
+        if given != default:
+            raise InvalidInput(f"{option} {given}: is for a filtered PID; leave it out for a cascade")
 
 
 def as_dict(tuning: Tuning, overshoots: tuple[float, float] | None) -> dict[str, Any]:

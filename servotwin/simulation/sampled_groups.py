@@ -23,7 +23,7 @@ from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.plants import Plant, structure_of
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.stack import LoopStack, sampled_plants
-from servotwin.simulation.ensemble import starts_of
+from servotwin.simulation.ensemble_starts import starts_of
 from servotwin.simulation.lifted import more_segments, new_segments
 from servotwin.simulation.lifted_engine import new_memory, places_of, start_law, watches_of
 from servotwin.simulation.lifted_tables import KINDS, Place, Places

@@ -2,7 +2,9 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,3 +86,24 @@ def test_the_command_shows_the_keys_of_the_file(tmp_path: Path, capsys: pytest.C
     }
     print_tuning(options, as_json=False)
     assert "position_gain_per_s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"kind": "PI"}, "--type PI: is for a filtered PID"),
+        ({"prefer": "Ki"}, "--prefer Ki: is"),
+        ({"b": 0.5}, "--b 0.5: is"),
+        ({"c": 0.0}, "--c 0.0: is"),
+        ({"Ms_max": 1.01}, r"--ms-max 1.01: the cascade .* has Ms = 2\.\d+; lower the crossover"),
+    ],
+)
+def test_the_command_takes_no_option_that_it_would_ignore(
+    tmp_path: Path, changes: dict[str, Any], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "axis.toml"
+    path.write_text(AXIS.dumps())
+    options = TuneOptions(str(path), "PIDF", 300.0, 40.0, math.inf, "Ms", 0.0, 1.0, None)
+    with pytest.raises(st.InvalidInput, match=words):
+        print_tuning(replace(options, **changes), as_json=True)
+    assert not capsys.readouterr().out

@@ -10,11 +10,19 @@ from servotwin.commissioning.edge_settings import Commissioning
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import answer, integrates, scaled
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.messages import Setting
+from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import _lag
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
 from servotwin.redesign.certified.certify import candidates_of, certify
 from servotwin.redesign.certified.fallback import CertificateFile, _decoder, _encoder
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.trial import Trial
+from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
+from servotwin.redesign.design import Design
+from servotwin.redesign.policy import Evidence
 from servotwin.redesign.registry import policy_of
 from servotwin.twin.settings import TwinSettings
 
@@ -66,16 +74,37 @@ def test_the_box_of_the_edge_admits_every_candidate_and_not_much_more(axis: st.A
     assert not guarded.limits.allows_gains(hot, guarded.middle)
 
 
-def test_the_lag_behind_a_ramp_is_that_of_the_simulation() -> None:
+@pytest.mark.parametrize("integral_time", [None, 0.02])
+def test_the_lag_behind_a_ramp_is_that_of_the_simulation(integral_time: float | None) -> None:
     """A quarter of the speed fed forward; the axis without Coulomb friction."""
     actuator, load = replace(SCREW.actuator, coulomb=0.0), replace(SCREW.load, friction=0.0)  # type: ignore[type-var]
-    law = CASCADE.replace(integral_time=None, velocity_feedforward=0.25)
+    law = CASCADE.replace(integral_time=integral_time, velocity_feedforward=0.25)
     axis = SCREW.replace(actuator=actuator, load=load, controller=law)
     speed = 0.01
     ramp = st.PiecewiseCubic(np.array([0.0]), np.array([[0.0, speed, 0.0, 0.0]]))
     run = st.simulate(axis, 1.0, reference=ramp, sample_rate=100.0)
     assert (run.reference - run.position)[-2] / speed == pytest.approx(_lag(axis, law), rel=1e-3)
     assert _lag(axis, law.linear()) == pytest.approx(_lag(axis, law), rel=1e-9)
+
+
+def test_a_machine_whose_drive_cuts_the_command_counts_as_saturated() -> None:
+    axis = SCREW.replace(controller=CASCADE.replace(voltage_limit=None))
+    for limit in (None, 0.1):
+        limited = axis.replace(actuator=replace(SCREW.actuator, limit=limit))
+        members = draw_independently(limited, KNOWN, 2, 1)
+        (measures,) = assess([Design(axis.controller, 0.0)], members, Trial(0.5, 0.1, 1000.0))
+        assert measures.saturated.all() == measures.saturated.any() == (limit is not None)
+
+
+@pytest.mark.parametrize("integral_time", [None, 0.02])
+def test_a_rest_without_friction_is_news_only_where_something_integrates(integral_time: float | None) -> None:
+    """The share of the integral in a linear law's gains is one where nothing integrates too."""
+    law = CASCADE.replace(integral_time=integral_time).linear()
+    policy = CertifiedPolicy(SCREW.replace(controller=law), KNOWN)
+    estimate = GapEstimate(0.0, 1.0, 1.0, (0.0, 1.0), GapStatus.UNIDENTIFIABLE, 1.0)
+    rest = Disturbance(0.0, 1e-6, 0.0, 0.3, 0.0)
+    seen = Evidence(estimate, rest, None, Setting.of(0.0, gains_of(law)), 0.01, rests=(0.0,))
+    assert policy._shows_more(seen) == integrates(law)
 
 
 @pytest.mark.parametrize(

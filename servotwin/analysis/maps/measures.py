@@ -20,7 +20,7 @@ from servotwin.hybrid.ensemble import run_ensemble
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
 from servotwin.simulation.continuous import controller_constants
-from servotwin.simulation.ensemble import start_modes
+from servotwin.simulation.ensemble_starts import start_modes
 from servotwin.simulation.inputs import plant_forces
 
 # Half-width about the final position, per reference step: the usual five per cent.

@@ -58,7 +58,7 @@ class MachineMeasures:
     cost : array
         s, integral of abs(error) over the whole run, per step.
     saturated : array of bool
-        True where the voltage met its limit.
+        True where the voltage met the law's limit, or the command the drive's.
     still, near : array
         m, ripple and tail below which the loop has settled.
     """
@@ -109,8 +109,9 @@ def assess(
     largest = float(members.step.max()) if largest is None else largest
     near = np.stack([nearness(setting, members, largest) for setting in settings])
     figures = _figures(laws, plants, np.array([setting.tolerance for setting in settings]), members, near, trial)
-    # The voltage of a saturated machine equals its limit exactly, so that reaching it is what counts.
-    limits = [setting.controller.voltage_limit or math.inf for setting in settings]
+    # The voltage of a saturated machine equals its law's limit exactly, so that reaching it is what counts.
+    drive = members.model.command_limit or math.inf
+    limits = [min(setting.controller.voltage_limit or math.inf, drive) for setting in settings]
     still = stillness(members)
     return [
         _measures(

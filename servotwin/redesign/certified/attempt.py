@@ -238,23 +238,22 @@ def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> 
 
 
 def _lag(servo: Plant, law: AnyController) -> float:
-    """s: steady error behind a ramp, per speed; the motor integrates, so a law without integral action lags."""
-    if integrates(law):
-        return 0.0
+    """s: steady error behind a ramp, per speed, of a machine whose motor integrates.
+
+    The integral of a filtered PID takes it to zero; that of a cascade integrates the speed's error and need not.
+    """
+    running = law_of(law)
     plant = servo.plant()
     corners = np.abs(plant.poles())
     slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
-    needed = 1.0 / (slow * float(np.abs(plant.response(slow))))
-    return abs(needed - _fed_forward(servo, law, slow)) / abs(answer(law))
-
-
-def _fed_forward(servo: Plant, law: AnyController, slow: float) -> float:
-    """Command per speed of a reference that the machine follows without error; `slow` in rad/s."""
-    running = law_of(law)
-    if not isinstance(running, LinearLaw):
-        return running.velocity_feedforward
-    reference, motor, load = law_response(running, slow)
-    return float(((reference + motor / servo.p + load) / (1j * slow)).real)
+    gain = complex(plant.response(slow))
+    if isinstance(running, LinearLaw):
+        reference, motor, load = law_response(running, slow)
+        followed = gain * reference / (1.0 - gain * (motor / servo.p + load))
+        return float(abs((1.0 - followed) / slow))
+    if integrates(law):
+        return 0.0
+    return abs(1.0 / (slow * abs(gain)) - running.velocity_feedforward) / abs(answer(law))
 
 
 def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) -> int:

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import ClassVar, Protocol
 
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.control.retuning import answer
+from servotwin.control.retuning import answer, integrates
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
@@ -275,16 +275,12 @@ class CertifiedPolicy:
         if abs(fed - gains.feedforward) > _SAME_FEEDFORWARD * self.smallest_answer:
             return True
         low, high = self._friction(evidence)
-        sticks = high > 0.0
-        if (
-            sticks
-            and self._motor(evidence) is not None
-            and (evidence.tuned_for is None or (low > 0.0 and getattr(gains, gains.integral)))
-        ):
+        sticks, integral = high > 0.0, integrates(with_gains(self.servo.controller, gains))
+        if sticks and self._motor(evidence) is not None and (evidence.tuned_for is None or (low > 0.0 and integral)):
             # The fallback set is verified for the stated friction only, and an integral is not all that friction allows
             # once it is known.
             return True
-        return (getattr(gains, gains.integral) != 0.0) != sticks and len(evidence.rests) > 0
+        return integral != sticks and len(evidence.rests) > 0
 
     def _motor(self, evidence: Evidence) -> LearntMotor | None:
         """The learnt motor, where it tells friction and bias well enough to act on them: to a small voltage, or to a
