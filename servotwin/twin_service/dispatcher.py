@@ -142,7 +142,7 @@ class Dispatcher:
         self._owner, self._quota = owner, quota
         self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
         self._work_pending = asyncio.Event()
-        self._stopping, self._waited_for = False, False
+        self._stopping, self._waited_for, self._latest = False, False, set[str]()
         self._tasks: set[asyncio.Task[None]] = set()
         self._to_release: set[str] = set()
         self._failures: Counter[tuple[str, bool]] = Counter()
@@ -162,7 +162,11 @@ class Dispatcher:
             if not leases:
                 self._pool.release(worker)
                 continue
-            task = asyncio.create_task(self._employ(worker, leases, self._waited_for))
+            servos = {lease.servo for lease in leases}
+            # Servos come in turns: where one comes twice in a row, no other waits.
+            others_wait = self._waited_for and servos != self._latest
+            self._latest = servos if len(servos) == 1 else set()
+            task = asyncio.create_task(self._employ(worker, leases, others_wait))
             self._tasks.add(task)
             # The loop has weak references to tasks only; the set keeps this one from being collected.
             task.add_done_callback(self._tasks.discard)
