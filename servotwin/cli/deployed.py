@@ -37,7 +37,7 @@ def up(
 
 
 class TwinAction(StrEnum):
-    """What `servotwin twin` does instead of serving."""
+    """Action of `servotwin twin` instead of serving."""
 
     CHECK = "check"
 

@@ -1,4 +1,4 @@
-"""What readers give and writers take: named columns of numbers, and metadata."""
+"""Tables that readers give and writers take: named columns of numbers, and metadata."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ _BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xb
 
 
 class _Layout(NamedTuple):
-    """How a text table is laid out.
+    """Layout of a text table.
 
     Attributes
     ----------

@@ -237,7 +237,7 @@ class Axis:
         return screw, np.concatenate([np.full(self.n, self.p * screw), np.zeros(self.n)])
 
     def rest_under_force(self, gap: float, screw: float) -> Rest | None:
-        """Where a load hangs that a constant force pushes; None: nothing does, or friction holds it."""
+        """Position at which a load hangs that a constant force pushes; None: nothing does, or friction holds it."""
         return rest_under_force(self, gap, screw)
 
     def shaft(self) -> ShaftMatrices:

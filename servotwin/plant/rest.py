@@ -1,4 +1,4 @@
-"""Where an axis begins: at rest under the constant force on its load, its position at zero."""
+"""Initial state of an axis: at rest under the constant force on its load, its position at zero."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class PlantStack:
         return np.ones(self.count), self._chain.equilibrium(self.p)
 
     def rest_under_force(self, which: int, gap: float, screw: float) -> Rest | None:
-        """Where the load of one of them hangs."""
+        """Position at which the load of one of them hangs."""
         return self._axes[which].rest_under_force(gap, screw) if self._axes else None
 
     def chain(self) -> Chain:

@@ -1,4 +1,4 @@
-"""Where a run begins: the plant at rest, and under a constant force the law with the command that holds the load."""
+"""Start of a run: the plant at rest, and under a constant force the law with the command that holds the load."""
 
 from __future__ import annotations
 

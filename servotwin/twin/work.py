@@ -31,7 +31,7 @@ workers; attempts from which on that message is abandoned."""
 
 @dataclass(frozen=True)
 class Urgency:
-    """How a servo's work is cut down to what can still have an effect, where more arrives than can be worked off.
+    """Limits of a servo's work to what can still have an effect, where more arrives than can be worked off.
 
     Attributes
     ----------

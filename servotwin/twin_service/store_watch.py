@@ -123,7 +123,7 @@ class StoreWatch:
         return None if file is None else file.with_name(f"{file.name}-{_MARK}")
 
     def _compare_mark(self) -> None:
-        """Where the store lacks messages that it once had, ask all edges for the windows that they still keep."""
+        """Ask all edges for the windows that they still keep, where the store lacks messages that it once had."""
         noted, newest = _read_mark(self._mark_file), newest_message(self._store)
         if newest >= noted:
             return

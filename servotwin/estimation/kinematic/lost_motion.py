@@ -31,7 +31,7 @@ _CHANCE = 0.025  # on either side of a 95 % interval
 
 
 class FittedCurves(NamedTuple):
-    """What a picture of the fit shows.
+    """Curves for a picture of the fit.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class FittedCurves(NamedTuple):
 
 @dataclass(frozen=True)
 class LostMotion:
-    """What a recording says of the gap; angles and lengths in the units of the recording.
+    """Gap that a recording shows; angles and lengths in the units of the recording.
 
     Attributes
     ----------

@@ -59,7 +59,7 @@ def models(design: Regression) -> tuple[Model, ...]:
 
 
 class ModelScore(NamedTuple):
-    """How well a model predicts strokes that it was not fitted to.
+    """Errors of a model on strokes that it was not fitted to.
 
     Attributes
     ----------

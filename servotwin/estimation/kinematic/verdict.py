@@ -1,4 +1,4 @@
-"""What a fit is worth: status, interval and reasons."""
+"""Verdict on a fit: status, interval and reasons."""
 
 from __future__ import annotations
 

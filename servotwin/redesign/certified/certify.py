@@ -263,7 +263,7 @@ def _zones_in_gap(servo: Plant, laws: tuple[AnyController, ...], zone: float, de
 
 
 def _gains(law: AnyController) -> _Gains:
-    """What tells laws with and without integral action apart from others."""
+    """Numbers that tell laws with and without integral action apart from others."""
     gains = gains_of(law)
     return (*(getattr(gains, name) for name in gains.scaled), getattr(gains, "notch_hz", 0.0))
 
