@@ -113,7 +113,7 @@ def commission(
     found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
     axis = None if drive.law is None else rigid_axis(found.best, drive.law, first, travel)
     if axis is not None and feedback == LOAD:
-        axis = _with_load_encoder(axis, first.resolution)
+        axis = _with_load_encoder(axis, first.load_resolution or first.resolution)
     if axis is not None and crossover is not None:
         axis = replace(axis, controller=tune_cascade(axis, crossover, _PHASE_MARGIN).controller)
     return replace(found, axis=axis, uncertainty=_uncertainty(found, travel))

@@ -12,6 +12,8 @@ import numpy as np
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, Mask
+from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.log import read_columns
@@ -79,12 +81,15 @@ class DriveLog:
         m (rotary: rad) per radian of the motor; None: unknown, the log counts the motor at the load.
     found : mapping
         Number of samples by defect, in words.
+    lost_motion : LostMotion or None
+        Gap between the two encoders, rad or m of the motor; None: there is one encoder.
     """
 
     recording: DriveRecording
     columns: Mapping[str, str]
     travel: float | None
     found: Mapping[str, int]
+    lost_motion: LostMotion | None = None
 
 
 def travel_of(lead_mm: float | None, ratio: float | None) -> float | None:
@@ -131,14 +136,14 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         raise InvalidInput(f"log {path}: {clean.time.size} samples can be used, of at least {_LEAST}")
     grid, usable, rate = _grid(clean.time)
     channels = {part: np.interp(grid, clean.time, values) for part, values in clean.channels.items()}
-    return _in_si(path, channels, units, (rate, usable), wanted, DriveLog(None, chosen, None, clean.found))  # type: ignore[arg-type]
+    return _in_si(path, channels, units, (grid, usable, rate), wanted, DriveLog(None, chosen, None, clean.found))  # type: ignore[arg-type]
 
 
 def _in_si(
     path: Path,
     channels: dict[str, Array],
     units: Mapping[str, str],
-    grid: tuple[float, Mask],
+    grid: tuple[Array, Mask, float],
     wanted: DriveColumns,
     log: DriveLog,
 ) -> DriveLog:
@@ -148,10 +153,13 @@ def _in_si(
         if part in channels:
             channels[part] = channels[part] * _POSITIONS[units[part]]
     output = units.get("load", units.get("reference", units["motor"]))
+    load_count = resolution(np.unique(channels["load"])) if "load" in channels else 0.0
     rotary, motor = output in _ANGLES, channels["motor"]
-    travel = wanted.travel
-    if "load" in channels and travel is None:
-        travel = _slope(motor, channels["load"])
+    time, usable, rate = grid
+    travel, lost = wanted.travel, None
+    if "load" in channels:
+        lost = estimate_lost_motion(EncoderRecording(time, motor, channels["load"], None, "rad", "", f"log {path}"))
+        travel = lost.ratio if travel is None and math.isfinite(lost.ratio) else travel
     turned = (units["motor"] in _ANGLES) and (travel is not None)
     if units["motor"] in _ANGLES and not rotary and travel is None:
         raise InvalidInput(
@@ -161,7 +169,6 @@ def _in_si(
     if turned and travel is not None:
         motor, count = motor * travel, count * abs(travel)
     scale = _force_scale(path, units["command"], rotary, travel if turned or not rotary else None, wanted)
-    rate, usable = grid
     recording = DriveRecording(
         rate=rate,
         position=motor,
@@ -172,10 +179,11 @@ def _in_si(
         rotary=rotary,
         force_per_command=scale,
         resolution=count,
+        load_resolution=load_count,
         command_unit=units["command"],
         source=f"log {path}",
     )
-    return replace(log, recording=recording, travel=travel)
+    return replace(log, recording=recording, travel=travel, lost_motion=lost)
 
 
 def _force_scale(path: Path, unit: str, rotary: bool, travel: float | None, wanted: DriveColumns) -> float | None:
@@ -192,12 +200,6 @@ def _force_scale(path: Path, unit: str, rotary: bool, travel: float | None, want
         # A torque of the motor, whose load travels by so much per radian.
         return 1.0 if travel is None and rotary else (None if travel is None else 1.0 / travel)
     return None
-
-
-def _slope(motor: Array, load: Array) -> float:
-    centred = motor - motor.mean()
-    square = float(centred @ centred)
-    return float(centred @ load) / square if square > 0.0 else 1.0
 
 
 def _grid(time: Array) -> tuple[Array, Mask, float]:

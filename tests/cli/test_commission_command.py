@@ -53,7 +53,7 @@ def test_the_axis_is_the_machine_of_the_log(log, tmp_path):
     axis = st.Axis.from_file(tmp_path / "axis.toml")
     p, actuator = axis.p, axis.actuator
     assert p == pytest.approx(0.01 / (2.0 * np.pi))
-    assert actuator.J == pytest.approx(PARAMETERS["inertia"] * p * p, rel=1e-3)
+    assert actuator.J / p**2 == pytest.approx(PARAMETERS["inertia"], rel=1e-3)
     assert actuator.friction == pytest.approx(PARAMETERS["viscous"] * p * p, rel=1e-3)
     assert actuator.coulomb == pytest.approx(PARAMETERS["coulomb"] * p, rel=1e-3)
     assert axis.controller.position_gain == pytest.approx(GAINS["position_gain"], rel=1e-3)

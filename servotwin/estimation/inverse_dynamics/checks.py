@@ -32,6 +32,14 @@ def at_limit(recording: DriveRecording) -> Mask:
     return np.asarray(mask & (np.roll(mask, 1) | np.roll(mask, -1)))
 
 
+def without_limit(recording: DriveRecording) -> DriveRecording:
+    """The recording with its limit, and without the samples at which the command is there."""
+    limited = at_limit(recording)
+    if not limited.any():
+        return recording
+    return replace(recording, usable=recording.usable & ~limited, limit=float(np.abs(recording.force[limited]).max()))
+
+
 def check_motion(recording: DriveRecording) -> None:
     """Refuse a recording without motion or without a command.
 

@@ -72,7 +72,8 @@ def rigid_axis(fit: ParameterFit, law: RunningLaw, recording: DriveRecording, p:
         velocity_gain=law.velocity_gain * p * p,
         integral_time=law.integral_time,
         speed_filter=law.speed_filter,
-        on=MOTOR,
+        on=law.on,
+        voltage_limit=None if recording.limit is None else recording.limit * p,
         sample_rate=recording.rate,
     )
     inertia = fit["inertia"]
@@ -82,7 +83,7 @@ def rigid_axis(fit: ParameterFit, law: RunningLaw, recording: DriveRecording, p:
         # Rigid with the motor, whose inertia contains it.
         Load((inertia,), motion=ROTARY if recording.rotary else LINEAR),
         controller,
-        Sensors(encoder_resolution=recording.resolution / p, feedback=MOTOR),
+        Sensors(recording.resolution / p, 0.0 if law.on == MOTOR else recording.load_resolution, law.on),
     )
 
 

@@ -182,9 +182,9 @@ def correlation_length(left: Array) -> float:
 def least_squares(names: tuple[str, ...], design: Array, rows: Rows) -> ParameterFit:
     """Fit, and leave out one block of time, or one part of the travel, after the other for the covariance.
 
-    Errors hang together in time (drift) and, as they come again in every cycle, in place (cyclic friction, a tight spot): the
-    covariance is the sum of both, on the safe side of that for two-way clusters (Cameron, Gelbach and Miller 2011). A
-    bootstrap that draws blocks may draw none at another speed, and is singular then; leaving out one block is not.
+    Errors hang together in time (drift) and, as they come again in every cycle, in place (cyclic friction, a tight
+    spot): the covariance is the sum of both, on the safe side of that for two-way clusters (Cameron, Gelbach and Miller
+    2011). A bootstrap that draws blocks may draw none at another speed, and is singular then; leaving out one is not.
     """
     scale = 1.0 / np.maximum(np.linalg.norm(design, axis=0), np.finfo(float).tiny)
     values = scale * np.linalg.lstsq(design * scale, rows.force, rcond=None)[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import Refinement, refine
@@ -73,7 +73,7 @@ def identify_drive(
         motion = motion_of(each.position, each.rate, band)
         if not applied:
             checks.check_limit(each, motion)
-            each = replace(each, usable=each.usable & ~checks.at_limit(each))
+            each = checks.without_limit(each)
         checks.check_directions(each, motion)
         used.append(each)
         motions.append(motion)

@@ -27,14 +27,16 @@ class DriveRecording:
     reference : (n,) array or None
         Of the position, in its unit.
     load : (n,) array or None
-        Position of a second encoder behind shaft and gap, in its own unit.
+        Position of a second encoder behind shaft and gap, m (rotary: rad).
     usable : (n,) bool array
         False where samples were missing.
     rotary : bool
     force_per_command : float or None
         N (rotary: N m) per unit of the command; None: unknown, and the fit is in units of the command.
-    resolution : float
-        One count of the position, in its unit.
+    resolution, load_resolution : float
+        One count of the position, and of the second encoder.
+    limit : float or None
+        Largest force, where the command stays at it; None: it stays at none.
     command_unit, source : str
     """
 
@@ -47,6 +49,8 @@ class DriveRecording:
     rotary: bool = False
     force_per_command: float | None = None
     resolution: float = 0.0
+    load_resolution: float = 0.0
+    limit: float | None = None
     command_unit: str = ""
     source: str = "recording"
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import optimize, signal
 
+from servotwin.control.linear_law import LOAD, MOTOR
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
 from servotwin.plant.signals import Array
@@ -36,6 +37,8 @@ class RunningLaw:
         s, with which the position is differentiated.
     left : float
         Norm of what the law leaves of the force, over that of the force.
+    on : {"motor", "load"}
+        Encoder that the position loop reads.
     """
 
     position_gain: float
@@ -43,6 +46,7 @@ class RunningLaw:
     integral_time: float | None
     speed_filter: float
     left: float = math.nan
+    on: str = MOTOR
 
     @property
     def explains(self) -> bool:
@@ -94,12 +98,12 @@ def running_law(recording: DriveRecording, given: GivenGains) -> RunningLaw:
                 "COLUMN, or --position-gain and --velocity-gain"
             )
         return RunningLaw(given.position_gain, given.velocity_gain, given.integral_time, given.speed_filter or step)  # type: ignore[arg-type]
-    if given.integral_time is not None:
-        return _fitted(recording, given, integral=True)
-    simple = _fitted(recording, given, integral=False)
-    if given.complete or simple.left < _EXPLAINED:
+    encoders = (MOTOR,) if recording.load is None else (MOTOR, LOAD)
+    integral = given.integral_time is not None
+    simple = min((_fitted(recording, given, integral, on) for on in encoders), key=lambda law: law.left)
+    if integral or given.complete or simple.left < _EXPLAINED:
         return simple
-    rich = _fitted(recording, given, integral=True)
+    rich = min((_fitted(recording, given, True, on) for on in encoders), key=lambda law: law.left)
     return rich if rich.left < _RICHER * simple.left else simple
 
 
@@ -110,17 +114,17 @@ def differentiated(position: Array, time: float, rate: float) -> Array:
     return np.asarray(share * rate * (position - position[0] - slow))
 
 
-def _fitted(recording: DriveRecording, given: GivenGains, integral: bool) -> RunningLaw:
+def _fitted(recording: DriveRecording, given: GivenGains, integral: bool, on: str) -> RunningLaw:
     """Search the filter's time and the integral time; the two gains are linear."""
     step = 1.0 / recording.rate
     if given.speed_filter is not None and not (integral and given.integral_time is None):
-        return _with_gains(recording, given)
+        return _with_gains(recording, given, on)
     bounds = (math.log(_LEAST_FILTER * step), math.log(_LONGEST_FILTER * step))
 
     def law_of(filter_log: float, integral_log: float | None) -> RunningLaw:
         speed_filter = given.speed_filter or math.exp(filter_log)
         reset = given.integral_time if integral_log is None else math.exp(integral_log)
-        return _with_gains(recording, replace(given, speed_filter=speed_filter, integral_time=reset))
+        return _with_gains(recording, replace(given, speed_filter=speed_filter, integral_time=reset), on)
 
     best = optimize.minimize_scalar(lambda x: min(law_of(x, None).left, _NONE), bounds=bounds, method="bounded")
     if not integral or given.integral_time is not None:
@@ -136,17 +140,18 @@ def _fitted(recording: DriveRecording, given: GivenGains, integral: bool) -> Run
     return law_of(*both.x)
 
 
-def _with_gains(recording: DriveRecording, given: GivenGains) -> RunningLaw:
+def _with_gains(recording: DriveRecording, given: GivenGains, on: str) -> RunningLaw:
     """The law of given filter times, its gains by linear least squares where they are not given."""
     reference, position, force, rate = recording.reference, recording.position, recording.force, recording.rate
     assert reference is not None
     assert given.speed_filter is not None
-    columns = np.column_stack([reference - position, -differentiated(position, given.speed_filter, rate)])
-    # The integral begins at an unknown value.
-    constant = np.empty((force.size, 0))
+    error = reference - (position if recording.load is None or on == MOTOR else recording.load)
+    columns = np.column_stack([error, -differentiated(position, given.speed_filter, rate)])
     if given.integral_time is not None:
         columns = columns + (np.cumsum(columns, axis=0) - columns) / (rate * given.integral_time)
-        constant = np.ones((force.size, 1))
+    # The integral begins at an unknown value, and the encoder's zero may be another one than the reference's.
+    constant = np.ones((force.size, 1))
+    force, columns, constant = force[recording.usable], columns[recording.usable], constant[recording.usable]
     # Force = Kv Kp first + Kv second: what is known of the two factors is taken out.
     Kp, Kv = given.position_gain, given.velocity_gain
     known, unknown = np.zeros_like(force), columns
@@ -162,4 +167,4 @@ def _with_gains(recording: DriveRecording, given: GivenGains) -> RunningLaw:
     if Kp is None:
         Kp = float(fit[0]) / Kv if Kv else 0.0
     share = float(np.linalg.norm(left) / np.linalg.norm(force))
-    return RunningLaw(Kp, Kv, given.integral_time, given.speed_filter, share if min(Kp, Kv) > 0.0 else math.inf)
+    return RunningLaw(Kp, Kv, given.integral_time, given.speed_filter, share if min(Kp, Kv) > 0.0 else math.inf, on)
