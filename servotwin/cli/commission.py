@@ -16,7 +16,7 @@ from servotwin.commissioning.commission import CommissionedAxis, commission
 from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
-from servotwin.estimation.inverse_dynamics.running_law import GivenGains
+from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.logs.drive_recordings import DriveColumns
 from servotwin.plant.axis import Axis
 from servotwin.runtime import files

@@ -181,7 +181,7 @@ def commission(
     import math
 
     from servotwin.cli.commission import CommissionOptions, show
-    from servotwin.estimation.inverse_dynamics.running_law import GivenGains
+    from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
     from servotwin.logs.drive_recordings import DriveColumns, travel_of
 
     columns = DriveColumns(

@@ -12,8 +12,8 @@ from servotwin.analysis.tuning.cascade import tune_cascade
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.closed_loop import rigid_axis
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
+from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.estimation.inverse_dynamics.identify import IdentifiedDrive, identify_drive
-from servotwin.estimation.inverse_dynamics.running_law import GivenGains
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
 from servotwin.plant.axis import Axis
 from servotwin.plant.sensors import LOAD, MOTOR, Sensors

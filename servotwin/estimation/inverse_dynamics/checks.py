@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.inverse_dynamics.conditioning import Motion
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, Rows
+from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, Mask
-from servotwin.estimation.inverse_dynamics.running_law import GivenGains, running_law
 from servotwin.plant.signals import Array
 
 _COUNTS = 20.0  # of the encoder: a smaller motion shows its counts
@@ -60,7 +60,7 @@ def check_motion(recording: DriveRecording) -> None:
         )
 
 
-def check_limit(recording: DriveRecording, motion: Motion) -> None:
+def check_limit(recording: DriveRecording, motion: DriveMotion) -> None:
     """Refuse a recording whose command is at its limit for long.
 
     Raises
@@ -78,7 +78,7 @@ def check_limit(recording: DriveRecording, motion: Motion) -> None:
         )
 
 
-def check_directions(recording: DriveRecording, motion: Motion) -> None:
+def check_directions(recording: DriveRecording, motion: DriveMotion) -> None:
     """Refuse a recording that moves in one direction only.
 
     Raises
@@ -156,5 +156,5 @@ def check_reference(recording: DriveRecording, gains: GivenGains) -> None:
     """
     assert recording.reference is not None
     swapped = replace(recording, reference=recording.position, position=recording.reference)
-    if running_law(swapped, gains).explains:
+    if fitted_cascade(swapped, gains).explains:
         raise InvalidInput(f"{recording.source}: --reference and --motor are swapped: the reference lags the position")

@@ -13,10 +13,10 @@ import numpy as np
 
 from servotwin.control.cascade import Cascade
 from servotwin.control.linear_law import MOTOR
-from servotwin.estimation.inverse_dynamics.conditioning import Band, Motion, low_passed, motion_of
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, low_passed, motion_of
 from servotwin.estimation.inverse_dynamics.fit import SYMMETRIC, ParameterFit, Rows, fit_models, regressors, rows_of
+from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
-from servotwin.estimation.inverse_dynamics.running_law import RunningLaw
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import LINEAR, ROTARY, Load
@@ -58,7 +58,7 @@ class Refinement:
     settled: bool
 
 
-def rigid_axis(fit: ParameterFit, law: RunningLaw, recording: DriveRecording, p: float) -> Axis:
+def rigid_axis(fit: ParameterFit, law: FittedCascade, recording: DriveRecording, p: float) -> Axis:
     """The axis that a fit describes: a torque drive on a rigid transmission, p travel per radian of the motor.
 
     Raises
@@ -87,7 +87,7 @@ def rigid_axis(fit: ParameterFit, law: RunningLaw, recording: DriveRecording, p:
     )
 
 
-def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: Band) -> SimulatedLog:
+def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: RegressionBand) -> SimulatedLog:
     """Run the axis along the recording's reference; `offset` is a force that resists the forward motion."""
     assert recording.reference is not None
     start, size = recording.position[0], recording.position.size
@@ -109,7 +109,7 @@ def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: Ba
 
 
 def refine(
-    first: ParameterFit, law: RunningLaw, recording: DriveRecording, band: Band, cycle: float, p: float
+    first: ParameterFit, law: FittedCascade, recording: DriveRecording, band: RegressionBand, cycle: float, p: float
 ) -> Refinement | None:
     """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track.
 
@@ -134,7 +134,12 @@ def refine(
 
 
 def _rows(
-    recording: DriveRecording, motion: Motion, band: Band, cycle: float, fit: ParameterFit, simulated: SimulatedLog
+    recording: DriveRecording,
+    motion: DriveMotion,
+    band: RegressionBand,
+    cycle: float,
+    fit: ParameterFit,
+    simulated: SimulatedLog,
 ) -> Rows:
     """Rows whose force is that of the model, and by how much the log's differs from the simulated one.
 

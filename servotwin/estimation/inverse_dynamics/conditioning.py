@@ -31,8 +31,8 @@ _SEGMENTS = 8  # of a spectrum's average
 _KEPT = 0.99  # share of usable samples below a row's filter
 
 
-class Band(NamedTuple):
-    """Band of a regression.
+class RegressionBand(NamedTuple):
+    """RegressionBand of a regression.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Band(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class DriveMotion:
     """Derivatives of a position and the sign of its speed, at the rate of the recording.
 
     Attributes
@@ -76,7 +76,7 @@ class Motion:
         return float(np.sum(~self.resting)) / self.rate
 
 
-def band_of(recording: DriveRecording) -> Band:
+def band_of(recording: DriveRecording) -> RegressionBand:
     """Choose the band from the spectrum of the acceleration."""
     rate = recording.rate
     second = np.diff(recording.position, 2) * rate**2
@@ -97,10 +97,10 @@ def band_of(recording: DriveRecording) -> Band:
     quiet = float(frequency[noisy[0]]) if noisy.size else math.inf
     corner = min(_BEYOND * motion, max(quiet, 0.5 * motion), 0.5 * _HIGHEST * rate)
     corner = max(corner, 4.0 / recording.duration)
-    return Band(motion, corner, max(1, int(rate / (2.5 * corner))), noise)
+    return RegressionBand(motion, corner, max(1, int(rate / (2.5 * corner))), noise)
 
 
-def motion_of(position: Array, rate: float, band: Band) -> Motion:
+def motion_of(position: Array, rate: float, band: RegressionBand) -> DriveMotion:
     """Derive speed and acceleration, and find standstills."""
     fine = min(_FINE * band.corner, _HIGHEST * rate)
     smooth = low_passed(position, fine, rate)
@@ -110,10 +110,12 @@ def motion_of(position: Array, rate: float, band: Band) -> Motion:
     slow = 4.0 * math.sqrt(band.noise * (2.0 * math.pi) ** 2 * fine**3 / 3.0)
     slow = max(slow, 1e-4 * float(np.abs(speed).max()))
     resting = _long(np.abs(speed) < slow, _REST * rate / band.corner)
-    return Motion(speed, np.gradient(speed, 1.0 / rate), side, resting, rate)
+    return DriveMotion(speed, np.gradient(speed, 1.0 / rate), side, resting, rate)
 
 
-def filtered_rows(columns: Array, moving: Mask, present: Mask, rate: float, band: Band) -> tuple[Array, Array]:
+def filtered_rows(
+    columns: Array, moving: Mask, present: Mask, rate: float, band: RegressionBand
+) -> tuple[Array, Array]:
     """Low-pass and decimate (n, c) columns; return the rows of moving, present samples and their times (s)."""
     kept = low_passed(np.column_stack([columns, moving.astype(float)]), band.corner, rate)
     edge = min(int(_EDGE * rate / band.corner), len(kept) // 4)

@@ -11,13 +11,13 @@ import numpy as np
 from scipy.stats import t as student
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.inverse_dynamics.conditioning import Band, Motion, filtered_rows
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, filtered_rows
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
 from servotwin.plant.signals import Array
 
 SYMMETRIC = ("inertia", "viscous", "coulomb", "offset")
 ASYMMETRIC = ("inertia", "viscous_forward", "coulomb_forward", "viscous_backward", "coulomb_backward")
-Places: TypeAlias = np.ndarray[Any, np.dtype[np.int64]]
+Groups: TypeAlias = np.ndarray[Any, np.dtype[np.int64]]
 
 _FEWEST, _MOST = 4, 40  # blocks
 _PARTS = 12  # of the travel
@@ -68,7 +68,7 @@ class ParameterFit:
         return float(student.ppf(0.975, freedom)) * self.std(name)
 
 
-def regressors(motion: Motion) -> Array:
+def regressors(motion: DriveMotion) -> Array:
     """(n, 9) columns of both models: four symmetric ones, then five asymmetric ones."""
     forward, backward = motion.side > 0.0, motion.side < 0.0
     ones = np.ones_like(motion.speed)
@@ -103,11 +103,11 @@ class Rows(NamedTuple):
 
     design: Array
     force: Array
-    blocks: Places
-    places: Places
+    blocks: Groups
+    places: Groups
 
 
-def rows_of(recording: DriveRecording, motion: Motion, band: Band, cycle: float) -> Rows:
+def rows_of(recording: DriveRecording, motion: DriveMotion, band: RegressionBand, cycle: float) -> Rows:
     """Rows of a recording for a motion; `cycle` is the duration of one cycle of it, s."""
     columns = np.column_stack([regressors(motion), recording.force])
     rows, times = filtered_rows(columns, ~motion.resting, recording.usable, recording.rate, band)
@@ -142,7 +142,7 @@ def fit_models(rows: Rows) -> tuple[ParameterFit, ParameterFit]:
     )
 
 
-def _blocks(times: Array, cycle: float, rows: Array) -> Places:
+def _blocks(times: Array, cycle: float, rows: Array) -> Groups:
     """Number of each row's block: whole cycles of motion, longer than errors hang together."""
     design, force = rows[:, : len(SYMMETRIC)], rows[:, -1]
     left = force - design @ np.linalg.lstsq(design, force, rcond=None)[0]
@@ -152,12 +152,12 @@ def _blocks(times: Array, cycle: float, rows: Array) -> Places:
     return np.arange(times.size) * count // times.size
 
 
-def _places(position: Array) -> Places:
+def _places(position: Array) -> Groups:
     """Number of each row's part of the travel, with as many rows in each."""
     return np.argsort(np.argsort(position)) * _PARTS // position.size
 
 
-def cycle_time(motion: Motion) -> float:
+def cycle_time(motion: DriveMotion) -> float:
     """Usual time from a reversal to the next one of the same direction, s; 0 without."""
     side = motion.side[~motion.resting]
     changes = np.flatnonzero(np.diff(side) > 0.0)
@@ -206,7 +206,7 @@ def least_squares(names: tuple[str, ...], design: Array, rows: Rows) -> Paramete
     )
 
 
-def _left_out(design: Array, force: Array, groups: Places) -> Array:
+def _left_out(design: Array, force: Array, groups: Groups) -> Array:
     """Covariance by leaving out one group after the other."""
     members = [groups == group for group in np.unique(groups)]
     grams = np.array([design[here].T @ design[here] for here in members])

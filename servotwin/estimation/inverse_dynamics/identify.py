@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import Refinement, refine
-from servotwin.estimation.inverse_dynamics.conditioning import Band, band_of, motion_of
+from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of
+from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
-from servotwin.estimation.inverse_dynamics.running_law import GivenGains, RunningLaw, running_law
 
 _FITTED = GivenGains()
 
@@ -24,9 +24,9 @@ class IdentifiedDrive:
     ----------
     symmetric, asymmetric : ParameterFit
         By inverse dynamics, of all recordings together.
-    bands : tuple of Band
+    bands : tuple of RegressionBand
         One for each recording.
-    law : RunningLaw or None
+    law : FittedCascade or None
         Of the first recording; None: no reference, and no gains were given.
     refinement : Refinement or None
         By closed-loop simulation of the first recording; None where it is not possible.
@@ -37,8 +37,8 @@ class IdentifiedDrive:
 
     symmetric: ParameterFit
     asymmetric: ParameterFit
-    bands: tuple[Band, ...]
-    law: RunningLaw | None
+    bands: tuple[RegressionBand, ...]
+    law: FittedCascade | None
     refinement: Refinement | None
     doubts: tuple[str, ...]
     advice: NextExperiment
@@ -89,13 +89,13 @@ def identify_drive(
 
 
 def _refined(
-    recording: DriveRecording, fit: ParameterFit, gains: GivenGains, filtering: tuple[Band, float], p: float
-) -> tuple[RunningLaw | None, Refinement | None, tuple[str, ...]]:
+    recording: DriveRecording, fit: ParameterFit, gains: GivenGains, filtering: tuple[RegressionBand, float], p: float
+) -> tuple[FittedCascade | None, Refinement | None, tuple[str, ...]]:
     """The law that ran, the refinement, and why there is none."""
     if recording.reference is None:
-        law = running_law(recording, gains) if gains.complete else None
+        law = fitted_cascade(recording, gains) if gains.complete else None
         return law, None, ("without a reference the loop cannot be simulated beside the log",)
-    law = running_law(recording, gains)
+    law = fitted_cascade(recording, gains)
     if not law.explains:
         checks.check_reference(recording, gains)
         left = f"{100.0 * law.left:.0f} %"

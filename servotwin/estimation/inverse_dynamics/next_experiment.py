@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servotwin.estimation.inverse_dynamics.conditioning import Motion
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, Rows
 from servotwin.plant.signals import Array
 
@@ -50,7 +50,7 @@ class NextExperiment:
         return f"{known}; {self.motion}, for {self.duration:.2g} s, would tell most of it and bring it to 1 %"
 
 
-def next_experiment(fit: ParameterFit, rows: Rows, motion: Motion, unit: str) -> NextExperiment:
+def next_experiment(fit: ParameterFit, rows: Rows, motion: DriveMotion, unit: str) -> NextExperiment:
     """Choose a motion by the information that it adds per second.
 
     The information of a motion is that of its regressors over the variance that the fit's covariance implies for its
@@ -77,7 +77,7 @@ def next_experiment(fit: ParameterFit, rows: Rows, motion: Motion, unit: str) ->
     return NextExperiment(fit.names[place], now, best[1], best[0])
 
 
-def _rows_per_second(rows: Rows, motion: Motion) -> float:
+def _rows_per_second(rows: Rows, motion: DriveMotion) -> float:
     return rows.force.size / max(motion.seconds, np.finfo(float).tiny)
 
 
@@ -95,7 +95,7 @@ def _needed(fit: ParameterFit, place: int, scale: Array, per_second: Array) -> f
     return seconds
 
 
-def _motions(motion: Motion, unit: str) -> list[tuple[str, Array]]:
+def _motions(motion: DriveMotion, unit: str) -> list[tuple[str, Array]]:
     """Candidate motions in words, and the mean information of their regressors."""
     fastest = float(np.quantile(np.abs(motion.speed), 0.99))
     sharpest = float(np.quantile(np.abs(motion.acceleration), 0.99))

@@ -8,8 +8,8 @@ from drive_recordings import GAINS, PARAMETERS, prescribed, recording_of, simula
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.conditioning import band_of
+from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.identify import identify_drive
-from servotwin.estimation.inverse_dynamics.running_law import GivenGains, running_law
 
 P = 1e-3
 
@@ -30,16 +30,16 @@ def test_a_simulated_loop_gives_its_parameters_and_its_gains(integral_time):
 
 
 def test_gains_that_are_given_are_taken_as_they_are():
-    law = running_law(simulated(), GivenGains(**GAINS, speed_filter=3e-3))
+    law = fitted_cascade(simulated(), GivenGains(**GAINS, speed_filter=3e-3))
     assert (law.position_gain, law.velocity_gain, law.speed_filter) == (*GAINS.values(), 3e-3)
     assert law.left < 1e-6
-    wrong = running_law(simulated(), GivenGains(**(GAINS | {"position_gain": 50.0})))
+    wrong = fitted_cascade(simulated(), GivenGains(**(GAINS | {"position_gain": 50.0})))
     assert wrong.left > 0.3
 
 
 @pytest.mark.parametrize("known", ["position_gain", "velocity_gain"])
 def test_one_gain_that_is_given_helps_to_find_the_other(known):
-    law = running_law(simulated(), GivenGains(**{known: GAINS[known]}))
+    law = fitted_cascade(simulated(), GivenGains(**{known: GAINS[known]}))
     for name, true in GAINS.items():
         assert getattr(law, name) == pytest.approx(true, rel=1e-3), name
 

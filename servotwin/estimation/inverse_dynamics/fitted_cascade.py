@@ -22,7 +22,7 @@ _UNKNOWN = 0.25  # of the force: a law that leaves more is not the one that ran
 
 
 @dataclass(frozen=True)
-class RunningLaw:
+class FittedCascade:
     """Position P, velocity P or PI: force = Kv (e + integral of e / Ti), e = Kp (reference - position) - speed.
 
     Attributes
@@ -82,7 +82,7 @@ class GivenGains:
         return self.position_gain is not None and self.velocity_gain is not None
 
 
-def running_law(recording: DriveRecording, given: GivenGains) -> RunningLaw:
+def fitted_cascade(recording: DriveRecording, given: GivenGains) -> FittedCascade:
     """Fit what is not given: without integral action first, with it where that explains the force better.
 
     Raises
@@ -97,7 +97,7 @@ def running_law(recording: DriveRecording, given: GivenGains) -> RunningLaw:
                 f"{recording.source}: without a reference the controller's gains cannot be fitted: give --reference "
                 "COLUMN, or --position-gain and --velocity-gain"
             )
-        return RunningLaw(given.position_gain, given.velocity_gain, given.integral_time, given.speed_filter or step)  # type: ignore[arg-type]
+        return FittedCascade(given.position_gain, given.velocity_gain, given.integral_time, given.speed_filter or step)  # type: ignore[arg-type]
     encoders = (MOTOR,) if recording.load is None else (MOTOR, LOAD)
     integral = given.integral_time is not None
     simple = min((_fitted(recording, given, integral, on) for on in encoders), key=lambda law: law.left)
@@ -114,14 +114,14 @@ def differentiated(position: Array, time: float, rate: float) -> Array:
     return np.asarray(share * rate * (position - position[0] - slow))
 
 
-def _fitted(recording: DriveRecording, given: GivenGains, integral: bool, on: str) -> RunningLaw:
+def _fitted(recording: DriveRecording, given: GivenGains, integral: bool, on: str) -> FittedCascade:
     """Search the filter's time and the integral time; the two gains are linear."""
     step = 1.0 / recording.rate
     if given.speed_filter is not None and not (integral and given.integral_time is None):
         return _with_gains(recording, given, on)
     bounds = (math.log(_LEAST_FILTER * step), math.log(_LONGEST_FILTER * step))
 
-    def law_of(filter_log: float, integral_log: float | None) -> RunningLaw:
+    def law_of(filter_log: float, integral_log: float | None) -> FittedCascade:
         speed_filter = given.speed_filter or math.exp(filter_log)
         reset = given.integral_time if integral_log is None else math.exp(integral_log)
         return _with_gains(recording, replace(given, speed_filter=speed_filter, integral_time=reset), on)
@@ -140,7 +140,7 @@ def _fitted(recording: DriveRecording, given: GivenGains, integral: bool, on: st
     return law_of(*both.x)
 
 
-def _with_gains(recording: DriveRecording, given: GivenGains, on: str) -> RunningLaw:
+def _with_gains(recording: DriveRecording, given: GivenGains, on: str) -> FittedCascade:
     """The law of given filter times, its gains by linear least squares where they are not given."""
     reference, position, force, rate = recording.reference, recording.position, recording.force, recording.rate
     assert reference is not None
@@ -167,4 +167,4 @@ def _with_gains(recording: DriveRecording, given: GivenGains, on: str) -> Runnin
     if Kp is None:
         Kp = float(fit[0]) / Kv if Kv else 0.0
     share = float(np.linalg.norm(left) / np.linalg.norm(force))
-    return RunningLaw(Kp, Kv, given.integral_time, given.speed_filter, share if min(Kp, Kv) > 0.0 else math.inf, on)
+    return FittedCascade(Kp, Kv, given.integral_time, given.speed_filter, share if min(Kp, Kv) > 0.0 else math.inf, on)
