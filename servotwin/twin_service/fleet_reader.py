@@ -19,10 +19,11 @@ _GRACE_S = 5.0
 
 
 class FleetPage(NamedTuple):
-    """Rows by name, and the position of the store at which they were read."""
+    """Rows by name, the position of the store at which they were read, and the twin's time, s since the epoch."""
 
     rows: list[FleetRow]
     position: StorePosition
+    now: float
 
 
 class EdgePresence:
@@ -74,7 +75,8 @@ class FleetReader:
 
         def read(connection: sa.Connection) -> FleetPage:
             position = overview.position(connection)  # before the rows: what changes meanwhile is sent once more
-            return FleetPage(self._rows(connection, overview.names_after(connection, after, limit)), position)
+            rows = self._rows(connection, overview.names_after(connection, after, limit))
+            return FleetPage(rows, position, self._wall())
 
         return self._store.reading(read)
 

@@ -90,7 +90,7 @@ class DashboardApi:
             (parameter("file", {"type": "string"}, "Its name.", "path"),),
             errors=(404,),
         )
-        known = operation("Session of this browser", {200: ("tokens: whether they are needed.", JSON)}, errors=(401,))
+        known = operation("Session of this browser", {200: ("tokens: they are needed; admitted: this browser may read.", JSON)})
         login = operation(
             "Begin a session: the answer sets a cookie",
             {204: ("It has begun.", None)},
@@ -111,7 +111,7 @@ class DashboardApi:
         limit = parameter("limit", {**INTEGER, "maximum": MAX_ROWS}, "Largest number of rows.")
         fleet = operation(
             "Rows of the fleet: gap with interval, wear, time to the limit, version, last window, link, alarms",
-            {200: ("rows by name; position: for `after` of the events.", JSON)},
+            {200: ("rows by name; position: for `after` of the events; now: s since the epoch.", JSON)},
             (parameter("after", {"type": "string"}, "Only names after this one."), limit),
             errors=QUERY_ERRORS,
         )
@@ -176,8 +176,12 @@ class DashboardApi:
         return _file(asset, request)
 
     async def _get_session(self, request: HttpRequest) -> HttpResponse:
-        self._operators.check(request)
-        return _fresh({"tokens": not self._operators.open})
+        try:
+            self._operators.check(request)
+            admitted = True
+        except RequestRejected:
+            admitted = False
+        return _fresh({"tokens": not self._operators.open, "admitted": admitted})
 
     async def _post_session(self, request: HttpRequest) -> HttpResponse:
         body = await self._bodies.read(request.content_length, request.receive)
@@ -195,7 +199,7 @@ class DashboardApi:
         self._operators.check(request)
         after = request.argument("after") or ""
         page = await store_query(self._executor, partial(self._reader.page, after, limit_of(request)))
-        return _fresh({"rows": page.rows, "position": page.position.text})
+        return _fresh({"rows": page.rows, "position": page.position.text, "now": page.now})
 
     async def _get_events(self, request: HttpRequest) -> HttpStream:
         self._operators.check(request)
