@@ -72,7 +72,7 @@ def interval_95(gap: float | None, std: float | None) -> tuple[float | None, flo
 
 def interval_of(record: StoredEvidence) -> tuple[float | None, float | None] | None:
     """95 % interval of an estimate or a glance, rad; an end that is not finite is None: unbounded."""
-    body = body_of(record) if record.kind == "estimate" else None
+    body: Any = body_of(record) if record.kind == "estimate" else None
     try:
         low, high = body["estimate"]["interval"]
     except (KeyError, TypeError, ValueError):

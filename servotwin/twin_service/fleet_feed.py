@@ -66,7 +66,7 @@ class FleetFeed:
         """End all streams; new ones end at once."""
         self._closed = True
         for queue in self._queues:
-            _end(queue)
+            queue.put_nowait(None)
 
     def admit(self) -> None:
         """Check that there is room for a watcher; raises RequestRejected."""
@@ -82,11 +82,11 @@ class FleetFeed:
         allowed : callable
             Called before each event: where it raises RequestRejected, the stream ends.
         """
-        queue: asyncio.Queue[bytes | None] = asyncio.Queue(_WAITING)
+        queue: asyncio.Queue[bytes | None] = asyncio.Queue()
         self._queues.add(queue)
         self._joined.set()
         if self._closed:
-            _end(queue)
+            queue.put_nowait(None)
         try:
             yield b"retry: 2000\n\n"
             if after is not None:
@@ -142,11 +142,13 @@ class FleetFeed:
         return _event("rows", position, await self._executor.run(partial(self._reader.rows, names)))
 
     def _send(self, event: bytes) -> None:
-        for queue in self._queues:
-            try:
+        for queue in tuple(self._queues):
+            if queue.qsize() < _WAITING:
                 queue.put_nowait(event)
-            except asyncio.QueueFull:
-                _end(queue)
+            else:
+                # It gets what waits, but not this: so it resumes from the last event that it got.
+                queue.put_nowait(None)
+                self._queues.discard(queue)
 
 
 def position_of(text: str | None) -> StorePosition | None:
@@ -161,13 +163,6 @@ async def _next(queue: asyncio.Queue[bytes | None]) -> bytes | None:
             return await queue.get()
     except TimeoutError:
         return b": still there\n\n"
-
-
-def _end(queue: asyncio.Queue[bytes | None]) -> None:
-    """End a stream after what is on its way."""
-    while queue.full():
-        queue.get_nowait()
-    queue.put_nowait(None)
 
 
 def _event(kind: str, position: StorePosition | None, data: object) -> bytes:

@@ -90,7 +90,9 @@ class DashboardApi:
             (parameter("file", {"type": "string"}, "Its name.", "path"),),
             errors=(404,),
         )
-        known = operation("Session of this browser", {200: ("tokens: they are needed; admitted: this browser may read.", JSON)})
+        known = operation(
+            "Session of this browser", {200: ("tokens: they are needed; admitted: this browser may read.", JSON)}
+        )
         login = operation(
             "Begin a session: the answer sets a cookie",
             {204: ("It has begun.", None)},

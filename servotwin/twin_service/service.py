@@ -122,6 +122,7 @@ class TwinService:
         self.claims = EdgeClaims(
             store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
         )
+        self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)
@@ -139,9 +140,8 @@ class TwinService:
         """HTTP application, whose lifespan starts and stops the service."""
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
-        operators = OperatorAccess(self.access, self.clocks.wall, self.config.encrypted)
-        operator = OperatorApi(operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
-        dashboard = DashboardApi(operators, self.store, self.executor, self._reader, self.feed)
+        operator = OperatorApi(self.operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
+        dashboard = DashboardApi(self.operators, self.store, self.executor, self._reader, self.feed)
         routes = [*edge.routes(), *operator.routes(), *dashboard.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)

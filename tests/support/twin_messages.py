@@ -69,7 +69,7 @@ def receipt(update, reason=Reason.APPLIED, in_force=None, boot="boot-1"):
 
 
 def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowMessage:
-    """Message of a window, with theta_m packed finely; `changes`: servo, version, reason, boot, start."""
+    """Message of a window, with theta_m packed finely; `changes`: version, reason, boot, start."""
     channels = []
     for name, samples in window.channels.items():
         unit = {"theta_m": "rad", "voltage": "V"}.get(name, "m")
@@ -77,7 +77,7 @@ def message_of(window: Window, sequence: int = 1, **changes) -> messages.WindowM
         channels += packed
     told = {"version": 0, "reason": "reference", "boot": "b", **changes}
     return messages.WindowMessage(
-        told.get("servo", "axis"),
+        "axis",
         told["boot"],
         sequence,
         told.get("start", window.start),

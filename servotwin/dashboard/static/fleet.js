@@ -2,7 +2,7 @@
 
 import * as api from "./api.js";
 import { element, setText, svg } from "./dom.js";
-import { ago, brief, DEG, gapText, limitInterval, limitText, linkOf, rateText, rateUnit, travelText } from "./format.js";
+import { ago, brief, DEG, gapText, limitInterval, limitText, linkOf, rateText, rateUnit, statusText, travelText } from "./format.js";
 
 const OVERSCAN = 6, HISTORIES = 48, AGES_MS = 5000;
 const WIDTH = 120, HEIGHT = 32;
@@ -23,7 +23,7 @@ const COLUMNS = [
 const FILTERS = [
   ["all", "all", () => true],
   ["alarms", "with alarms", (row) => row.alarms.length > 0],
-  ["limit", "near or over the limit", (row) => row.until_limit !== null && row.until_limit < 7 * 86400],
+  ["limit", "at the limit within 7 days", (row) => row.until_limit !== null && row.until_limit < 7 * 86400],
   ["silent", "silent", (row, now) => linkOf(row, now).kind === "bad"],
   ["unknown", "without a gap", (row) => row.gap === null],
 ];
@@ -217,7 +217,7 @@ export class FleetPage {
 
   fill(cells, row) {
     const now = this.live.now(), link = linkOf(row, now);
-    setText(cells.servo.lastChild, row.gap === null && !row.status ? "no estimate yet" : row.status === "ok" ? "estimate accepted" : row.status);
+    setText(cells.servo.lastChild, row.gap === null && !row.status ? "no estimate yet" : statusText(row.status));
     pair(cells.gap, gapText(row.gap, row.interval), travelText(row.gap, row));
     pair(cells.rate, rateText(row.rate, row.rate_interval, this.unit), row.rate === null ? "no trend yet" : "");
     pair(cells.limit, limitText(row), limitInterval(row));
@@ -234,12 +234,12 @@ export class FleetPage {
 
   drawHistory(cells, row) {
     const values = (this.histories.get(row.servo) ?? []).filter((value) => value !== null);
-    const most = Math.max(...values, 1e-9) * 1.08;
+    const top = Math.max(...values, 1e-9), span = Math.max(top - Math.min(...values), 0.2 * top), low = Math.max(0, top - span);
     const x = (i) => (values.length > 1 ? (i * (WIDTH - 6)) / (values.length - 1) + 3 : WIDTH / 2);
-    const y = (value) => HEIGHT - 3 - (value / most) * (HEIGHT - 6);
+    const y = (value) => HEIGHT - 3 - ((value - low) / (top - low)) * (HEIGHT - 6);
     const path = values.length === 1 ? `M3 ${y(values[0])}H${WIDTH - 3}` : values.map((value, i) => `${i ? "L" : "M"}${x(i).toFixed(1)} ${y(value).toFixed(1)}`).join("");
     if (cells.line.getAttribute("d") !== path) cells.line.setAttribute("d", path);
-    cells.history.title = values.length ? `Gap of the last ${values.length} windows: ${brief(values[0] * DEG)} to ${brief(values.at(-1) * DEG)} deg; the scale begins at 0` : "";
+    cells.history.title = values.length ? `Gap of the last ${values.length} windows: ${brief(values[0] * DEG)} to ${brief(values.at(-1) * DEG)} deg; the scale is ${brief(low * DEG)} to ${brief(top * DEG)} deg` : "";
   }
 
   // Short histories of the visible rows, asked for together, at most once a second.

@@ -28,6 +28,9 @@ export function gapText(gap, interval, scale = DEG) {
   return `${fixed(gap * scale, decimals)} ± ${fixed(half, decimals)}`;
 }
 
+// The store's word for a window that told nothing new is "nothing moved".
+export const statusText = (status) => ({ ok: "estimate accepted", "nothing moved": "unchanged", "": "no estimate yet" })[status] ?? status;
+
 // The gap as travel of the load: micrometres or degrees.
 export function travelText(gap, row) {
   if (gap === null || !row.travel) return "";

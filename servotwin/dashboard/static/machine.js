@@ -4,7 +4,7 @@
 import * as api from "./api.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
-import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, stamp, travelText } from "./format.js";
+import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, stamp, statusText, travelText } from "./format.js";
 import { chainTable, eventList, simulated } from "./updates.js";
 
 const REFRESH_MS = 1500, POINTS = 700, EVERY = 20000;
@@ -102,7 +102,7 @@ export class MachinePage {
         { label: "accepted", color: "blue", points: true, only: true }, { label: "not accepted", color: "blue", points: true, hollow: true, only: true },
         { label: "trend", color: "green", width: 2, spanGaps: true }, { label: "limit", color: "red", dash: [6, 4], spanGaps: true },
       ],
-      bands: [[1, 2, "blue"]], range: (low, high) => [0, high > 0 ? high * 1.1 : 1],
+      bands: [[1, 2, "blue"]], range: around,
     });
     const fromZero = (low, high) => [0, high > 0 ? high * 1.12 : 1];
     this.tailPlot = plot(places.tail, { time: true, yLabel: "Error at the end", marks: versions, range: fromZero, series: [{ label: "error", color: "blue", points: true, spanGaps: true }] });
@@ -138,7 +138,7 @@ export class MachinePage {
     setText(this.blank, this.gaps ? "No window of this machine has come yet: there is nothing to estimate from." : row || this.live.state !== "live" ? "Reading …" : "The twin knows no machine of this name.");
     if (!row) return;
     const unit = rateUnit([row.rate]), link = linkOf(row, now);
-    this.tile("gap", gapText(row.gap, row.interval), [row.status === "ok" ? "estimate accepted" : row.status || "no estimate yet", travelText(row.gap, row)]);
+    this.tile("gap", gapText(row.gap, row.interval), [statusText(row.status), travelText(row.gap, row)]);
     this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time, 95 %"]);
     this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
     this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? row.receipt : ""]);
@@ -264,6 +264,13 @@ export class MachinePage {
     }
     this.loop.replaceChildren(loopPlot(x, y, { xLabel: "Motor (deg)", yLabel: "Motor ahead of the load (deg)", about: "Hysteresis loop of motor and load" }));
   }
+}
+
+// A range around the data, wide enough that noise does not look like wear.
+function around(low, high) {
+  if (low === null || high === null) return [0, 1];
+  const least = Math.max(0.15 * Math.abs(high), 0.02), more = Math.max(0, least - (high - low)) / 2 + 0.08 * (high - low);
+  return [Math.max(0, low - more), high + more];
 }
 
 // Channels are decimated one by one: between its own samples a channel is interpolated.
