@@ -155,6 +155,9 @@ def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
     assert page.locator("[aria-label=Updates] tbody tr").count() == 4
     has_text(page, "[aria-label='Behind the last update']", "not simulated")
     has_text(page, "[aria-label=Events]", "edge connected: boot boot-1")
+    page.set_viewport_size({"width": 360, "height": 740})
+    page.select_option("[aria-label=Window] select", index=1)
+    has_text(page, "[aria-label=Window] p", "The least and greatest sample")
     page.click("text=Every sample")
     has_text(page, "[aria-label=Window] p", "Every sample is shown")
     with page.expect_download() as download:

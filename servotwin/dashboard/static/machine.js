@@ -7,7 +7,7 @@ import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, stamp, statusText, travelText } from "./format.js";
 import { chainTable, eventList, simulated } from "./updates.js";
 
-const REFRESH_MS = 1500, POINTS = 700, EVERY = 20000;
+const REFRESH_MS = 1500, EVERY = 20000;
 const scaled = (values, factor) => values.map((value) => (value === null ? null : value * factor));
 
 export class MachinePage {
@@ -205,13 +205,18 @@ export class MachinePage {
       this.choice.dataset.newest = listed[0];
       if (!this.follow && listed.includes(chosen)) this.choice.value = chosen;
     }
-    if (this.shown !== this.choice.value) await this.loadWindow(POINTS);
+    if (this.shown !== this.choice.value) await this.loadWindow(this.columns());
   }
 
   pick(key) {
     this.follow = this.choice.selectedIndex === 0;
     this.choice.value = key;
-    this.loadWindow(POINTS);
+    this.loadWindow(this.columns());
+  }
+
+  // Two columns of samples per three pixels: more would not be seen.
+  columns() {
+    return Math.max(100, Math.round(this.positionPlot.place.clientWidth / 1.5));
   }
 
   async loadWindow(points) {
