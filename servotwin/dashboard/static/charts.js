@@ -2,13 +2,15 @@
 
 /* global uPlot */
 import { colour, element, svg } from "./dom.js";
-import { brief } from "./format.js";
+import { fixed } from "./format.js";
 
-const FONT = "12px system-ui, sans-serif";
+// Sizes follow that of the page's text.
+const rem = () => parseFloat(getComputedStyle(document.documentElement).fontSize) / 16;
 
-function axis(label, more = {}) {
+function axis(label, size, more = {}) {
+  const font = `${Math.round(12 * rem())}px system-ui, sans-serif`;
   return {
-    label, labelFont: FONT, font: FONT, labelSize: 18, stroke: colour("soft"), size: 58,
+    label, labelFont: font, font, labelSize: 18 * rem(), stroke: colour("soft"), size: size * rem(),
     grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, ...more,
   };
 }
@@ -18,7 +20,8 @@ function marks(list) {
   return (plot) => {
     const { ctx, bbox } = plot;
     ctx.save();
-    ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
+    const unit = devicePixelRatio * rem();
+    ctx.font = `${11 * unit}px system-ui, sans-serif`;
     let free = -Infinity;
     for (const { at, word, color, dash } of list()) {
       const x = plot.valToPos(at, "x", true);
@@ -32,8 +35,8 @@ function marks(list) {
       ctx.stroke();
       const width = ctx.measureText(word).width;
       if (x > free && x + width < bbox.left + bbox.width) {
-        ctx.fillText(word, x + 3 * devicePixelRatio, bbox.top + 11 * devicePixelRatio);
-        free = x + width + 8 * devicePixelRatio;
+        ctx.fillText(word, x + 3 * unit, bbox.top + 11 * unit);
+        free = x + width + 8 * unit;
       }
     }
     ctx.restore();
@@ -70,8 +73,8 @@ export class TimePlot {
       cursor: { sync: options.sync ? { key: options.sync } : undefined, drag: { x: true, y: false } },
       scales: { x: { time: Boolean(options.time) }, y: { range: options.range && ((_, low, high) => options.range(low, high)) } },
       axes: [
-        axis(options.xLabel, { size: options.time ? 46 : 34, values: options.time ? [...TIME_FORMATS] : undefined }),
-        axis(options.yLabel, { values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
+        axis(options.xLabel, options.time ? 46 : 34, { values: options.time ? [...TIME_FORMATS] : undefined }),
+        axis(options.yLabel, 58, { values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
       ],
       series: [{}, ...options.series.map((each) => ({
         label: each.label, stroke: colour(each.color), width: each.width ?? 1.6, dash: each.dash, spanGaps: Boolean(each.spanGaps),
@@ -120,10 +123,12 @@ const TIME_FORMATS = [
   [0.001, ":{ss}.{fff}", "\n{HH}:{mm}", null, null, null, null, null, 1],
 ];
 
+// As many decimals as the distance of two ticks needs.
 function label(tick, ticks) {
   const step = Math.abs(ticks[1] - ticks[0]) || 1;
-  const decimals = Math.max(0, Math.min(9, -Math.floor(Math.log10(step) + 1e-9)));
-  return tick.toFixed(decimals).replace("-", "−");
+  let decimals = 0;
+  while (decimals < 9 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6) decimals++;
+  return fixed(tick, decimals);
 }
 
 const translucent = (color) => color.replace(/^rgb\((.*)\)$/, "rgba($1, 0.22)");
@@ -136,11 +141,12 @@ export function loopPlot(x, y, { xLabel, yLabel, about }) {
   const py = (value) => H - bottom - ((value - y0) / (y1 - y0)) * (H - top - bottom);
   const node = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": about });
   const line = (d, stroke, width) => svg("path", { d, fill: "none", stroke, "stroke-width": width });
-  for (const tick of ticksOf(x0, x1)) {
-    node.append(line(`M${px(tick)} ${top}V${H - bottom}`, "var(--grid)", 1), text(brief(tick), px(tick), H - bottom + 16, "middle"));
+  const across = ticksOf(x0, x1), up = ticksOf(y0, y1);
+  for (const tick of across) {
+    node.append(line(`M${px(tick)} ${top}V${H - bottom}`, "var(--grid)", 1), text(label(tick, across), px(tick), H - bottom + 16, "middle"));
   }
-  for (const tick of ticksOf(y0, y1)) {
-    node.append(line(`M${left} ${py(tick)}H${W - right}`, "var(--grid)", 1), text(brief(tick), left - 6, py(tick) + 4, "end"));
+  for (const tick of up) {
+    node.append(line(`M${left} ${py(tick)}H${W - right}`, "var(--grid)", 1), text(label(tick, up), left - 6, py(tick) + 4, "end"));
   }
   const d = x.map((value, i) => `${i ? "L" : "M"}${px(value).toFixed(1)} ${py(y[i]).toFixed(1)}`).join("");
   node.append(line(d, "var(--blue)", 1.4), text(xLabel, (left + W - right) / 2, H - 8, "middle"));

@@ -43,6 +43,7 @@ export class Live {
     source.addEventListener("open", () => {
       this.failures = 0;
       this.set("live");
+      this.changed([]);
     });
     source.addEventListener("rows", (event) => this.take(event));
     source.addEventListener("reload", () => this.start());

@@ -135,7 +135,9 @@ export class MachinePage {
     const known = this.gaps?.windows.received.length ?? 0;
     this.content.hidden = known === 0;
     this.blank.hidden = known > 0;
-    setText(this.blank, this.gaps ? "No window of this machine has come yet: there is nothing to estimate from." : row || this.live.state !== "live" ? "Reading …" : "The twin knows no machine of this name.");
+    const unknown = !row && this.live.state === "live";
+    const none = this.gaps ? "No window of this machine has come yet: there is nothing to estimate from." : "Reading …";
+    setText(this.blank, unknown ? "The twin knows no machine of this name." : none);
     if (!row) return;
     const unit = rateUnit([row.rate]), link = linkOf(row, now);
     this.tile("gap", gapText(row.gap, row.interval), [statusText(row.status), travelText(row.gap, row)]);
@@ -177,17 +179,24 @@ export class MachinePage {
     const high = scaled(windows.high, DEG), top = Math.max(0, ...gap.filter((value) => value !== null)) * 1.5 + 0.1;
     const near = limit !== null && limit < 3 * top ? limit : null;
     const newest = this.live.rows.get(this.name) ?? { gap: null };
+    // The last version may have been applied after the last window.
+    const [last] = this.marks().map((mark) => mark.at).slice(-1), later = last > windows.received.at(-1) ? [last] : [];
+    const time = [...windows.received, ...later];
     this.gapPlot.show([
-      windows.received,
-      high.map((value) => (value === null ? null : Math.min(value, Math.max(top, near ?? 0)))),
-      scaled(windows.low, DEG).map((value, i) => (high[i] === null ? null : value)),
-      gap.map((value, i) => (accepted[i] ? value : null)), gap.map((value, i) => (accepted[i] ? null : value)),
-      scaled(windows.trend, DEG), gap.map(() => near),
+      time,
+      ...[
+        high.map((value) => (value === null ? null : Math.min(value, Math.max(top, near ?? 0)))),
+        scaled(windows.low, DEG).map((value, i) => (high[i] === null ? null : value)),
+        gap.map((value, i) => (accepted[i] ? value : null)), gap.map((value, i) => (accepted[i] ? null : value)),
+        scaled(windows.trend, DEG),
+      ].map((values) => [...values, ...later.map(() => null)]),
+      time.map(() => near),
     ], `Gap over ${count} windows: newest ${gapText(newest.gap, newest.interval)} deg`);
     const unit = positionUnit(machine);
     this.tailPlot.options.yLabel = `Error at the end (${unit.name})`;
     this.tailPlot.show([windows.received, scaled(windows.tail, unit.factor)], "Largest tracking error in the last tenth of each window");
-    const residual = unit.name === "mm" ? ["nm", 1e9] : ["µrad", 1e6];
+    const fine = Math.max(...windows.residual) < (unit.name === "mm" ? 1e-6 : 1e-3);
+    const residual = unit.name === "mm" ? (fine ? ["nm", 1e9] : ["µm", 1e6]) : fine ? ["µrad", 1e6] : ["mrad", 1e3];
     this.residualPlot.options.yLabel = `Residual, rms (${residual[0]})`;
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
     this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
