@@ -17,7 +17,7 @@ from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.window import Window
 from servotwin.simulation import simulate
 
-PRESETS = ("two-mass-drive", "ball-screw", "robot-joint", "gantry")
+PRESETS = ("two-mass-drive", "robot-joint", "gantry")
 _LEAST = 1.0
 """Smallest gap over the healthy one; the largest is that of the shelf."""
 

@@ -23,7 +23,8 @@ from servotwin.simulation import Run, simulate
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
-SCREW = Axis.preset("ball-screw")
+LIGHT = Axis.preset("ball-screw")
+SCREW = LIGHT.replace(load=dataclasses.replace(LIGHT.load, m=(100.0,)))
 RATE, BEGIN, LENGTH = 2000.0, 0.38, 0.2
 GAP = 25e-6 / SCREW.p
 SETTINGS = TwinSettings(policy="paper", k_dz=0.0, trend=TrendSettings.for_wear(GAP, 3600.0))
@@ -31,7 +32,7 @@ SETTINGS = TwinSettings(policy="paper", k_dz=0.0, trend=TrendSettings.for_wear(G
 
 @pytest.fixture(scope="module")
 def run() -> Run:
-    """Two steps of the ball screw with five times its healthy gap."""
+    """Two steps of the ball screw with a table of 100 kg and a gap of 25 um."""
     return simulate(SCREW, 0.6, reference=SquareWave(2.5e-4, 0.8), gap=GAP, sample_rate=RATE)
 
 
@@ -42,8 +43,8 @@ def window(run: Run) -> Window:
     return Window(theta_m=seen.theta_m, voltage=seen.voltage, sample_rate=RATE, start=BEGIN)
 
 
-def test_a_model_with_the_true_numbers_predicts_the_motor_to_its_counts(run: Run, window: Window) -> None:
-    """The residual beside the true gap is that of the counts; a gap that is 5 % off leaves more, none much more."""
+def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window: Window) -> None:
+    """To a five-hundredth of its travel; a gap that is 5 % off leaves more, no gap ten times as much."""
     assert window.theta_m is not None
     assert window.voltage is not None
     shaft = ShaftModel(SCREW, Priors(0.1, 0.1, 0.1, 0.1, 1e-3))
@@ -52,16 +53,16 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_to_its_counts(run: Run
     problem = MotorProblem(model, SCREW.p * window.theta_m, window.voltage, 1.0 / RATE, count)
     values = problem.start(0.5 * SCREW.p * GAP, 0.0)
     first = round(BEGIN * RATE)
-    values[len(shaft.unknowns) - 2 : len(shaft.unknowns)] = run.q[first, 0], 0.0
+    values[len(shaft.unknowns) - 2 : len(shaft.unknowns)] = run.q[first, 0], RATE * np.gradient(run.q[:, 0])[first]
 
     def left(factor: float) -> float:
         changed = values.copy()
         changed[0] *= factor
         return float(np.std(problem.misfit(changed, 0.15 * model.speed))) / count
 
-    assert left(1.0) < 2.5
+    assert left(1.0) < 2e-3 * float(np.ptp(window.theta_m)) / SCREW.encoder_resolution
     assert left(0.95) > 1.2 * left(1.0)
-    assert left(0.0) > 5.0 * left(1.0)
+    assert left(0.0) > 10.0 * left(1.0)
 
 
 def test_the_twin_of_an_axis_without_a_load_encoder_estimates_its_gap(window: Window) -> None:
@@ -86,6 +87,12 @@ def test_a_motor_that_does_not_feel_the_load_is_refused_in_words(name: str, wind
     if blind.at_motor:
         with pytest.raises(InvalidInput, match="do not show the gap"):
             estimator_of(blind, SETTINGS)
+
+
+def test_a_load_that_is_light_beside_the_motor_is_refused(window: Window) -> None:
+    """Two of five accepted windows of this preset were wrong when it was not."""
+    with pytest.raises(InvalidInput, match="inertia at the motor is 11 % of the motor's own"):
+        estimate_gap(window, LIGHT)
 
 
 def test_the_papers_servo_has_no_reaction(window: Window) -> None:
