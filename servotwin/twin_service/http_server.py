@@ -7,6 +7,7 @@ import resource
 import signal
 import socket
 import ssl
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
@@ -15,6 +16,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
+from servotwin.runtime.service_manager import ServiceManager
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
@@ -207,11 +209,15 @@ class HttpServer(uvicorn.Server):
     app : HttpApp
     close_polls : callable
         Ends all long polls.
+    works : callable
+        Test whether the service still does its work; where it does not, the service manager's watchdog restarts it.
     """
 
-    def __init__(self, config: ServiceConfig, app: HttpApp, close_polls: Callable[[], None]) -> None:
+    def __init__(
+        self, config: ServiceConfig, app: HttpApp, close_polls: Callable[[], None], works: Callable[[], bool]
+    ) -> None:
         super().__init__(_server_config(config, app))
-        self._close_polls = close_polls
+        self._close_polls, self._works, self._manager = close_polls, works, ServiceManager()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -227,8 +233,16 @@ class HttpServer(uvicorn.Server):
         await super().startup(sockets)
         for each in sockets or ():
             print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
+        if self.started:
+            self._manager.ready()
+
+    async def on_tick(self, counter: int) -> bool:
+        if self._works():
+            self._manager.alive(time.monotonic())
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._manager.stopping()
         self._close_polls()
         await super().shutdown(sockets)
 

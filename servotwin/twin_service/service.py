@@ -178,11 +178,15 @@ class TwinService:
 
     def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
-        store, workers = self._store_healthy(), self.pool.alive
-        # A task that ended without an error did so because of the damage.
-        dispatching = not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
+        store, workers, dispatching = self._store_healthy(), self.pool.alive, self.dispatching
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
         return {"ok": store and workers > 0 and dispatching, "degraded": self._lagging(backlog), **parts}
+
+    @property
+    def dispatching(self) -> bool:
+        """False where a task of the service has failed; only a restart begins it again."""
+        # A task that ended without an error did so because of the damage.
+        return not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
 
     def _lagging(self, backlog: Backlog | None) -> list[str]:
         """The lag in a sentence, where it is above its limit."""
