@@ -58,11 +58,12 @@ def serve(twin: TwinFile, store: Store, listener: socket.socket, pool: WorkerPoo
 
 
 def _open_configured_store(config: ServiceConfig) -> Store:
-    """Open the store, with its password."""
+    """Open the store, with its password and the certificates that its server's is checked against."""
     address = config.store
-    if config.store_password is not None:
-        address = sa.make_url(address).set(password=config.store_password).render_as_string(hide_password=False)
-    return open_store(address)
+    if config.store_ca is not None:
+        verified = {"sslmode": "verify-full", "sslrootcert": str(config.store_ca)}
+        address = sa.make_url(address).update_query_dict(verified).render_as_string(hide_password=False)
+    return open_store(address, config.store_password)
 
 
 def open_existing_store(config: ServiceConfig) -> Store:

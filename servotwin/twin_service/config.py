@@ -122,6 +122,14 @@ class ServiceConfig:
         str, key(parse=_store_url, help="SQLAlchemy URL without a password; a SQLite file is relative to this one.")
     ] = "sqlite:///twin.db"
     store_password: str | None = None
+    store_ca: Annotated[
+        Path | None,
+        key(
+            parse=_file,
+            help="PEM file with the certificates against which PostgreSQL's is checked, with its host's name "
+            "(sslmode=verify-full); where absent, the connection is as the URL says.",
+        ),
+    ] = None
     workers: Annotated[int, key(minimum=1, maximum=256, help="Processes that estimate.")] = 2
     tls_certificate: Annotated[Path | None, key(parse=_file, help="PEM file; both or none.")] = None
     tls_key: Annotated[Path | None, key(parse=_file, help="PEM file with the certificate's key.")] = None
@@ -191,6 +199,12 @@ class ServiceConfig:
         check(self)
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise InvalidInput("tls_certificate and tls_key belong together: give both or none")
+        if self.store_ca is not None and not self.store.startswith("postgresql"):
+            raise InvalidInput(f"store_ca is for PostgreSQL; store is {self.store!r}")
+        if self.store_ca is not None and "ssl" in self.store.partition("?")[2]:
+            raise InvalidInput(
+                "store_ca and options ssl... in the URL of store exclude each other; leave out the latter"
+            )
         if not self.local and (self.tokens is None or (self.tls_key is None and not self.behind_proxy)):
             raise InvalidInput(
                 f"bind = {self.bind!r} can be reached from other machines: this requires tokens, and tls_certificate "
