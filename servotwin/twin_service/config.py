@@ -203,7 +203,7 @@ class ServiceConfig:
             raise InvalidInput(f"store_ca is for PostgreSQL; store is {self.store!r}")
         if self.store_ca is not None and "ssl" in self.store.partition("?")[2]:
             raise InvalidInput(
-                "store_ca and options ssl... in the URL of store exclude each other; leave out the latter"
+                "store_ca and options ssl... of the store's URL exclude each other; leave the latter out"
             )
         if not self.local and (self.tokens is None or (self.tls_key is None and not self.behind_proxy)):
             raise InvalidInput(
