@@ -1,5 +1,5 @@
 #!/bin/sh
-# Debian's mosquitto and PostgreSQL, which some tests start for themselves; without root or apt-get those tests are skipped.
+# Debian's mosquitto, PostgreSQL and Prometheus (for promtool), which some tests run for themselves; without root or apt-get those tests are skipped.
 set -eu
 
 POLICY=/usr/sbin/policy-rc.d
@@ -10,6 +10,7 @@ have_postgresql() { command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin
 missing=""
 have_mosquitto || missing="$missing mosquitto"
 have_postgresql || missing="$missing postgresql"
+command -v promtool >/dev/null || missing="$missing prometheus"
 [ -n "$missing" ] || exit 0
 
 go_on() {

@@ -13,6 +13,7 @@ from typing import Any
 import msgspec
 
 from servotwin.messages import NAME_PATTERN, Refusal
+from servotwin.runtime.prometheus import CONTENT_TYPE
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import Backlog, StoredEvidence, WindowTrace
 from servotwin.store.store import Store
@@ -36,7 +37,7 @@ from servotwin.twin_service.http_app import (
 )
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
 from servotwin.twin_service.limits import RequestRejected
-from servotwin.twin_service.monitoring import CONTENT_TYPE, Metrics
+from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.store_executor import StoreExecutor
 
 MAX_ROWS = 1000

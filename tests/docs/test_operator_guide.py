@@ -138,7 +138,12 @@ def test_every_metric_is_explained(system: TwinService) -> None:
         "twin_service", "counts.add", ".add"
     )
     everywhere = re.findall(r"\bservotwin_[a-z_]+", ALARM + GUIDE)
-    assert set(everywhere) - told <= {"servotwin_version"}
+    assert {name for name in everywhere if not name.startswith("servotwin_edge_")} - told <= {"servotwin_version"}
+
+
+def test_every_metric_of_an_edge_is_explained() -> None:
+    made = calls("edge_process", "_Metric", "metric_lines")
+    assert set(named("Metrics of an edge")) == made | {"servotwin_edge_tick_seconds"}
 
 
 def test_every_field_of_health_is_explained(system: TwinService) -> None:
