@@ -1,5 +1,5 @@
 #!/bin/sh
-# Debian's mosquitto, PostgreSQL and Prometheus (for promtool), which some tests run for themselves; without root or apt-get those tests are skipped.
+# Debian's mosquitto, PostgreSQL Prometheus (for promtool) and docker-compose, which some tests run for themselves; without root or apt-get those tests are skipped.
 set -eu
 
 POLICY=/usr/sbin/policy-rc.d
@@ -11,6 +11,7 @@ missing=""
 have_mosquitto || missing="$missing mosquitto"
 have_postgresql || missing="$missing postgresql"
 command -v promtool >/dev/null || missing="$missing prometheus"
+command -v docker-compose >/dev/null || missing="$missing docker-compose"
 [ -n "$missing" ] || exit 0
 
 go_on() {
