@@ -98,6 +98,13 @@ class AccessControl:
         if not any(matches):
             raise self._rejected(verifier, "the token is not an operator's")
 
+    def knows(self, token: bytes | None) -> bool:
+        """Test whether a token is anybody's."""
+        try:
+            return _digest(token) in self._known
+        except RequestRejected:
+            return False
+
     def verifier(self, servo: str) -> bytes | None:
         """Verifier with which messages to a servo are sealed; None: its token was revoked."""
         return _OPEN if self._verifiers is None else self._verifiers.servos.get(servo)

@@ -160,6 +160,31 @@ class ServiceConfig:
     max_body_bytes: Annotated[
         int, key(minimum=1024, maximum=MAX_BYTES, help="Largest size of a body, as sent and as decompressed.")
     ] = MAX_BYTES
+    samples_per_window: Annotated[
+        int,
+        key(minimum=1, help="Largest number of samples of a window; a worker's time and memory for it grow with them."),
+    ] = 100_000
+    megabytes_per_day: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Largest mean rate at which one servo fills the disk, in MB of messages as they are stored; of a rate "
+            "above it the edge keeps what is too much, and sends it later.",
+        ),
+    ] = 2000.0
+    strangers: Annotated[
+        int, key(minimum=1, maximum=_MOST, help="Largest number of connections open at once that have shown no token.")
+    ] = 8192
+    strangers_per_address: Annotated[
+        int,
+        key(
+            minimum=1,
+            maximum=_MOST,
+            help="Largest number of them from one address, once they are older than 2 s; with tokens only, and not "
+            "behind a proxy.",
+        ),
+    ] = 128
     body_timeout_s: Annotated[float, key(above=0.0, help="Time within which a body must arrive.")] = 30.0
     long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Largest number of long polls open at once.")] = (
         20_000

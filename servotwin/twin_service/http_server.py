@@ -10,6 +10,8 @@ import ssl
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
@@ -17,9 +19,11 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
 from servotwin.runtime.service_manager import ServiceManager
+from servotwin.twin_service.auth import bearer_token
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
+from servotwin.twin_service.strangers import Stranger, StrangerLimit
 
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
@@ -48,12 +52,23 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     _head = _unreported = _drained = 0
     _timer: asyncio.TimerHandle | None = None
     _drain_timer: asyncio.TimerHandle | None = None
+    _stranger: Stranger | None = None
+
+    def __init__(self, *, strangers: StrangerLimit | None, **options: Any) -> None:
+        super().__init__(**options)
+        self._strangers = strangers
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._start_timer()
+        if self._strangers is not None:
+            self._stranger = self._strangers.enter(_address_of(transport), transport.abort)
+            if self._stranger is None:
+                transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        if self._stranger is not None:
+            self._stranger.leave()
         self._stop_timer()
         self._stop_drain()
         super().connection_lost(exc)
@@ -90,6 +105,8 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         self._unreported = 0
         self._stop_timer()
+        if self._stranger is not None:
+            self._stranger.show(bearer_token(dict(self.headers).get(b"authorization")))
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
@@ -209,14 +226,21 @@ class HttpServer(uvicorn.Server):
     app : HttpApp
     close_polls : callable
         Ends all long polls.
+    strangers : StrangerLimit or None
+        Limit of the connections that have shown no token.
     works : callable
         Test whether the service still does its work; where it does not, the service manager's watchdog restarts it.
     """
 
     def __init__(
-        self, config: ServiceConfig, app: HttpApp, close_polls: Callable[[], None], works: Callable[[], bool]
+        self,
+        config: ServiceConfig,
+        app: HttpApp,
+        close_polls: Callable[[], None],
+        strangers: StrangerLimit | None,
+        works: Callable[[], bool],
     ) -> None:
-        super().__init__(_server_config(config, app))
+        super().__init__(_server_config(config, app, strangers))
         self._close_polls, self._works, self._manager = close_polls, works, ServiceManager()
 
     @contextmanager
@@ -247,11 +271,16 @@ class HttpServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _server_config(config: ServiceConfig, app: HttpApp) -> uvicorn.Config:
+def _address_of(transport: asyncio.Transport) -> str:
+    peer = transport.get_extra_info("peername")
+    return str(peer[0]) if isinstance(peer, tuple) and peer else ""
+
+
+def _server_config(config: ServiceConfig, app: HttpApp, strangers: StrangerLimit | None) -> uvicorn.Config:
     """Configure uvicorn."""
     return uvicorn.Config(
         app,
-        http=_LimitedHttpProtocol,
+        http=partial(_LimitedHttpProtocol, strangers=strangers),  # type: ignore[arg-type]
         ws="none",
         lifespan="on",
         log_config=None,

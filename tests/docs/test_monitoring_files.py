@@ -29,7 +29,7 @@ EDGE = {
 
 def exported(folder: Path) -> str:
     """Metrics of a twin that has a broker, and of an edge."""
-    twin = read_twin(twin_file(folder, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n', tokens=False))
+    twin = read_twin(twin_file(folder, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n'))
     store = open_store(twin.service.store)
     system = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
     try:

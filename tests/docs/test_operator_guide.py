@@ -118,7 +118,7 @@ def test_every_answer_and_every_cause_is_explained(title: str, names: Any) -> No
 @pytest.fixture
 def system(tmp_path: Path) -> Iterator[TwinService]:
     """A service that has not begun, with a broker, so that it has every metric."""
-    twin = read_twin(twin_file(tmp_path, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n', tokens=False))
+    twin = read_twin(twin_file(tmp_path, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n'))
     store = open_store(twin.service.store)
     made = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
     try:
