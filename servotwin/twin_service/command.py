@@ -6,15 +6,16 @@ import asyncio
 import logging
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
 from servotwin.runtime.locks import lock_beside, locked
-from servotwin.store.engine import parse_address, sqlite_file
+from servotwin.store.engine import StoreUnavailable, parse_address, sqlite_file
 from servotwin.store.store import Store, open_store
+from servotwin.twin_service.auth import read_tokens
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_server import HttpServer, check_tls, listening_socket, raise_descriptor_limit
 from servotwin.twin_service.monitoring import configure_logging
@@ -44,6 +45,7 @@ def run(path: Path, port: int | None = None) -> None:
         closing(_open_configured_store(twin.service)) as store,
         listening_socket(twin.service, port) as listener,
     ):
+        check_fleet(store, twin.service.tokens)
         serve(twin, store, listener, pool)
 
 
@@ -66,6 +68,26 @@ def _open_configured_store(config: ServiceConfig) -> Store:
         verified = {"sslmode": "verify-full", "sslrootcert": str(config.store_ca)}
         address = sa.make_url(address).update_query_dict(verified).render_as_string(hide_password=False)
     return open_store(address, config.store_password)
+
+
+def check_fleet(store: Store, tokens: Path | None) -> None:
+    """Have a new store keep the name of its fleet, which is in the file of tokens.
+
+    Servos of two fleets may have the same names: one machine's updates would follow from the other's past.
+
+    Raises
+    ------
+    InvalidInput
+        The store is another fleet's.
+    """
+    fleet = known = "" if tokens is None else read_tokens(tokens).fleet
+    with suppress(StoreUnavailable):  # a full disk: the service says so itself, and recovers when there is room
+        known = store.fleet(fleet) if fleet else ""
+    if known != fleet:
+        raise InvalidInput(
+            f"store {store.name}: belongs to the fleet {known!r}, and {tokens} to {fleet!r}; give the store of this "
+            f"fleet, or, where the tokens were made anew for the same machines, write fleet = {known!r} there"
+        )
 
 
 def open_existing_store(config: ServiceConfig) -> Store:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
-from servotwin.twin_service.auth import Verifiers, write_private, write_tokens
+from servotwin.twin_service.auth import write_private, write_tokens
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.up.enrolment import (
     CERTIFICATE,
@@ -115,7 +115,7 @@ def enroll_all(twin_path: Path, source: Path, requests: Mapping[int, Enrolment])
             for line, request in requests.items():
                 files, verifiers[request.servo] = write_folder(twin, request, texts[line])
                 written += files
-            write_tokens(tokens, Verifiers({**known.servos, **verifiers}, known.operators))
+            write_tokens(tokens, replace(known, servos={**known.servos, **verifiers}))
     return [*written, tokens]
 
 

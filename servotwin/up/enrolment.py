@@ -144,7 +144,7 @@ def revoke(path: Path, name: str) -> Path:
         servos, operators = dict(known.servos), dict(known.operators)
         servos.pop(name, None)
         operators.pop(name, None)
-        write_tokens(tokens, Verifiers(servos, operators))
+        write_tokens(tokens, replace(known, servos=servos, operators=operators))
     return tokens
 
 

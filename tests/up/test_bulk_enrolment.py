@@ -1,5 +1,6 @@
 """Enrolling many servos from a CSV file: all or none."""
 
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -9,8 +10,11 @@ from typer.testing import CliRunner
 from servotwin.cli import app as cli
 from servotwin.edge_process.config import token_of
 from servotwin.edge_process.config_file import load
+from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
+from servotwin.store.store import open_store
 from servotwin.twin_service.auth import Verifiers, read_tokens, write_tokens
+from servotwin.twin_service.command import check_fleet
 
 URL = "https://twin:1"
 
@@ -114,3 +118,23 @@ def test_a_name_and_a_file_exclude_each_other(folder: Path) -> None:
     for arguments in (["enroll"], ["enroll", "ax-1", "--csv", "fleet.csv"]):
         done = CliRunner().invoke(cli.app, arguments)
         assert (done.exit_code, done.stderr.count("give a name, or --csv")) == (2, 1)
+
+
+def test_a_store_of_another_fleet_is_refused_in_one_sentence(folder: Path) -> None:
+    """Its servos may have the same names: updates of these machines would follow from the past of those."""
+    for name in ("a", "b"):
+        (folder / name).mkdir()
+        twin_file(folder / name, 'tokens = "tokens.toml"', tokens=False)
+        assert enroll(folder / name, "name\nax-1\n", "--url", URL)[0] == 0
+    here, other = ((folder / name / "tokens.toml") for name in ("a", "b"))
+    with closing(open_store(f"sqlite:///{folder}/a/twin.db")) as store:
+        check_fleet(store, None)
+        check_fleet(store, here)
+        assert enroll(folder / "a", "name\nax-2\n", "--url", URL)[0] == 0  # the file was written again
+        check_fleet(store, here)
+        with pytest.raises(InvalidInput) as refused:
+            check_fleet(store, other)
+        own, foreign = read_tokens(here).fleet, read_tokens(other).fleet
+        assert f"belongs to the fleet {own!r}" in str(refused.value)
+        other.write_text(other.read_text().replace(foreign, own))
+        check_fleet(store, other)
