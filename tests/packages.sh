@@ -1,5 +1,6 @@
 #!/bin/sh
-# Debian's mosquitto, PostgreSQL Prometheus (for promtool) and docker-compose, which some tests run for themselves; without root or apt-get those tests are skipped.
+# Debian's mosquitto, PostgreSQL, Chromium, Prometheus (for promtool) and docker-compose, which some tests start for
+# themselves; without root or apt-get those tests are skipped.
 set -eu
 
 POLICY=/usr/sbin/policy-rc.d
@@ -7,9 +8,12 @@ POLICY=/usr/sbin/policy-rc.d
 have_mosquitto() { command -v mosquitto >/dev/null || [ -x /usr/sbin/mosquitto ]; }
 have_postgresql() { command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1; }
 
+have_chromium() { command -v chromium >/dev/null; }
+
 missing=""
 have_mosquitto || missing="$missing mosquitto"
 have_postgresql || missing="$missing postgresql"
+have_chromium || missing="$missing chromium"
 command -v promtool >/dev/null || missing="$missing prometheus"
 command -v docker-compose >/dev/null || missing="$missing docker-compose"
 [ -n "$missing" ] || exit 0
