@@ -32,6 +32,8 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 _Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
 _SAFE = ("GET", "HEAD")
+_UNBUFFERED = (b"x-accel-buffering", b"no")
+"""Header that keeps a proxy from collecting the parts of a stream."""
 _pack = msgspec.msgpack.Encoder().encode
 
 
@@ -74,10 +76,12 @@ class HttpRequest:
     @property
     def foreign(self) -> bool:
         """True where a browser sends it for a page of another site."""
-        origin, host = self.header(b"origin"), self.header(b"host")
-        if origin is not None:
-            return origin.partition(b"://")[2] != (host or b"")
-        return self.header(b"sec-fetch-site") in (b"cross-site", b"same-site")
+        # A browser says it itself, except on plain HTTP: there is no proxy then that would change the host.
+        site = self.header(b"sec-fetch-site")
+        if site is not None:
+            return site not in (b"same-origin", b"none")
+        origin = self.header(b"origin")
+        return origin is not None and origin.partition(b"://")[2] != self.header(b"host")
 
     @property
     def claim(self) -> str:
@@ -173,7 +177,7 @@ class HttpStream:
 
     async def send(self, send: Send) -> None:
         """Send the parts as they come."""
-        headers = [(b"content-type", self._content_type.encode()), (b"cache-control", b"no-store")]
+        headers = [(b"content-type", self._content_type.encode()), (b"cache-control", b"no-store"), _UNBUFFERED]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         gone = asyncio.create_task(self._until_gone())
         sending = asyncio.create_task(self._send_parts(send))
