@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -42,8 +43,9 @@ def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool, page: P
         check_page(page)
     answers = []
     for path in logs:
-        with console.status(f"{path.name}"):
-            log = read_recording(path, columns)
+        with console.status(path.name) as status:
+            log = read_recording(path, columns, partial(_tell, status, path.name))
+            status.update(f"{path.name}: models")
             answers.append((log, estimate_lost_motion(log.recording)))
     if page is not None:
         log, found = answers[-1]
@@ -57,6 +59,10 @@ def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool, page: P
         _print(console, log, found)
     for before, after in pairwise(answers):
         console.print(_change(before, after), highlight=False)
+
+
+def _tell(status: Any, name: str, samples: int) -> None:
+    status.update(f"{name}: {samples:,} samples read")
 
 
 def as_dict(log: RecordedLog, found: LostMotion) -> dict[str, Any]:

@@ -35,7 +35,7 @@ class Cleaned(NamedTuple):
     found: Mapping[str, int]
 
 
-def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float]) -> Cleaned:
+def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float], first: bool = True) -> Cleaned:
     """Leave out samples that are damaged, repeated, stale or out of order; unwrap angles; count all of it.
 
     Parameters
@@ -46,6 +46,8 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
         (n,) arrays by name.
     turns : mapping
         Full turn of the channels that are angles, in their units.
+    first : bool
+        The log begins here: a first sample long before the others is an old one.
     """
     found: dict[str, int] = {}
     names = list(channels)
@@ -58,7 +60,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             table = table[kept]
 
     keep(np.isfinite(table.sum(axis=1)), "without a number in some column")
-    if len(table) > 2:
+    if first and len(table) > 2:
         intervals = np.diff(table[:, 0])
         usual = float(np.median(np.abs(intervals)))
         stale = int(intervals[0] > _STALE * usual) if usual > 0.0 else 0
