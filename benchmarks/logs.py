@@ -24,8 +24,10 @@ from benchmarks.log_files import WRITERS, damaged
 from benchmarks.shelf import SHELF
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
+from servotwin.estimation.kinematic.wind_up import wind_up, with_machine
 from servotwin.logs.recordings import read_recording
 from servotwin.plant.axis import Axis
+from servotwin.plant.shown import position_unit
 from servotwin.plant.signals import Array, PiecewiseCubic
 from servotwin.simulation import simulate
 
@@ -72,9 +74,7 @@ class LogCase:
     @property
     def wind_up(self) -> float:
         """Way of the motor by which the load's friction winds up the transmission between two directions, rad."""
-        transmission = self.plant.transmission
-        stiffness = transmission.k_d if math.isfinite(transmission.k_d) else math.inf
-        return 2.0 * self.plant.guide.friction / stiffness / self.plant.p
+        return wind_up(self.plant)
 
     def reference(self) -> tuple[PiecewiseCubic, float]:
         """Strokes to and fro of various lengths and speeds, and their duration in s."""
@@ -158,16 +158,24 @@ def measured(case: LogCase) -> dict[str, Any]:
         path = Path(folder) / case.file
         columns = WRITERS[case.file](path, table)
         try:
-            answer = estimate_lost_motion(read_recording(path, columns).recording)
+            recording = read_recording(path, columns).recording
+            answer = estimate_lost_motion(recording)
         except InvalidInput as error:
             return found | {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
+    unit = position_unit(case.plant).si
+    known = with_machine(replace(recording, load_unit=unit), answer, Axis.preset(case.name))
     return found | {
+        "axis": {"status": known.status.value, "interval": _numbers(known.interval_motor)},
         "status": answer.status.value,
         "reasons": list(answer.reasons),
         "model": answer.model,
         "estimate": answer.gap_motor if math.isfinite(answer.gap_motor) else None,
-        "interval": [end if math.isfinite(end) else None for end in answer.interval_motor],
+        "interval": _numbers(answer.interval_motor),
     }
+
+
+def _numbers(interval: tuple[float, float]) -> list[float | None]:
+    return [end if math.isfinite(end) else None for end in interval]
 
 
 def _units(names: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, LogCase]]:
@@ -177,16 +185,20 @@ def _units(names: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, L
         yield from ((f"{seed}/{name}/{place}", cases[place]) for name, cases in drawn.items())
 
 
-def inside(numbers: Mapping[str, Any], true: str) -> bool:
-    """True where the interval contains the case's `true` ("gap" or "lost")."""
-    low, high = numbers["interval"]
-    return (low is None or low <= numbers[true]) and (high is None or numbers[true] <= high)
+def inside(interval: Sequence[float | None], first: float, last: float | None = None) -> bool:
+    """True where the interval contains a gap, or some gap from `first` to `last`."""
+    low, high = interval
+    last = first if last is None else last
+    return (low is None or low <= last) and (high is None or first <= high)
 
 
 def _show(found: Mapping[str, Any], console: Console) -> None:
     result = Table(title="logs: gaps of two encoders", title_justify="left", box=None)
     result.add_column("preset")
-    for heading in ("logs", "ok", "ok: lost\nmotion in", "ok:\ngap in", "doubtful", "lost\nmotion in", "refused"):
+    for heading in (
+        *("logs", "ok", "ok: lost\nmotion in", "gap to lost\nmotion in", "ok:\ngap in", "doubtful", "lost\nmotion in"),
+        *("refused", "axis known:\nok", "ok:\ngap in"),
+    ):
         result.add_column(heading, justify="right")
     for name in (*SHELF, ""):
         rows = [numbers for key, numbers in found.items() if not name or key.split("/")[1] == name]
@@ -202,16 +214,20 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
 
 def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     accepted = [each for each in rows if each["status"] == "ok"]
+    known = [each for each in rows if each.get("axis", {}).get("status") == "ok"]
     doubtful = [each for each in rows if each["status"] not in ("ok", "refused") and each["interval"] != [None, None]]
     doubtful = [each for each in doubtful if each["interval"][0] is not None]
     return (
         len(rows),
         len(accepted),
-        sum(inside(each, "lost") for each in accepted),
-        sum(inside(each, "gap") for each in accepted),
+        sum(inside(each["interval"], each["lost"]) for each in accepted),
+        sum(inside(each["interval"], each["gap"], each["lost"]) for each in accepted),
+        sum(inside(each["interval"], each["gap"]) for each in accepted),
         len(doubtful),
-        sum(inside(each, "lost") for each in doubtful),
+        sum(inside(each["interval"], each["lost"]) for each in doubtful),
         len(rows) - len(accepted) - len(doubtful),
+        len(known),
+        sum(inside(each["axis"]["interval"], each["gap"]) for each in known),
     )
 
 

@@ -106,7 +106,10 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
             part = {name: values[begin : begin + _BLOCK] for name, values in arrays.items()}
             # Thinned samples lie further apart: counts are those of the first block.
             counts = counts or {name: resolution(values[np.isfinite(values)]) for name, values in part.items()}
-            gathering.add(times[begin : begin + _BLOCK], part)
+            try:
+                gathering.add(times[begin : begin + _BLOCK], part)
+            except InvalidInput as error:
+                raise InvalidInput(f"log {path}: {error}") from None
             told(gathering.samples)
     clean = gathering.cleaned()
     _check_left(path, clean, gathering.samples, damaged)
@@ -165,6 +168,8 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
                 f"log {path}: no column is called like the {part}'s position; give --{part} COLUMN, one of "
                 f"{', '.join(names) or 'none'}"
             )
+    if result["motor"] == result["load"]:
+        raise InvalidInput(f"log {path}: --motor and --load are both {result['motor']!r}: give two columns")
     return result
 
 

@@ -12,6 +12,7 @@ from scipy.stats import t as student
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
+from servotwin.estimation.kinematic.breaks import check_one_machine
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
 from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
@@ -28,7 +29,7 @@ from servotwin.estimation.kinematic.regression import (
     regression,
     solved,
 )
-from servotwin.estimation.kinematic.strokes import counts_of, play_and_side, strokes_of
+from servotwin.estimation.kinematic.strokes import Strokes, counts_of, play_and_side, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
@@ -136,7 +137,7 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     Raises
     ------
     InvalidInput
-        The motor or the load does not move, or the motor never reverses.
+        The motor or the load does not move, the motor never reverses, or the load jumps against it.
     """
     motor_count, load_count = counts_of(recording)
     least = _least_motion(recording.motor, motor_count)
@@ -151,6 +152,7 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     if first is None:
         return _no_gap()
     prepared = regression(recording, strokes, first)
+    check_one_machine(recording, prepared, coarse)
     prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
     grid, tensor = _tensor(prepared, coarse, least)
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
@@ -167,6 +169,11 @@ def _least_motion(values: Array, count: float) -> float:
     second = np.diff(values, 2)
     noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6.0)
     return max(_COUNTS * count, 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(values)))
+
+
+def strokes_in(recording: EncoderRecording) -> Strokes:
+    """Cut at the reversals that are more than the encoder's counts and noise."""
+    return strokes_of(recording, _least_motion(recording.motor, counts_of(recording)[0]))
 
 
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
