@@ -49,7 +49,8 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
     if known and abs(halves[1] / halves[0] - 1.0) > _RATIO:
         raise InvalidInput(
             f"{recording.source}: the load moves by {halves[0]:.4g} {unit} per {recording.motor_unit} in its first "
-            f"half and by {halves[1]:.4g} in its second: two machines, or two units, in one log; give each its own"
+            f"half and by {halves[1]:.4g} in its second: two machines or units in one log, or turns lost in a pause; "
+            "give each part by itself"
         )
     fit = solved(values @ values.T, used)
     step = largest_step(values[0] - fit.coefficients @ values[used])
@@ -58,7 +59,8 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
         time = recording.time[prepared.rows[step.row]]
         raise InvalidInput(
             f"{recording.source}: from {time:.4g} s on the load is {step.size:+.4g} {unit} off where the motor moved "
-            "it: an encoder or a coupling slipped, or two logs were joined; give the parts one by one"
+            "it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were joined; give each part by "
+            "itself"
         )
 
 
