@@ -59,8 +59,8 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
         time = recording.time[prepared.rows[step.row]]
         raise InvalidInput(
             f"{recording.source}: from {time:.4g} s on the load is {step.size:+.4g} {unit} off where the motor moved "
-            "it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were joined; give each part by "
-            "itself"
+            "it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were joined; give each part "
+            "by itself"
         )
 
 
