@@ -93,7 +93,7 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
     """
     names = tuple(read_columns(path, ()).names)
     chosen = _chosen(path, names, wanted)
-    units = {part: _unit(name) for part, name in chosen.items()}
+    units = {part: named_unit(name) for part, name in chosen.items()}
     motor_unit = wanted.motor_unit or units["motor"] or "motor unit"
     load_unit = wanted.load_unit or units["load"] or "load unit"
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
@@ -101,7 +101,8 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
     for columns in read_blocks(path, tuple(chosen.values())):
         damaged = {**columns.damaged, **damaged}
         arrays = _arrays(path, chosen, columns)
-        times = _times(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, gathering.samples, arrays)
+        size, before = len(arrays["motor"]), gathering.samples
+        times = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size, before)
         for begin in range(0, len(times), _BLOCK):
             part = {name: values[begin : begin + _BLOCK] for name, values in arrays.items()}
             # Thinned samples lie further apart: counts are those of the first block.
@@ -130,7 +131,7 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
 
 def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
     """Columns by their parts, of one length."""
-    arrays = {part: _numbers(path, name, columns) for part, name in chosen.items()}
+    arrays = {part: numbers_of(path, name, columns) for part, name in chosen.items()}
     size = len(arrays["motor"])
     for part, values in arrays.items():
         if len(values) != size:
@@ -175,7 +176,7 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
 
 def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
     """The column of that name, with its unit or without."""
-    fitting = [name for name in names if given in (name, _bare(name))]
+    fitting = [name for name in names if given in (name, bare_name(name))]
     if not fitting:
         hint = did_you_mean(given, names)
         raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
@@ -183,11 +184,11 @@ def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
 
 
 def _guessed(part: str, names: Sequence[str]) -> str | None:
-    bare = {_bare(name).lower().replace(" ", "_"): name for name in reversed(names)}
+    bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
     return next((bare[guess] for guess in _GUESSES[part] if guess in bare), None)
 
 
-def _bare(name: str) -> str:
+def bare_name(name: str) -> str:
     """A column's name without its unit."""
     found = _UNIT.match(name)
     if found:
@@ -196,7 +197,7 @@ def _bare(name: str) -> str:
     return name[: -len(ending) - 1] if ending else name
 
 
-def _unit(name: str) -> str:
+def named_unit(name: str) -> str:
     """The unit that a column's name says; empty where it says none."""
     found = _UNIT.match(name)
     if found:
@@ -211,20 +212,31 @@ def _ending(name: str) -> str:
     return next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
 
 
-def _times(
-    path: Path, time: Array | None, unit: str, rate: float | None, before: int, arrays: Mapping[str, Array]
-) -> Array:
-    """(n,) times in s of a block, `before` samples after the first."""
+def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size: int, before: int = 0) -> Array:
+    """Times in s, of a column or by the rate; `before` samples after the first.
+
+    Raises
+    ------
+    InvalidInput
+        An unknown unit, or neither times nor a rate.
+    """
     if time is not None and rate is None:
         if unit and unit.lower() not in _SECONDS:
             raise InvalidInput(f"log {path}: times in {unit!r}: allowed are {', '.join(_SECONDS)}")
         return time * _SECONDS.get(unit.lower(), 1.0)
     if rate is None or not (np.isfinite(rate) and rate > 0.0):
         raise InvalidInput(f"log {path}: no column is called like a time; give --time COLUMN, or --rate in Hz above 0")
-    return np.arange(before, before + len(arrays["motor"])) / rate
+    return np.arange(before, before + size) / rate
 
 
-def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
+def numbers_of(path: Path, name: str, columns: LogColumns) -> Array:
+    """A column's numbers.
+
+    Raises
+    ------
+    InvalidInput
+        It holds none.
+    """
     values = columns.values[name]
     if getattr(values, "dtype", None) is not None and values.dtype.kind == "M":
         values = values.astype("datetime64[ns]").astype(np.int64) * 1e-9

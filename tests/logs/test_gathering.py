@@ -64,7 +64,7 @@ def test_a_thinned_log_keeps_its_turning_points_and_its_gap(made):
 
 
 def test_an_angle_whose_turns_cannot_be_counted_is_refused(made):
-    fast = (1000.0 * made.time) % (2.0 * np.pi)  # 0.4 turns from sample to sample
+    fast = (70.0 * made.motor) % (2.0 * np.pi)  # up to 0.4 turns from sample to sample
     with pytest.raises(InvalidInput, match="its turns cannot be counted"):
         gathered(made, 10_000, fast)
 

@@ -17,7 +17,7 @@ _RATIO = 0.03  # between the halves of a recording
 _TRAVEL = 10.0  # gaps, from which on the ratio is known
 
 
-class Step(NamedTuple):
+class ResidualStep(NamedTuple):
     """The step that explains a residual best.
 
     Attributes
@@ -64,7 +64,7 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
         )
 
 
-def largest_step(residual: Array) -> Step:
+def largest_step(residual: Array) -> ResidualStep:
     """Find the step with which a residual (k,) is explained best."""
     size, total = residual.size, residual - residual.mean()
     before = np.arange(1, size)
@@ -73,4 +73,4 @@ def largest_step(residual: Array) -> Step:
     row = int(np.argmax(gain)) + 1
     scale = float(total @ total)
     jump = float(total[row:].mean() - total[:row].mean())
-    return Step(row, jump, float(gain[row - 1]) / scale if scale else 0.0)
+    return ResidualStep(row, jump, float(gain[row - 1]) / scale if scale else 0.0)
