@@ -109,7 +109,7 @@ def test_no_cycle_is_predicted_and_none_is_found(name: str) -> None:
     assert limit_cycle(bare(name), gap_of(name), step=30.0 * GAPS[name]).status is CycleStatus.SETTLES
     if name == "emps":
         with pytest.raises(InvalidInput, match="outside of a loop on the motor's encoder"):
-            predictions(bare(name), gap_of(name), st.Controller(1.0, 0.0, 0.0, 0.1))
+            predictions(bare(name), gap_of(name))
     else:
         assert predictions(bare(name), gap_of(name)) == ()
 
