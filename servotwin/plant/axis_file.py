@@ -135,6 +135,7 @@ LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
 LINEAR_LAW = "linear"
 LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: linear_law}
 """Controllers that the file of an axis can describe, by their key `kind`."""
+_MASSES = {LINEAR: "mass_kg", ROTARY: "inertia_kg_m2"}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
 
 
@@ -166,6 +167,11 @@ def read_parts(table: Table, folder: Path) -> Parts:
     motion = kind_of(tables["load"], LOADS)
     if motion != _MOTIONS[kind]:
         raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
+    for name, own in ((_MASSES[each], _MASSES[motion]) for each in _MASSES if each != motion):
+        if name in tables["load"].values:
+            raise InvalidInput(
+                f"{table.source}: load.{name} = {tables['load'].values[name]!r}: this load is {motion}; give load.{own}"
+            )
     load: Load = read_kind(tables["load"], LOADS, Path())
     law = _read_controller(tables["controller"], folder, actuator.unit, motion, transmission.p)
     encoders = table.table("sensors").renamed({_sensor_key(name, motion): name for name in _SENSOR_KEYS})
