@@ -227,6 +227,18 @@ def commission(
     )
 
 
+def dataset(
+    name: Annotated[str, typer.Argument(help="Name of a public set: emps.")],
+    folder: Annotated[Path | None, typer.Option(help="Where it is kept; the user's cache by default.")] = None,
+) -> None:
+    """Fetch a public set of measured data, once, and print the path of its file."""
+    from servotwin.datasets import DATASETS, fetch
+
+    path = fetch(name, folder)
+    typer.echo(f"{name}: {DATASETS[name].source}; {DATASETS[name].notice}", err=True)
+    print(path)
+
+
 def bench(context: typer.Context) -> None:
     """Measure speed and accuracy beside other solvers; part of the source checkout: python -m benchmarks."""
     try:
