@@ -55,7 +55,7 @@ class OracleMode:
         return self.exponential(time) @ x
 
     def derivatives(self, x: Array) -> Array:
-        """(40, n) terms of the state's Taylor series over one step of the grid; an exponential costs ten times as much."""
+        """(40, n) terms of the state's Taylor series over one step of the grid: a tenth of an exponential's cost."""
         terms = [x]
         for k in range(1, len(POWERS)):
             terms.append(self.flow @ terms[-1] * (self.step / k))
