@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from exploration import extent
 
 from benchmarks.axis_windows import SCREW, SHAFT, screw_case, shaft_case, tally
 from servotwin.control.controller import Controller
@@ -114,20 +115,24 @@ def test_the_same_machine_in_other_units_has_the_same_estimate() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize("kind", SHAFT)
 def test_random_drives_are_estimated_within_their_intervals(kind: str) -> None:
-    result = tally(shaft_case, kind, 6, 3)
+    count = extent(2, 12)
+    result = tally(shaft_case, kind, count, 3)
     assert result.false == result.bounds_above == 0, result
-    assert len(result.errors) >= 3, result
+    assert len(result.errors) >= count // 2, result
     assert result.inside == len(result.errors), result
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize("kind", SCREW)
 def test_random_tables_are_estimated_within_their_intervals(kind: str) -> None:
-    result = tally(screw_case, kind, 30, 3)
+    count = extent(10, 60)
+    result = tally(screw_case, kind, count, 3)
     assert result.false == result.bounds_above == 0, result
-    assert len(result.errors) >= 18, result
+    assert len(result.errors) >= 0.6 * count, result
     assert result.inside >= len(result.errors) - 1, result
 
 
@@ -204,11 +209,12 @@ def test_a_gap_that_may_grow_within_the_window_widens_the_interval_only() -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_a_search_that_was_led_astray_begins_anew():
     # Each was accepted with a wrong gap (6.4, 4.1 and 69 um) when the first minima alone were followed.
     screw = Axis.preset("ball-screw")
     machine, metre = screw.scaled({"k": 0.985, "c": 0.977}), 1.0 / screw.p
-    for gap in (8.5e-6, 38e-6, 43e-6):
+    for gap in (8.5e-6, 38e-6, 43e-6)[: extent(1, 3)]:
         run = simulate(
             machine, 2.3, reference=SquareWave(7e-4, 4.0), gap=gap * metre, sample_rate=2000.0, input_bias=0.004
         )
