@@ -52,9 +52,9 @@ hold_s = 2.0
 {twin}
 """
 CERTIFIED = """policy = "certified"
-demands = {velocity_feedforward = false, machines = 40, settled_percent = 90}
+demands = {velocity_feedforward = false}
 """
-"""With half of the candidates and few machines: both sides verify them all."""
+"""With half of the candidates: both sides verify them all."""
 TWIN = """
 [service]
 store = "sqlite:///twin.db"
