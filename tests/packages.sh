@@ -1,5 +1,5 @@
 #!/bin/sh
-# Debian's mosquitto and PostgreSQL, which some tests start for themselves; without root or apt-get those tests are skipped.
+# Debian's mosquitto, PostgreSQL and Chromium, which some tests start for themselves; without root or apt-get those tests are skipped.
 set -eu
 
 POLICY=/usr/sbin/policy-rc.d
@@ -7,9 +7,12 @@ POLICY=/usr/sbin/policy-rc.d
 have_mosquitto() { command -v mosquitto >/dev/null || [ -x /usr/sbin/mosquitto ]; }
 have_postgresql() { command -v initdb >/dev/null || ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1; }
 
+have_chromium() { command -v chromium >/dev/null; }
+
 missing=""
 have_mosquitto || missing="$missing mosquitto"
 have_postgresql || missing="$missing postgresql"
+have_chromium || missing="$missing chromium"
 [ -n "$missing" ] || exit 0
 
 go_on() {

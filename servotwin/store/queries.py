@@ -45,6 +45,12 @@ def servos(connection: sa.Connection, after: str, limit: int) -> list[ServoSumma
     return [ServoSummary(*row) for row in connection.execute(query)]
 
 
+def servo_summaries(connection: sa.Connection, names: Collection[str]) -> list[ServoSummary]:
+    """Summaries of these servos, by name."""
+    query = _SUMMARY.where(twins.c.servo.in_(names)).order_by(twins.c.servo)
+    return [ServoSummary(*row) for row in connection.execute(query)]
+
+
 def servo(connection: sa.Connection, name: str) -> ServoSummary | None:
     """Summary of one servo."""
     row = connection.execute(_SUMMARY.where(twins.c.servo == name)).one_or_none()
@@ -93,8 +99,9 @@ def audit(
     limit: int,
     window: tuple[str, int] | None,
     before: int | None,
+    updates: bool = False,
 ) -> list[WindowTrace]:
-    """Traces of a servo's newest windows, newest first."""
+    """Traces of a servo's newest windows, newest first; `updates`: only of those that led to an update."""
     query = sa.select(*_WINDOW_COLUMNS).where(WINDOWS, messages.c.servo == servo)
     if window is not None:
         query = query.where(_is_window(servo, *window))
@@ -102,6 +109,9 @@ def audit(
         query = query.where(messages.c.received >= since)
     if before is not None:
         query = query.where(messages.c.id < before)
+    if updates:
+        sent = sa.select(evidence.c.message).where(evidence.c.servo == servo, evidence.c.kind == "update")
+        query = query.where(messages.c.id.in_(sent))
     selected = query.order_by(messages.c.id.desc()).limit(limit).cte("chosen")
     rows_of: dict[int, list[Any]] = {}
     for row in connection.execute(_chain(servo, selected)).all():
@@ -166,7 +176,12 @@ def _evidence(row: Any, offset: int) -> StoredEvidence | None:
     values = row[offset : offset + _EVIDENCE_WIDTH]
     if values[0] is None:
         return None
-    record = StoredEvidence(*values)
+    return evidence_of_row(values)
+
+
+def evidence_of_row(row: Any) -> StoredEvidence:
+    """The evidence in the first columns of a row, null as the empty value."""
+    record = StoredEvidence(*row[:_EVIDENCE_WIDTH])
     return record._replace(message=record.message or 0, context=record.context or "")
 
 

@@ -208,6 +208,7 @@ class Store:
         limit: int = 100,
         window: tuple[str, int] | None = None,
         before: int | None = None,
+        updates: bool = False,
     ) -> list[WindowTrace]:
         """Evidence chains of a servo's windows, newest window first, in one query.
 
@@ -221,8 +222,10 @@ class Store:
             (boot, sequence): only this one.
         before : int, optional
             Only windows with lower ids: the id of the last window gives the next page.
+        updates : bool
+            Only windows that led to an update.
         """
-        return self._read(lambda connection: queries.audit(connection, servo, since, limit, window, before))
+        return self._read(lambda connection: queries.audit(connection, servo, since, limit, window, before, updates))
 
     def events(self, servo: str, since: float = 0.0, limit: int = 100) -> list[StoredEvidence]:
         """Evidence that belongs to no window, newest first: starts of the edge, fallbacks, answers, faults of the twin.
@@ -241,6 +244,10 @@ class Store:
     def contexts(self, keys: Collection[str]) -> dict[str, str]:
         """JSON texts of contexts by key; unknown keys are left out."""
         return self._read(lambda connection: queries.contexts(connection, keys))
+
+    def reading(self, action: Callable[[sa.Connection], _Result]) -> _Result:
+        """Run a query, such as those of `overview`, in a transaction that reads; raises StoreUnavailable."""
+        return self._read(action)
 
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:

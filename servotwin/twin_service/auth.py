@@ -8,6 +8,7 @@ from __future__ import annotations
 import hmac
 import logging
 import re
+import secrets
 import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -97,6 +98,24 @@ class AccessControl:
         matches = [hmac.compare_digest(verifier, known) for known in self._verifiers.operators.values()]
         if not any(matches):
             raise self._rejected(verifier, "the token is not an operator's")
+
+    @property
+    def open(self) -> bool:
+        """True where nobody needs a token."""
+        return self._verifiers is None
+
+    def operator_of(self, token: bytes | None) -> str:
+        """Name of the operator with a token; empty: it is no operator's."""
+        verifier, found = _digest(token), ""
+        for name, known in (self._verifiers or Verifiers()).operators.items():
+            if hmac.compare_digest(verifier, known):
+                found = name
+        return found
+
+    def operator_key(self, name: str) -> bytes:
+        """Key that only the service and the holder of an operator's token can make; random where there is none."""
+        known = None if self._verifiers is None else self._verifiers.operators.get(name)
+        return secrets.token_bytes(32) if known is None else known
 
     def verifier(self, servo: str) -> bytes | None:
         """Verifier with which messages to a servo are sealed; None: its token was revoked."""

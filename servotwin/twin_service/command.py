@@ -53,7 +53,7 @@ def serve(twin: TwinFile, store: Store, listener: socket.socket, pool: WorkerPoo
         log.warning("no tokens: whoever reaches this machine itself may do everything")
     raise_descriptor_limit()
     service = TwinService(twin, store, pool=pool)
-    server = HttpServer(twin.service, service.http_app(), service.polls.close)
+    server = HttpServer(twin.service, service.http_app(), service.end_streams)
     asyncio.run(server.serve([listener]))
 
 

@@ -159,6 +159,9 @@ class ServiceConfig:
     polls_per_servo: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of long polls of one servo open at once.")
     ] = 8
+    watchers: Annotated[
+        int, key(minimum=0, maximum=_MOST, help="Largest number of dashboards that watch the fleet at once.")
+    ] = 100
     queue: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of messages that wait for their commit.")
     ] = 2000
@@ -210,6 +213,11 @@ class ServiceConfig:
     def local(self) -> bool:
         """True where only this machine reaches the service."""
         return is_here(self.bind)
+
+    @property
+    def encrypted(self) -> bool:
+        """True where browsers reach the service over TLS."""
+        return self.tls_key is not None or self.behind_proxy
 
 
 def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os.environ) -> ServiceConfig:

@@ -5,12 +5,14 @@ No framework: its layers take longer for the PUT of a window than checking and c
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import math
 import re
 import traceback
-from collections.abc import Awaitable, Callable, Iterable, Mapping, MutableMapping
+from collections.abc import AsyncGenerator, Awaitable, Callable, Iterable, Mapping, MutableMapping
 from contextlib import AbstractAsyncContextManager
+from http.cookies import CookieError, SimpleCookie
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
@@ -29,8 +31,10 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 _Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
 MSGPACK, JSON, TEXT = "application/msgpack", "application/json", "text/plain"
+HTML, CSV, EVENTS = "text/html; charset=utf-8", "text/csv; charset=utf-8", "text/event-stream"
 _MAX_INTEGER = 2**53
 """Largest integer in a request: the largest that JSON readers with float64 numbers represent exactly."""
+_SAFE = ("GET", "HEAD")
 _TITLE, _VERSION = "servotwin twin", "1"
 _DESCRIPTION = (
     """MessagePack in, MessagePack out; errors are JSON: {"code": ..., "detail": ...}. Times in s, angles in rad."""
@@ -65,6 +69,22 @@ class HttpRequest:
     def token(self) -> bytes | None:
         """Bearer token; None: there is none."""
         return bearer_token(self.header(b"authorization"))
+
+    def cookie(self, name: str) -> str | None:
+        """A cookie; None: there is none of that name."""
+        try:
+            jar = SimpleCookie((self.header(b"cookie") or b"").decode("latin-1"))
+        except CookieError:
+            return None
+        return jar[name].value if name in jar else None
+
+    @property
+    def foreign(self) -> bool:
+        """True where a browser sends it for a page of another site."""
+        origin, host = self.header(b"origin"), self.header(b"host")
+        if origin is not None:
+            return origin.partition(b"://")[2] != (host or b"")
+        return self.header(b"sec-fetch-site") in (b"cross-site", b"same-site")
 
     @property
     def claim(self) -> str:
@@ -141,6 +161,47 @@ class HttpResponse:
         await send({"type": "http.response.body", "body": self.body})
 
 
+class HttpStream:
+    """Response whose body comes in parts, until they end or the client goes.
+
+    Parameters
+    ----------
+    parts : asynchronous iterator of bytes
+        Closed in the end, whatever happens.
+    content_type : str
+    receive : callable
+        ASGI's: it tells when the client has gone.
+    """
+
+    __slots__ = ("_content_type", "_parts", "_receive")
+
+    def __init__(self, parts: AsyncGenerator[bytes, None], content_type: str, receive: Receive) -> None:
+        self._parts, self._content_type, self._receive = parts, content_type, receive
+
+    async def send(self, send: Send) -> None:
+        """Send the parts as they come."""
+        headers = [(b"content-type", self._content_type.encode()), (b"cache-control", b"no-store")]
+        await send({"type": "http.response.start", "status": 200, "headers": headers})
+        gone = asyncio.create_task(self._until_gone())
+        sending = asyncio.create_task(self._send_parts(send))
+        try:
+            await asyncio.wait((gone, sending), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            for task in (gone, sending):
+                task.cancel()
+            await asyncio.gather(gone, sending, return_exceptions=True)
+            await self._parts.aclose()
+
+    async def _until_gone(self) -> None:
+        while (await self._receive())["type"] != "http.disconnect":
+            pass
+
+    async def _send_parts(self, send: Send) -> None:
+        async for part in self._parts:
+            await send({"type": "http.response.body", "body": part, "more_body": True})
+        await send({"type": "http.response.body", "body": b""})
+
+
 def msgpack_response(value: object, status: int = 200) -> HttpResponse:
     """Response in MessagePack."""
     return HttpResponse(status, _pack(value), MSGPACK)
@@ -151,7 +212,8 @@ def json_response(value: object, status: int = 200, headers: Mapping[str, str] |
     return HttpResponse(status, msgspec.json.encode(value), JSON, headers)
 
 
-Handler = Callable[[HttpRequest], Awaitable[HttpResponse]]
+AnyResponse = HttpResponse | HttpStream
+Handler = Callable[[HttpRequest], Awaitable[AnyResponse]]
 Operation = dict[str, Any]
 
 
@@ -212,7 +274,7 @@ class HttpApp:
             return
         await response.send(send)
 
-    async def _respond(self, scope: Scope, receive: Receive) -> HttpResponse:
+    async def _respond(self, scope: Scope, receive: Receive) -> AnyResponse:
         for pattern, handlers in self._routes:
             match = pattern.fullmatch(scope["path"])
             if match is None:
@@ -223,6 +285,8 @@ class HttpApp:
                 return self._no_route(405, "this path does not know that method", allowed)
             request = HttpRequest(scope, receive, match.groupdict())
             try:
+                if scope["method"] not in _SAFE and request.foreign:
+                    raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the request comes from a page of another site", 403)
                 return await handler(request)
             except RequestRejected as rejected:
                 return self._rejection(request, rejected)
@@ -273,7 +337,11 @@ _NAME = NAME_PATTERN.replace(r"\A", "^").replace(r"\Z", "$")
 _BYTES: Operation = {"type": "string", "format": "binary"}
 INTEGER: Operation = {"type": "integer", "minimum": 0, "maximum": _MAX_INTEGER}
 SECONDS: Operation = {"type": "number", "minimum": 0}
-_CONTENT: dict[str, Operation] = {MSGPACK: _BYTES, JSON: {}, TEXT: {"type": "string"}}
+_CONTENT: dict[str, Operation] = {
+    MSGPACK: _BYTES,
+    JSON: {},
+    **{key: {"type": "string"} for key in (TEXT, HTML, CSV, EVENTS)},
+}
 _ERROR: Operation = {
     "type": "object",
     "required": ["code", "detail"],
@@ -317,6 +385,7 @@ def operation(
     parameters: Iterable[Operation] = (),
     body: str = "",
     errors: Iterable[int] = (),
+    body_type: str = MSGPACK,
 ) -> Operation:
     """OpenAPI operation object.
 
@@ -328,9 +397,11 @@ def operation(
     parameters : iterable of dict
         As `parameter` makes them.
     body : str
-        Description of the request's MessagePack body; empty: it has none.
+        Description of the request's body; empty: it has none.
     errors : iterable of int
         Statuses of error bodies.
+    body_type : str
+        Content type of the request's body.
     """
     described: Operation = {}
     for status, (description, kind) in responses.items():
@@ -340,8 +411,8 @@ def operation(
         described.setdefault(str(status), {"description": "Rejected.", "content": {JSON: {"schema": _ERROR}}})
     declared: Operation = {"summary": summary, "parameters": list(parameters), "responses": described}
     if body:
-        schema = {**_BYTES, "maxLength": MAX_BYTES}
-        declared["requestBody"] = {"required": True, "description": body, "content": {MSGPACK: {"schema": schema}}}
+        schema = {**_BYTES, "maxLength": MAX_BYTES} if body_type == MSGPACK else {}
+        declared["requestBody"] = {"required": True, "description": body, "content": {body_type: {"schema": schema}}}
     return declared
 
 

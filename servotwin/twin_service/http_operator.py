@@ -8,15 +8,14 @@ import re
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from servotwin.messages import NAME_PATTERN, Refusal
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.records import Backlog, StoredEvidence, WindowTrace
+from servotwin.store.records import Backlog, StoredEvidence, StoredMessage, WindowTrace
 from servotwin.store.store import Store
-from servotwin.twin_service.auth import AccessControl
 from servotwin.twin_service.http_app import (
     BOOT,
     INTEGER,
@@ -37,9 +36,11 @@ from servotwin.twin_service.http_app import (
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.monitoring import CONTENT_TYPE, Metrics
+from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 
 MAX_ROWS = 1000
+_Result = TypeVar("_Result")
 _BACKLOG_S = 0.5
 """s for which a backlog that was read is served again."""
 Health = Callable[[Backlog | None], dict[str, Any]]
@@ -51,7 +52,7 @@ class OperatorApi:
 
     Parameters
     ----------
-    access : AccessControl
+    operators : OperatorAccess
     store : Store
     executor : StoreExecutor
     health : callable
@@ -62,14 +63,14 @@ class OperatorApi:
 
     def __init__(
         self,
-        access: AccessControl,
+        operators: OperatorAccess,
         store: Store,
         executor: StoreExecutor,
         health: Health,
         metrics: Metrics,
         wall: Callable[[], float],
     ) -> None:
-        self._access, self._store, self._executor = access, store, executor
+        self._operators, self._store, self._executor = operators, store, executor
         self._health, self._metrics, self._wall = health, metrics, wall
         self._backlog_lock = asyncio.Lock()
         self._backlog: tuple[float, Backlog | None] = -math.inf, None
@@ -96,6 +97,7 @@ class OperatorApi:
                 limit,
                 parameter("since", SECONDS, "Only windows received then or later, s since the epoch."),
                 parameter("before", INTEGER, "Only windows with lower ids: the next page."),
+                parameter("updates", {**INTEGER, "maximum": 1}, "1: only windows that led to an update."),
             ),
             errors=QUERY_ERRORS,
         )
@@ -129,42 +131,37 @@ class OperatorApi:
         ]
 
     async def _get_servos(self, request: HttpRequest) -> HttpResponse:
-        self._access.check_operator(request.token)
-        after, limit = request.argument("after") or "", _limit(request)
+        self._operators.check(request)
+        after, limit = request.argument("after") or "", limit_of(request)
         if after and not re.match(NAME_PATTERN, after):
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, "after: give the name of a servo")
         summaries = await self._query(partial(self._store.servos, after, limit))
         return json_response([summary._asdict() for summary in summaries])
 
     async def _get_servo(self, request: HttpRequest) -> HttpResponse:
-        servo = self._admitted_servo(request)
+        servo = admitted_servo(self._operators, request)
         summary = await self._query(partial(self._store.servo, servo))
         if summary is None:
             raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} has never sent a message")
         return json_response(summary._asdict())
 
     async def _get_audit(self, request: HttpRequest) -> HttpResponse:
-        servo = self._admitted_servo(request)
+        servo = admitted_servo(self._operators, request)
         since = request.seconds("since", 0.0) or None
         before = request.integer("before", 0) or None
-        traces = await self._query(partial(self._store.audit, servo, since, _limit(request), None, before))
+        updates = bool(request.integer("updates", 0))
+        traces = await self._query(partial(self._store.audit, servo, since, limit_of(request), None, before, updates))
         return json_response([trace_as_json(trace) for trace in traces])
 
     async def _get_events(self, request: HttpRequest) -> HttpResponse:
-        servo = self._admitted_servo(request)
+        servo = admitted_servo(self._operators, request)
         since = request.seconds("since", 0.0)
-        events = await self._query(partial(self._store.events, servo, since, _limit(request)))
+        events = await self._query(partial(self._store.events, servo, since, limit_of(request)))
         return json_response([evidence_as_json(event) for event in events])
 
     async def _get_window(self, request: HttpRequest) -> HttpResponse:
         """The stored bytes of a window, with their compression as content-encoding."""
-        servo = self._admitted_servo(request)
-        boot, sequence = request.path["boot"], _sequence(request.path["sequence"])
-        if not re.match(NAME_PATTERN, boot):
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "boot: give 1 to 64 letters, digits, . _ or -")
-        window = await self._query(partial(self._store.window, servo, boot, sequence))
-        if window is None or not window.body:
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the body of this window is not stored", 404)
+        window = await stored_window(self._operators, self._store, self._executor, request)
         headers = {"content-encoding": window.encoding} if window.encoding else {}
         return HttpResponse(200, window.body, MSGPACK, headers)
 
@@ -203,19 +200,39 @@ class OperatorApi:
                 self._backlog = self._wall(), backlog
             return backlog
 
-    def _admitted_servo(self, request: HttpRequest) -> str:
-        """Name of the servo in the path, for an operator."""
-        self._access.check_operator(request.token)
-        servo = request.path["servo"]
-        if not re.match(NAME_PATTERN, servo):
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "servo: give 1 to 64 letters, digits, . _ or -")
-        return servo
-
     async def _query(self, call: Callable[[], Any]) -> Any:
-        try:
-            return await self._executor.run(call)
-        except StoreUnavailable:
-            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
+        return await store_query(self._executor, call)
+
+
+def admitted_servo(operators: OperatorAccess, request: HttpRequest) -> str:
+    """Name of the servo in the path, for an operator; raises RequestRejected."""
+    operators.check(request)
+    servo = request.path["servo"]
+    if not re.match(NAME_PATTERN, servo):
+        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "servo: give 1 to 64 letters, digits, . _ or -")
+    return servo
+
+
+async def stored_window(
+    operators: OperatorAccess, store: Store, executor: StoreExecutor, request: HttpRequest
+) -> StoredMessage:
+    """The window in the path with its body, for an operator; raises RequestRejected."""
+    servo = admitted_servo(operators, request)
+    boot, sequence = request.path["boot"], _sequence(request.path["sequence"])
+    if not re.match(NAME_PATTERN, boot):
+        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "boot: give 1 to 64 letters, digits, . _ or -")
+    window = await store_query(executor, partial(store.window, servo, boot, sequence))
+    if window is None or not window.body:
+        raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the body of this window is not stored", 404)
+    return window
+
+
+async def store_query(executor: StoreExecutor, call: Callable[[], _Result]) -> _Result:
+    """Result of a call that reads the store; raises RequestRejected where it cannot be read."""
+    try:
+        return await executor.run(call)
+    except StoreUnavailable:
+        raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
 
 
 def trace_as_json(trace: WindowTrace) -> dict[str, Any]:
@@ -249,7 +266,8 @@ def evidence_as_json(record: StoredEvidence) -> dict[str, Any]:
     return {**record._asdict(), "body": body}
 
 
-def _limit(request: HttpRequest) -> int:
+def limit_of(request: HttpRequest) -> int:
+    """Argument `limit`: rows at most."""
     return min(request.integer("limit", 100) or 1, MAX_ROWS)
 
 

@@ -25,7 +25,10 @@ from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
+from servotwin.twin_service.fleet_feed import FleetFeed
+from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
 from servotwin.twin_service.http_app import HttpApp
+from servotwin.twin_service.http_dashboard import DashboardApi
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
@@ -35,6 +38,7 @@ from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLim
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
+from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.twin_file import TwinFile
@@ -118,6 +122,11 @@ class TwinService:
         self.claims = EdgeClaims(
             store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
         )
+        self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
+        only_here = config.mqtt is None and not self._shared
+        presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
+        self._reader = FleetReader(store, presence, self.clocks.wall)
+        self.feed = FleetFeed(self._reader, self.executor, presence, config.watchers, self._shared)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
             handler = MqttRequestHandler(
@@ -131,8 +140,9 @@ class TwinService:
         """HTTP application, whose lifespan starts and stops the service."""
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
-        operator = OperatorApi(self.access, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
-        routes = [*edge.routes(), *operator.routes()]
+        operator = OperatorApi(self.operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
+        dashboard = DashboardApi(self.operators, self.store, self.executor, self._reader, self.feed)
+        routes = [*edge.routes(), *operator.routes(), *dashboard.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
@@ -146,6 +156,7 @@ class TwinService:
             await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
+        self._spawn(self.feed.run())
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -159,10 +170,15 @@ class TwinService:
         if self._mqtt is not None:
             await self._mqtt.start()
 
+    def end_streams(self) -> None:
+        """End all long polls and event streams, which would otherwise keep the server from stopping."""
+        self.polls.close()
+        self.feed.close()
+
     async def stop(self) -> None:
         """Commit the received messages, finish the running work, stop the workers."""
         # Sources of requests first and the writer last: it still commits the results of the work that is finished.
-        self.polls.close()
+        self.end_streams()
         if self._mqtt is not None:
             await self._mqtt.stop()
         await self.dispatcher.stop()
@@ -255,6 +271,7 @@ class TwinService:
         waiting = "Messages and results that wait for their commit."
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
+        add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.feed.watchers)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
         damaged = "1: the store is damaged, and is not written any more."
         add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))

@@ -56,7 +56,7 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     console = console or Console()
     with opened(path) as folder, _counted_signals() as signals:
         _greet(folder, console)
-        site = Site(folder, Outages(), signals)
+        site = Site(folder, Outages(), signals, lambda url: _announce(folder, url, console))
         monitor = _Monitor(folder, site, speed, console)
         try:
             site.start()
@@ -80,6 +80,12 @@ def _greet(folder: Folder, console: Console) -> None:
             described = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
             console.print(f"continuing with {described}", soft_wrap=True, highlight=False)
     console.print("starting (the very first time, code is compiled for a minute or two) ...", highlight=False)
+
+
+def _announce(folder: Folder, url: str, console: Console) -> None:
+    """Print the address of the dashboard, and where the token is that it asks for once."""
+    for line in (f"twin: listening on {url}", f"dashboard: open {url} and give it the token in {folder.operator_file}"):
+        console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _initial_speed(folder: Folder) -> float:
@@ -134,8 +140,7 @@ class _Monitor:
         self._poller.start()
         with self._live() as live:
             if live is None:
-                # No table on a pipe or in a file: the address is printed at once, and a line every 5 s.
-                self._print(f"twin: listening on {self._site.url}")
+                # No table on a pipe or in a file: a line every 5 s.
                 self._print(f"logs: {self._folder.path}/*.log")
             shown = adapted = self._begun
             while not signals() and not (seconds is not None and time.monotonic() - self._begun >= seconds):

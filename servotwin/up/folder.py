@@ -74,9 +74,14 @@ class Folder:
         if config.twin is not None and config.twin.url != url:
             write_text(file, edge_toml(replace(config, twin=replace(config.twin, url=url))))
 
+    @property
+    def operator_file(self) -> Path:
+        """File with the operator's token."""
+        return self.path / OPERATOR
+
     def operator(self) -> str:
         """Operator's token."""
-        return (self.path / OPERATOR).read_text(encoding="utf-8").strip()
+        return self.operator_file.read_text(encoding="utf-8").strip()
 
 
 @contextmanager

@@ -30,10 +30,14 @@ class Site:
     folder : Folder
     outages : Outages
     signals : Signals
+    announce : callable
+        Called with the URL of the twin as soon as it answers, while the other processes still start.
     """
 
-    def __init__(self, folder: Folder, outages: Outages, signals: Signals) -> None:
-        self._folder, self._outages, self._signals = folder, outages, signals
+    def __init__(
+        self, folder: Folder, outages: Outages, signals: Signals, announce: Callable[[str], None] = lambda _url: None
+    ) -> None:
+        self._folder, self._outages, self._signals, self._announce = folder, outages, signals, announce
         self.twin = self._child("twin", ("servotwin", "twin", "--config", str(folder.path / TWIN), "--port", "0"))
         self.machines = {servo.name: self._machine(servo.name) for servo in SERVOS}
         self.edges = {servo.name: self._edge(servo.name) for servo in SERVOS}
@@ -114,7 +118,7 @@ class Site:
         return self._child(f"edge {servo}", ("servotwin.edge_process", str(self._folder.path / servo / EDGE)), "")
 
     def _wait_until_ready(self, children: list[Child]) -> None:
-        end = time.monotonic() + _READY_S
+        end, announced = time.monotonic() + _READY_S, False
         while any(child.address is None for child in children):
             for child in children:
                 child.read_output()
@@ -122,6 +126,9 @@ class Site:
                     raise child.failure(f"does not start (code {child.code})")
                 if time.monotonic() > end:
                     raise child.failure(f"is not ready after {_READY_S:.0f} s")
+            if self.url and not announced:
+                announced = True
+                self._announce(self.url)
             if self._signals():
                 raise StartInterrupted
             time.sleep(_POLL_S)

@@ -48,7 +48,9 @@ def test_requests_that_the_openapi_document_allows(described, data):
     """And headers, cookies and bodies of its own making."""
     from schemathesis.checks import not_a_server_error
 
-    case = data.draw(st.one_of([result.ok().as_strategy() for result in described.get_all_operations()]))
+    operations = [result.ok() for result in described.get_all_operations()]
+    finite = [each for each in operations if each.path != "/v1/fleet/events"]  # a stream does not end
+    case = data.draw(st.one_of([each.as_strategy() for each in finite]))
     if "wait" in (case.query or {}):
         case.query["wait"] = "0.01"
     answer = case.call(timeout=20.0)

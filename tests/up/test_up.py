@@ -94,10 +94,11 @@ def times(path: Path) -> list[float]:
 
 
 def stored(path: Path) -> dict[str, set[str]]:
-    """The boots of which the twin has windows, by servo."""
+    """The numbers of the boots of which the twin has windows, by servo: b1 is the first."""
     store = open_store(f"sqlite:///{path / 'twin.db'}")
     try:
-        return {servo.name: {link.window.boot for link in store.audit(servo.name, None, 1000)} for servo in STARTED}
+        audits = {servo.name: store.audit(servo.name, None, 1000) for servo in STARTED}
+        return {name: {link.window.boot.partition("-")[0] for link in links} for name, links in audits.items()}
     finally:
         store.close()
 
@@ -134,14 +135,13 @@ def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path, monkeypatc
         second.wait()
         with started(path, "--speed", "10") as third:
             lines_until(third, RUNNING)
+            # However slow this machine: each servo's windows come from a boot after the first.
+            assert eventually(lambda: all(boots - {"b1"} for boots in stored(path).values()))
             third.send_signal(signal.SIGINT)
             assert "all processes have ended" in lines_until(third, "all processes have ended")[-1]
             assert third.wait(PATIENCE_S) == 0
     assert eventually(lambda: not left_behind(path))
     assert all(after > former + 5.0 for former, after in zip(before, times(path), strict=True))
-    for servo, boots in stored(path).items():
-        assert {boot.partition("-")[0] for boot in boots} >= {"b1"}, servo
-        assert len(boots) > 1, servo
     assert not list(path.glob("*/drive.sock"))
 
 

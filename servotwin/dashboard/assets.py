@@ -1,0 +1,50 @@
+"""The page's own files, read once: content type, digest and compressed body of each."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+from functools import lru_cache
+from importlib import resources
+from typing import NamedTuple
+
+INDEX = "index.html"
+SECURITY = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+}
+"""Headers of every file: no script but the page's own files, nothing from elsewhere, in no frame."""
+_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".css": "text/css; charset=utf-8",
+    ".js": "text/javascript; charset=utf-8",
+    ".svg": "image/svg+xml",
+}
+
+
+class Asset(NamedTuple):
+    """A file of the page; `tag`: its entity tag."""
+
+    content_type: str
+    body: bytes
+    compressed: bytes
+    tag: str
+
+
+@lru_cache(maxsize=1)
+def assets() -> dict[str, Asset]:
+    """Files by name."""
+    found = {}
+    for file in resources.files("servotwin.dashboard").joinpath("static").iterdir():
+        kind = _TYPES.get(file.name[file.name.rfind(".") :])
+        if kind is not None:
+            body = file.read_bytes()
+            tag = '"' + hashlib.sha256(body).hexdigest()[:32] + '"'
+            found[file.name] = Asset(kind, body, gzip.compress(body, 9, mtime=0), tag)
+    return found

@@ -1,0 +1,71 @@
+// Requests to the twin. Whatever goes wrong becomes one sentence.
+
+export class ApiError extends Error {
+  constructor(message, status) {
+    super(message);
+    this.status = status;
+  }
+}
+
+const WORDS = {
+  401: "The session has ended, or its token was revoked.",
+  403: "This token may not read the fleet: it belongs to a machine.",
+  404: "The twin does not have that.",
+  429: "The twin is asked too often at the moment.",
+  503: "The twin cannot read its store now.",
+};
+
+async function detail(response) {
+  try {
+    return (await response.json()).detail;
+  } catch {
+    return "";
+  }
+}
+
+export async function request(path, options = {}) {
+  let response;
+  try {
+    response = await fetch(path, { credentials: "same-origin", signal: AbortSignal.timeout(15000), ...options });
+  } catch (error) {
+    throw new ApiError(error.name === "TimeoutError" ? "The twin does not answer." : "The twin cannot be reached.", 0);
+  }
+  if (!response.ok) {
+    const said = await detail(response);
+    throw new ApiError(WORDS[response.status] || said || `The twin answers with status ${response.status}.`, response.status);
+  }
+  if (response.status === 204) return null;
+  try {
+    return await response.json();
+  } catch {
+    throw new ApiError("The twin's answer cannot be read.", response.status);
+  }
+}
+
+export const session = () => request("/v1/session");
+export const logout = () => request("/v1/session", { method: "DELETE" });
+export const login = (token) =>
+  request("/v1/session", { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify({ token }) });
+
+// All rows, page by page, with the position from which changes are to be followed.
+export async function fleet() {
+  const rows = [];
+  let position = null, now = Date.now() / 1000;
+  for (let after = ""; ; ) {
+    const page = await request(`/v1/fleet?limit=1000&after=${encodeURIComponent(after)}`);
+    position ??= page.position;
+    now = page.now;
+    rows.push(...page.rows);
+    if (page.rows.length < 1000) return { rows, position, now };
+    after = page.rows.at(-1).servo;
+  }
+}
+
+const servo = (name) => `/v1/servos/${encodeURIComponent(name)}`;
+export const windowPath = (name, boot, sequence) => `${servo(name)}/windows/${encodeURIComponent(boot)}/${sequence}`;
+export const histories = (names) => request(`/v1/fleet/histories?servos=${names.map(encodeURIComponent).join(",")}`);
+export const gaps = (name, limit = 400) => request(`${servo(name)}/gaps?limit=${limit}`);
+export const gapsFile = (name) => `${servo(name)}/gaps.csv?limit=1000`;
+export const updates = (name, limit = 20) => request(`${servo(name)}/audit?updates=1&limit=${limit}`);
+export const events = (name, limit = 50) => request(`${servo(name)}/events?limit=${limit}`);
+export const channels = (name, boot, sequence, points) => request(`${windowPath(name, boot, sequence)}/channels?points=${points}`);

@@ -1,0 +1,182 @@
+// Plots: uPlot over time, in the colours of the theme; and a loop in the plane, which uPlot does not draw.
+
+/* global uPlot */
+import { colour, element, svg } from "./dom.js";
+import { fixed } from "./format.js";
+
+// Sizes follow that of the page's text.
+const rem = () => parseFloat(getComputedStyle(document.documentElement).fontSize) / 16;
+
+function axis(label, size, more = {}) {
+  const font = `${Math.round(12 * rem())}px system-ui, sans-serif`;
+  return {
+    label, labelFont: font, font, labelSize: 18 * rem(), stroke: colour("soft"), size: size * rem(),
+    grid: { stroke: colour("grid"), width: 1 }, ticks: { stroke: colour("grid"), width: 1 }, ...more,
+  };
+}
+
+// Vertical marks with a word each, drawn behind the data; words that would overlap are left out.
+function marks(list) {
+  return (plot) => {
+    const { ctx, bbox } = plot;
+    ctx.save();
+    const unit = devicePixelRatio * rem();
+    ctx.font = `${11 * unit}px system-ui, sans-serif`;
+    let free = -Infinity;
+    for (const { at, word, color, dash } of list()) {
+      const x = plot.valToPos(at, "x", true);
+      if (x < bbox.left || x > bbox.left + bbox.width) continue;
+      ctx.strokeStyle = ctx.fillStyle = colour(color);
+      ctx.lineWidth = devicePixelRatio;
+      ctx.setLineDash(dash ? [4, 4] : []);
+      ctx.beginPath();
+      ctx.moveTo(x, bbox.top);
+      ctx.lineTo(x, bbox.top + bbox.height);
+      ctx.stroke();
+      const width = ctx.measureText(word).width;
+      if (x > free && x + width < bbox.left + bbox.width) {
+        ctx.fillText(word, x + 3 * unit, bbox.top + 11 * unit);
+        free = x + width + 8 * unit;
+      }
+    }
+    ctx.restore();
+  };
+}
+
+/* A plot over time that follows the width of its place.
+   options: height, time (x is s since the epoch), xLabel, yLabel, series [{label, color, width, dash, points, paths}],
+   bands [[high, low, color]], marks () => [{at, word, color, dash}], range (low, high) => [low, high], sync, about. */
+export class TimePlot {
+  constructor(place, options) {
+    Object.assign(this, { place, options, data: null });
+    place.setAttribute("role", "img");
+    this.observer = new ResizeObserver(() => this.resize());
+    this.observer.observe(place);
+  }
+
+  show(data, about) {
+    this.data = data;
+    this.place.setAttribute("aria-label", about);
+    if (this.plot) this.plot.setData(data);
+    else this.make();
+    this.relabel();
+  }
+
+  make() {
+    const { options } = this;
+    const width = this.place.clientWidth;
+    if (!width || !this.data) return;
+    this.width = width;
+    this.plot = new uPlot({
+      width, height: this.place.clientHeight || 240,
+      legend: { show: false },
+      cursor: { sync: options.sync ? { key: options.sync } : undefined, drag: { x: true, y: false } },
+      scales: { x: { time: Boolean(options.time) }, y: { range: options.range && ((_, low, high) => options.range(low, high)) } },
+      axes: [
+        axis(options.xLabel, options.time ? 46 : 34, { values: options.time ? [...TIME_FORMATS] : undefined }),
+        axis(options.yLabel, 58, { values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
+      ],
+      series: [{}, ...options.series.map((each) => ({
+        label: each.label, stroke: colour(each.color), width: each.width ?? 1.6, dash: each.dash, spanGaps: Boolean(each.spanGaps),
+        points: { show: Boolean(each.points), size: 6, fill: each.hollow ? colour("raised") : colour(each.color), stroke: colour(each.color) },
+        paths: each.only ? () => null : each.steps ? uPlot.paths.stepped({ align: 1 }) : undefined,
+      }))],
+      bands: (options.bands ?? []).map(([high, low, color]) => ({ series: [high, low], fill: translucent(colour(color)) })),
+      hooks: options.marks ? { drawClear: [marks(options.marks)] } : {},
+    }, this.data, this.place);
+    this.plot.root.setAttribute("aria-hidden", "true");
+  }
+
+  resize() {
+    if (!this.plot) return this.make();
+    const width = this.place.clientWidth;
+    if (width && width !== this.width) {
+      this.width = width;
+      this.plot.setSize({ width, height: this.place.clientHeight || 240 });
+    }
+  }
+
+  // Labels are fixed when a plot is made.
+  relabel() {
+    if (this.plot && this.plot.axes[1].label !== this.options.yLabel) this.redraw();
+  }
+
+  redraw() {
+    this.plot?.destroy();
+    this.plot = null;
+    this.make();
+  }
+
+  close() {
+    this.observer.disconnect();
+    this.plot?.destroy();
+  }
+}
+
+// Times of day in 24 hours, the day where it changes.
+const TIME_FORMATS = [
+  [86400 * 365, "{YYYY}", null, null, null, null, null, null, 1],
+  [86400 * 28, "{MMM}", "\n{YYYY}", null, null, null, null, null, 1],
+  [86400, "{D} {MMM}", "\n{YYYY}", null, null, null, null, null, 1],
+  [60, "{HH}:{mm}", "\n{D} {MMM}", null, "\n{D} {MMM}", null, null, null, 1],
+  [1, "{HH}:{mm}:{ss}", "\n{D} {MMM}", null, null, null, null, null, 1],
+  [0.001, ":{ss}.{fff}", "\n{HH}:{mm}", null, null, null, null, null, 1],
+];
+
+// As many decimals as the distance of two ticks needs.
+function label(tick, ticks) {
+  const step = Math.abs(ticks[1] - ticks[0]) || 1;
+  let decimals = 0;
+  while (decimals < 9 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6) decimals++;
+  return fixed(tick, decimals);
+}
+
+const translucent = (color) => color.replace(/^rgb\((.*)\)$/, "rgba($1, 0.22)");
+
+// A loop in the plane: y over x with axes; points in their order.
+export function loopPlot(x, y, { xLabel, yLabel, about }) {
+  const W = 400, H = 320, left = 64, right = 12, top = 10, bottom = 44;
+  const [x0, x1] = extent(x), [y0, y1] = extent(y);
+  const px = (value) => left + ((value - x0) / (x1 - x0)) * (W - left - right);
+  const py = (value) => H - bottom - ((value - y0) / (y1 - y0)) * (H - top - bottom);
+  const node = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": about });
+  const line = (d, stroke, width) => svg("path", { d, fill: "none", stroke, "stroke-width": width });
+  const across = ticksOf(x0, x1), up = ticksOf(y0, y1);
+  for (const tick of across) {
+    node.append(line(`M${px(tick)} ${top}V${H - bottom}`, "var(--grid)", 1), text(label(tick, across), px(tick), H - bottom + 16, "middle"));
+  }
+  for (const tick of up) {
+    node.append(line(`M${left} ${py(tick)}H${W - right}`, "var(--grid)", 1), text(label(tick, up), left - 6, py(tick) + 4, "end"));
+  }
+  const d = x.map((value, i) => `${i ? "L" : "M"}${px(value).toFixed(1)} ${py(y[i]).toFixed(1)}`).join("");
+  node.append(line(d, "var(--blue)", 1.4), text(xLabel, (left + W - right) / 2, H - 8, "middle"));
+  const side = text(yLabel, 0, 0, "middle");
+  side.setAttribute("transform", `translate(13 ${(top + H - bottom) / 2}) rotate(-90)`);
+  node.append(side);
+  return node;
+}
+
+const text = (words, x, y, anchor) => svg("text", { x, y, "text-anchor": anchor }, words);
+
+function extent(values) {
+  let low = Infinity, high = -Infinity;
+  for (const value of values) {
+    if (value < low) low = value;
+    if (value > high) high = value;
+  }
+  const spread = high - low || Math.abs(high) || 1;
+  return [low - 0.05 * spread, high + 0.05 * spread];
+}
+
+function ticksOf(low, high) {
+  const raw = (high - low) / 5, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((each) => each * power).find((each) => each >= raw);
+  const ticks = [];
+  for (let tick = Math.ceil(low / step) * step; tick <= high + 1e-12 * step; tick += step) ticks.push(Math.abs(tick) < step / 1e6 ? 0 : tick);
+  return ticks;
+}
+
+export function legend(...entries) {
+  return element("ul", { class: "legend" }, entries.map(([kind, words]) =>
+    element("li", { class: kind.split(" ")[0] }, element("i", { class: kind.split(" ")[1] ?? "" }), element("span", {}, words))));
+}

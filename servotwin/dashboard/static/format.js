@@ -1,0 +1,95 @@
+// Numbers, units and times as people read them. Inside, everything is SI: rad, m, s; times in s since the epoch.
+
+export const DEG = 180 / Math.PI;
+const MINUTE = 60, HOUR = 3600, DAY = 86400, YEAR = 365.25 * DAY;
+const UNKNOWN = "–";
+
+const decimalsFor = (spread) => Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(spread))));
+
+export const fixed = (value, decimals) => value.toFixed(decimals).replace("-", "−");
+
+// Three significant digits, without an exponent where that is readable.
+export function brief(value) {
+  if (value === null || !Number.isFinite(value)) return UNKNOWN;
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e5 || size < 1e-4) return value.toExponential(2).replace("-", "−");
+  return fixed(value, Math.min(7, Math.max(0, 2 - Math.floor(Math.log10(size)))));
+}
+
+// A value with its 95 % interval: as many digits as the interval deserves.
+export function gapText(gap, interval, scale = DEG) {
+  if (gap === null) return UNKNOWN;
+  if (!interval || interval[0] === null) return brief(gap * scale);
+  if (interval[1] === null) return `≥ ${brief(interval[0] * scale)}`;
+  const half = ((interval[1] - interval[0]) / 2) * scale;
+  if (!(half > 0)) return brief(gap * scale);
+  const decimals = decimalsFor(half);
+  return `${fixed(gap * scale, decimals)} ± ${fixed(half, decimals)}`;
+}
+
+// The store's word for a window that told nothing new is "nothing moved".
+export const statusText = (status) => ({ ok: "estimate accepted", "nothing moved": "unchanged", "": "no estimate yet" })[status] ?? status;
+
+// The gap as travel of the load: micrometres or degrees.
+export function travelText(gap, row) {
+  if (gap === null || !row.travel) return "";
+  const travel = gap * row.travel;
+  return row.travel_unit === "rad" ? `${brief(travel * DEG)} deg at the load` : `${brief(travel * 1e6)} µm of travel`;
+}
+
+// Unit in which positions of a machine are shown, and its factor.
+export const positionUnit = (machine) =>
+  machine && machine.travel_unit === "rad" ? { name: "deg", factor: DEG } : { name: "mm", factor: 1e3 };
+
+// One unit for all wear rates of a table, after the largest.
+export function rateUnit(rates) {
+  const largest = Math.max(0, ...rates.filter((rate) => rate !== null).map(Math.abs)) * DEG;
+  if (largest * HOUR >= 0.1) return { name: "deg/h", factor: DEG * HOUR };
+  if (largest * DAY >= 0.1) return { name: "deg/day", factor: DEG * DAY };
+  return { name: "deg/year", factor: DEG * YEAR };
+}
+
+export function rateText(rate, interval, unit) {
+  if (rate === null) return UNKNOWN;
+  const half = interval ? ((interval[1] - interval[0]) / 2) * unit.factor : 0;
+  if (!(half > 0)) return brief(rate * unit.factor);
+  const decimals = decimalsFor(half);
+  return `${fixed(rate * unit.factor, decimals)} ± ${fixed(half, decimals)}`;
+}
+
+export function duration(seconds) {
+  if (seconds === null || !Number.isFinite(seconds)) return UNKNOWN;
+  const steps = [[YEAR, "years"], [DAY, "days"], [HOUR, "h"], [MINUTE, "min"]];
+  for (const [size, name] of steps) {
+    if (seconds >= 2 * size) return `${seconds / size >= 10 ? Math.round(seconds / size) : fixed(seconds / size, 1)} ${name}`;
+  }
+  return `${seconds >= 10 || seconds === 0 ? Math.round(seconds) : fixed(seconds, 1)} s`;
+}
+
+export const ago = (time, now) => (time === null ? "never" : `${duration(Math.max(0, now - time))} ago`);
+
+export function limitText(row) {
+  if (row.gap_limit === null) return "no limit";
+  if (row.until_limit === 0) return "reached";
+  if (row.until_limit === null) return row.rate === null ? UNKNOWN : "not growing";
+  return duration(row.until_limit);
+}
+
+export function limitInterval(row) {
+  if (!row.until_limit_interval || !row.until_limit) return "";
+  const [early, late] = row.until_limit_interval;
+  return late === null ? `at the earliest in ${duration(early)}` : `${duration(early)} to ${duration(late)}`;
+}
+
+export function linkOf(row, now) {
+  if (row.connected === true) return { word: "connected", kind: "good" };
+  if (row.last_message === null) return { word: "never heard", kind: "none" };
+  const silence = now - row.last_message;
+  if (row.connected === null && silence < 10 * MINUTE) return { word: "heard", kind: "good" };
+  return { word: "silent", kind: "bad", note: `for ${duration(Math.max(0, silence))}` };
+}
+
+export const clock = (time) => new Date(time * 1000).toLocaleTimeString([], { hour12: false });
+export const stamp = (time) =>
+  new Date(time * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "medium", hour12: false });

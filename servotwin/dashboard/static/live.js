@@ -1,0 +1,114 @@
+// The fleet as it is now: read once, then followed by server-sent events; kept, and marked stale, while the twin is away.
+
+import * as api from "./api.js";
+
+const RETRY_MS = [1000, 2000, 4000, 8000, 15000];
+
+export class Live {
+  constructor(changed, ended) {
+    this.rows = new Map();
+    this.changed = changed; // called with the names of the rows that changed; null: all
+    this.ended = ended; // called where the session has ended
+    this.state = "starting"; // starting, live, trouble, away, ended
+    this.why = "";
+    this.since = null; // s since the epoch: from then on what is shown may be out of date
+    this.skew = 0;
+    this.position = null;
+    this.failures = 0;
+  }
+
+  now() {
+    return Date.now() / 1000 + this.skew;
+  }
+
+  async start() {
+    this.stop();
+    try {
+      const { rows, position, now } = await api.fleet();
+      this.skew = now - Date.now() / 1000;
+      this.rows = new Map(rows.map((row) => [row.servo, row]));
+      this.position = position;
+      this.follow();
+      this.set("live");
+      this.changed(null);
+    } catch (error) {
+      if (error.status === 401 || error.status === 403) return this.end(error.message);
+      this.retry(error.message);
+    }
+  }
+
+  follow() {
+    const source = new EventSource(`/v1/fleet/events?after=${this.position}`);
+    this.source = source;
+    source.addEventListener("open", () => {
+      this.failures = 0;
+      this.set("live");
+      this.changed([]);
+    });
+    source.addEventListener("rows", (event) => this.take(event));
+    source.addEventListener("reload", () => this.start());
+    source.addEventListener("trouble", (event) => this.set("trouble", read(event) || "The twin reports trouble."));
+    source.addEventListener("ended", () => this.end("The session has ended, or its token was revoked."));
+    source.addEventListener("error", () => this.lost());
+  }
+
+  take(event) {
+    const rows = read(event);
+    if (!Array.isArray(rows)) return this.set("trouble", "A message of the twin cannot be read.");
+    this.position = event.lastEventId || this.position;
+    for (const row of rows) if (row && typeof row.servo === "string") this.rows.set(row.servo, row);
+    this.set("live");
+    this.changed(rows.map((row) => row.servo));
+  }
+
+  // The browser tries again by itself, unless the twin refused: then the reason is asked for.
+  async lost() {
+    this.set("away", "The twin cannot be reached.");
+    this.changed([]);
+    if (this.source.readyState !== EventSource.CLOSED) return;
+    this.stop();
+    try {
+      const { admitted } = await api.session();
+      if (!admitted) this.end("The session has ended, or its token was revoked.");
+      else this.retry("The twin refuses more pages that watch.");
+    } catch (error) {
+      if (error.status === 401 || error.status === 403) this.end(error.message);
+      else this.retry(error.message);
+    }
+  }
+
+  retry(why) {
+    this.stop();
+    this.set("away", why);
+    this.changed([]);
+    const wait = RETRY_MS[Math.min(this.failures++, RETRY_MS.length - 1)];
+    this.timer = setTimeout(() => this.start(), wait);
+  }
+
+  end(why) {
+    this.stop();
+    this.set("ended", why);
+    this.ended(why);
+  }
+
+  stop() {
+    clearTimeout(this.timer);
+    this.source?.close();
+  }
+
+  set(state, why = "") {
+    if (state === "live") this.since = null;
+    else this.since ??= this.rows.size ? this.now() : null;
+    this.state = state;
+    this.why = why;
+    document.documentElement.dataset.live = state;
+  }
+}
+
+function read(event) {
+  try {
+    return JSON.parse(event.data);
+  } catch {
+    return null;
+  }
+}

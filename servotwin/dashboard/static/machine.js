@@ -1,0 +1,303 @@
+/* global uPlot */
+// One machine: what is known, its gap over time, its last windows, the updates and what they were verified on.
+
+import * as api from "./api.js";
+import { legend, loopPlot, TimePlot } from "./charts.js";
+import { element, setText } from "./dom.js";
+import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, stamp, statusText, travelText } from "./format.js";
+import { chainTable, eventList, simulated } from "./updates.js";
+
+const REFRESH_MS = 1500, EVERY = 20000;
+const scaled = (values, factor) => values.map((value) => (value === null ? null : value * factor));
+
+export class MachinePage {
+  constructor(view, live, name) {
+    Object.assign(this, { view, live, name, gaps: null, updates: null, happened: null, shown: null, follow: true, error: "" });
+    this.plots = [];
+    this.build();
+    this.ages = setInterval(() => this.facts(), 5000);
+    this.facts();
+    this.refresh();
+  }
+
+  close() {
+    this.closed = true;
+    clearInterval(this.ages);
+    clearTimeout(this.timer);
+    for (const plot of this.plots) plot.close();
+  }
+
+  redraw() {
+    for (const plot of this.plots) plot.redraw();
+  }
+
+  update(names) {
+    this.facts();
+    if (names === null || names.includes(this.name)) this.later();
+  }
+
+  later() {
+    this.timer ??= setTimeout(() => {
+      this.timer = null;
+      this.refresh();
+    }, REFRESH_MS);
+  }
+
+  build() {
+    const { name } = this;
+    this.tiles = {};
+    const tile = (key, label) => {
+      this.tiles[key] = [element("dd"), element("dd")];
+      return element("div", { class: "fact" }, element("dt", {}, label), ...this.tiles[key]);
+    };
+    this.alarms = element("ul", { class: "alarms", hidden: true, "aria-label": "Alarms of the last day" });
+    this.trouble = element("p", { class: "error", role: "status" });
+    this.choice = element("select", { "aria-label": "Window", on: { change: () => this.pick(this.choice.value) } });
+    this.rate = element("button", { type: "button", on: { click: () => this.loadWindow(EVERY) } }, "Every sample");
+    this.windowFile = element("a", { download: true }, "CSV");
+    this.windowNote = element("p", { class: "soft" });
+    this.loop = element("div", { class: "hysteresis" });
+    this.chain = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Updates" });
+    this.proof = element("div");
+    this.events = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Events" });
+    this.blank = element("p", { class: "empty", hidden: true });
+    const plot = (place, options) => {
+      this.plots.push(new TimePlot(place, options));
+      return this.plots.at(-1);
+    };
+    const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
+    const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
+    this.content = element("div", {},
+      panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV")],
+        legend(["blue", "estimate"], ["blue band", "95 % interval"], ["green", "wear (trend)"], ["red dash", "limit"], ["orange", "version applied"], ["red dots", "version refused, or fallback"]),
+        places.gap),
+      panel("Window", [this.choice, this.rate, this.windowFile], this.windowNote,
+        element("div", { class: "pair" },
+          element("div", {},
+            legend(["orange", "reference"], ["blue", "position"]), places.position,
+            legend(["blue", "motor"], ["orange", "screw or gear, from the position"]), places.motor,
+            legend(["blue", "command"]), places.voltage),
+          element("div", {}, element("h3", {}, "Hysteresis"),
+            element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
+            this.loop))),
+      panel("Did it help?", [],
+        legend(["blue", "of each window"], ["orange", "version applied"]),
+        element("div", { class: "two" }, places.tail, places.residual)),
+      panel("Updates", [], this.chain),
+      panel("Behind the last update", [], this.proof),
+      panel("Events", [], this.events));
+    this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: "#/" }, "All machines"));
+    this.tilesList = element("dl", { class: "facts" },
+      tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
+    this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
+    this.makePlots(plot, places);
+  }
+
+  makePlots(plot, places) {
+    const versions = () => this.marks();
+    this.gapPlot = plot(places.gap, {
+      time: true, xLabel: "", yLabel: "Gap (deg)", marks: versions,
+      series: [
+        { label: "high", color: "blue", width: 0 }, { label: "low", color: "blue", width: 0 },
+        { label: "accepted", color: "blue", points: true, only: true }, { label: "not accepted", color: "blue", points: true, hollow: true, only: true },
+        { label: "trend", color: "green", width: 2, spanGaps: true }, { label: "limit", color: "red", dash: [6, 4], spanGaps: true },
+      ],
+      bands: [[1, 2, "blue"]], range: around,
+    });
+    const fromZero = (low, high) => [0, high > 0 ? high * 1.12 : 1];
+    this.tailPlot = plot(places.tail, { time: true, yLabel: "Error at the end", marks: versions, range: fromZero, series: [{ label: "error", color: "blue", points: true, spanGaps: true }] });
+    this.residualPlot = plot(places.residual, { time: true, yLabel: "Residual, rms", marks: versions, range: fromZero, series: [{ label: "residual", color: "blue", points: true, spanGaps: true }] });
+    this.positionPlot = plot(places.position, { sync: "window", yLabel: "Position", series: [{ label: "reference", color: "orange" }, { label: "position", color: "blue" }] });
+    this.motorPlot = plot(places.motor, { sync: "window", yLabel: "Angle (deg)", series: [{ label: "motor", color: "blue" }, { label: "screw", color: "orange" }] });
+    this.voltagePlot = plot(places.voltage, { sync: "window", xLabel: "Time in the window (s)", yLabel: "Command", series: [{ label: "command", color: "blue" }] });
+  }
+
+  async refresh() {
+    try {
+      const [gaps, updates, happened] = await Promise.all([api.gaps(this.name), api.updates(this.name), api.events(this.name)]);
+      if (this.closed) return;
+      Object.assign(this, { gaps, updates, happened, error: "" });
+    } catch (error) {
+      if (this.closed) return;
+      this.error = error.message;
+      if (error.status === 401) this.live.end(error.message);
+      else this.later();
+    }
+    this.facts();
+    if (this.gaps) await this.show();
+  }
+
+  // What the rows of the fleet tell: shown at once, and again with every event.
+  facts() {
+    const row = this.live.rows.get(this.name), now = this.live.now();
+    this.content.classList.toggle("stale", this.live.since !== null || this.error !== "");
+    setText(this.trouble, this.error ? `${this.error} What is shown may be out of date.` : "");
+    const known = this.gaps?.windows.received.length ?? 0;
+    this.content.hidden = known === 0;
+    this.blank.hidden = known > 0;
+    const unknown = !row && this.live.state === "live";
+    const none = this.gaps ? "No window of this machine has come yet: there is nothing to estimate from." : "Reading …";
+    setText(this.blank, unknown ? "The twin knows no machine of this name." : none);
+    if (!row) return;
+    const unit = rateUnit([row.rate]), link = linkOf(row, now);
+    this.tile("gap", gapText(row.gap, row.interval), [statusText(row.status), travelText(row.gap, row)]);
+    this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time, 95 %"]);
+    this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
+    this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? row.receipt : ""]);
+    this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? `${row.waiting} messages wait` : ""]);
+    this.tile("link", link.word, [link.note ?? "", row.last_message === null ? "" : `last message ${ago(row.last_message, now)}`]);
+    this.tiles.link[0].className = `mark ${link.kind}`;
+    const lines = row.alarms.map((alarm) => `${stamp(alarm.time)}: ${alarm.sentence}`);
+    this.alarms.hidden = lines.length === 0;
+    if (this.alarms.dataset.lines !== lines.join("\n")) {
+      this.alarms.dataset.lines = lines.join("\n");
+      this.alarms.replaceChildren(...lines.map((line) => element("li", {}, line)));
+    }
+  }
+
+  tile(key, value, notes) {
+    setText(this.tiles[key][0], value);
+    setText(this.tiles[key][1], notes.filter(Boolean).join(", "));
+  }
+
+  marks() {
+    if (!this.gaps) return [];
+    const { versions, fallbacks } = this.gaps;
+    const marks = versions.filter((each) => each.applied !== null).map((each) => ({
+      at: each.answered, word: `v${each.version}`, color: each.applied ? "orange" : "red", dash: !each.applied,
+    }));
+    marks.push(...fallbacks.map((each) => ({ at: each.time, word: "fallback", color: "red", dash: true })));
+    return marks.sort((a, b) => a.at - b.at);
+  }
+
+  async show() {
+    const { windows, machine } = this.gaps, count = windows.received.length;
+    if (!count) return;
+    const accepted = windows.kind.map((kind, i) => kind === "glance" || windows.status[i] === "ok");
+    const gap = scaled(windows.gap, DEG);
+    const limit = machine.gap_limit === null ? null : machine.gap_limit * DEG;
+    const high = scaled(windows.high, DEG), top = Math.max(0, ...gap.filter((value) => value !== null)) * 1.5 + 0.1;
+    const near = limit !== null && limit < 3 * top ? limit : null;
+    const newest = this.live.rows.get(this.name) ?? { gap: null };
+    // The last version may have been applied after the last window.
+    const [last] = this.marks().map((mark) => mark.at).slice(-1), later = last > windows.received.at(-1) ? [last] : [];
+    const time = [...windows.received, ...later];
+    this.gapPlot.show([
+      time,
+      ...[
+        high.map((value) => (value === null ? null : Math.min(value, Math.max(top, near ?? 0)))),
+        scaled(windows.low, DEG).map((value, i) => (high[i] === null ? null : value)),
+        gap.map((value, i) => (accepted[i] ? value : null)), gap.map((value, i) => (accepted[i] ? null : value)),
+        scaled(windows.trend, DEG),
+      ].map((values) => [...values, ...later.map(() => null)]),
+      time.map(() => near),
+    ], `Gap over ${count} windows: newest ${gapText(newest.gap, newest.interval)} deg`);
+    const unit = positionUnit(machine);
+    this.tailPlot.options.yLabel = `Error at the end (${unit.name})`;
+    this.tailPlot.show([windows.received, scaled(windows.tail, unit.factor)], "Largest tracking error in the last tenth of each window");
+    const fine = Math.max(...windows.residual) < (unit.name === "mm" ? 1e-6 : 1e-3);
+    const residual = unit.name === "mm" ? (fine ? ["nm", 1e9] : ["µm", 1e6]) : fine ? ["µrad", 1e6] : ["mrad", 1e3];
+    this.residualPlot.options.yLabel = `Residual, rms (${residual[0]})`;
+    this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
+    this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
+    this.proof.replaceChildren(simulated(this.updates));
+    this.events.replaceChildren(eventList(this.happened));
+    await this.chooseWindows();
+  }
+
+  async chooseWindows() {
+    const { windows } = this.gaps, keys = windows.sequence.map((sequence, i) => `${windows.boot[i]}/${sequence}`).reverse();
+    const listed = keys.slice(0, 100);
+    if (this.choice.dataset.newest !== listed[0] || this.choice.options.length !== listed.length) {
+      const chosen = this.choice.value;
+      this.choice.replaceChildren(...listed.map((key, i) => element("option", { value: key }, `${i ? "" : "newest: "}number ${key.split("/")[1]}, ${stamp(windows.received[windows.received.length - 1 - i])}`)));
+      this.choice.dataset.newest = listed[0];
+      if (!this.follow && listed.includes(chosen)) this.choice.value = chosen;
+    }
+    if (this.shown !== this.choice.value) await this.loadWindow(this.columns());
+  }
+
+  pick(key) {
+    this.follow = this.choice.selectedIndex === 0;
+    this.choice.value = key;
+    this.loadWindow(this.columns());
+  }
+
+  // Two columns of samples per three pixels: more would not be seen.
+  columns() {
+    return Math.max(100, Math.round(this.positionPlot.place.clientWidth / 1.5));
+  }
+
+  async loadWindow(points) {
+    const key = this.choice.value, [boot, sequence] = key.split("/");
+    this.windowFile.href = `${api.windowPath(this.name, boot, sequence)}/channels.csv`;
+    this.shown = key;
+    try {
+      const window = await api.channels(this.name, boot, sequence, points);
+      if (this.closed || this.shown !== key) return;
+      this.showWindow(window);
+    } catch (error) {
+      if (this.closed) return;
+      setText(this.windowNote, error.status === 404 ? "The samples of this window are no longer stored." : error.message);
+      this.loop.replaceChildren();
+      for (const plot of [this.positionPlot, this.motorPlot, this.voltagePlot]) if (plot.data) plot.show([[], ...plot.data.slice(1).map(() => [])], "no samples");
+      if (error.status === 401) this.live.end(error.message);
+    }
+  }
+
+  showWindow(window) {
+    const { machine } = this.gaps, unit = positionUnit(machine);
+    const channel = (name) => window.channels.find((each) => each.name === name);
+    const position = channel("position"), motor = channel("theta_m"), reference = channel("reference"), command = channel("voltage");
+    const kept = Math.max(...window.channels.map((each) => each.values.length));
+    const every = kept >= window.samples;
+    this.rate.disabled = every;
+    setText(this.windowNote, `${duration(window.samples / window.rate)} at ${brief(window.rate)} Hz, sent for: ${window.reason}; version ${window.version} in force. ${every ? "Every sample is shown." : "The least and greatest sample of each column are shown."} Drag to look closer, double click for all.`);
+    this.positionPlot.options.yLabel = `Position (${unit.name})`;
+    const joined = (first, second) => uPlot.join([first, second].map((each) => (each ? [each.time, each.values] : [[], []])));
+    const stretch = (data, factors) => [data[0], ...data.slice(1).map((values, i) => filled(values).map((value) => (value === null ? null : value * factors[i])))];
+    this.positionPlot.show(stretch(joined(reference, position), [unit.factor, unit.factor]), `Reference and position in ${unit.name}`);
+    const screw = position && machine.travel ? { time: position.time, values: position.values.map((value) => value / machine.travel) } : null;
+    this.motorPlot.show(stretch(joined(motor, screw), [DEG, DEG]), "Angles of motor and screw in degrees");
+    this.voltagePlot.options.yLabel = `Command (${machine.command_unit})`;
+    this.voltagePlot.show(command ? [command.time, command.values] : [[], []], `Command in ${machine.command_unit}`);
+    this.showLoop(motor, position, machine);
+  }
+
+  showLoop(motor, position, machine) {
+    if (!motor || !position || !machine.travel) {
+      this.loop.replaceChildren(element("p", { class: "soft" }, "The window has no angle of the motor, or the travel per turn is unknown."));
+      return;
+    }
+    const [, theta, q] = uPlot.join([[motor.time, motor.values], [position.time, position.values]]);
+    const a = filled(theta), b = filled(q), x = [], y = [];
+    for (let i = 0; i < a.length; i++) {
+      if (a[i] === null || b[i] === null) continue;
+      x.push(a[i] * DEG);
+      y.push((a[i] - b[i] / machine.travel) * DEG);
+    }
+    this.loop.replaceChildren(loopPlot(x, y, { xLabel: "Motor (deg)", yLabel: "Motor ahead of the load (deg)", about: "Hysteresis loop of motor and load" }));
+  }
+}
+
+// A range around the data, wide enough that noise does not look like wear.
+function around(low, high) {
+  if (low === null || high === null) return [0, 1];
+  const least = Math.max(0.15 * Math.abs(high), 0.02), more = Math.max(0, least - (high - low)) / 2 + 0.08 * (high - low);
+  return [Math.max(0, low - more), high + more];
+}
+
+// Channels are decimated one by one: between its own samples a channel is interpolated.
+function filled(values) {
+  const made = values.slice();
+  let before = -1;
+  for (let i = 0; i < made.length; i++) {
+    if (made[i] === null || made[i] === undefined) continue;
+    for (let k = before + 1; before >= 0 && k < i; k++) made[k] = made[before] + ((made[i] - made[before]) * (k - before)) / (i - before);
+    before = i;
+  }
+  return made.map((value) => (value === undefined ? null : value));
+}
+
+const panel = (title, tools, ...children) =>
+  element("section", { class: "panel", "aria-label": title }, element("header", {}, element("h2", {}, title), ...tools), ...children);

@@ -1,0 +1,97 @@
+// Updates as the audit chain: window, estimate, verification, version, answer of the edge, effect; and other events.
+
+import { element } from "./dom.js";
+import { brief, DEG, gapText, stamp } from "./format.js";
+
+const cell = (content, number = false) => element("td", { class: number ? "number" : "" }, content);
+const percent = (share) => `${brief(share * 100)} %`;
+
+export function chainTable(traces, gaps, unit) {
+  const steps = traces.flatMap((trace) => trace.steps.map((step) => ({ trace, step })));
+  if (!steps.length) return element("p", { class: "soft" }, refusals(gaps) || "The twin has sent no update yet.");
+  const heads = ["Version", "Sent", "Window", "Gap, deg", "Setting", "Verified on", "The edge", `Error at the end, before → after (${unit.name})`];
+  return element("table", {},
+    element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))),
+    element("tbody", {}, steps.sort((a, b) => b.step.update.version - a.step.update.version).map(({ trace, step }) => row(trace, step, unit))));
+}
+
+// Why the newest windows led to no update.
+function refusals(gaps) {
+  const reasons = gaps.windows.reasons.at(-1) ?? [];
+  return reasons.length ? `The twin has sent no update yet. The newest estimate: ${reasons.join("; ")}.` : "";
+}
+
+function row(trace, step, unit) {
+  const body = step.update.body ?? {}, { verification } = body;
+  const half = body.interval && body.interval[0] !== null ? body.interval : null;
+  return element("tr", {},
+    cell(String(step.update.version), true), cell(stamp(step.update.created), true), cell(`${trace.window.sequence}`, true),
+    cell(gapText(body.gap ?? null, half), true), cell(settingText(body.setting ?? {}, unit)),
+    cell(verification ? `${verification.members} simulated machines` : "not simulated"),
+    cell(answerText(step)), cell(effectText(step.effect, unit), true));
+}
+
+function settingText(setting, unit) {
+  const parts = [setting.tolerance ? `dead zone ${brief(setting.tolerance * unit.factor)} ${unit.name}` : "no dead zone"];
+  const gains = setting.gains ?? {};
+  const named = ["Kp", "Ki", "Kd"].filter((name) => typeof gains[name] === "number");
+  if (named.length) parts.push(named.map((name) => `${name} ${brief(gains[name])}`).join(", "));
+  if (gains.feedforward) parts.push(`feedforward ${brief(gains.feedforward)}`);
+  return parts.join("; ");
+}
+
+function answerText(step) {
+  const receipt = step.answers.find((answer) => answer.kind === "receipt");
+  const fallback = step.answers.find((answer) => answer.kind === "fallback");
+  if (fallback) return `left it for its fallback set: ${fallback.status}`;
+  if (!receipt) return "has not answered yet";
+  return receipt.body?.applied ? "applied it" : `refused it: ${receipt.status}`;
+}
+
+function effectText(effect, unit) {
+  if (!effect) return "no window under it yet";
+  const error = (evidence) => (evidence && evidence.tail !== null ? brief(evidence.tail * unit.factor) : "?");
+  return `${error(effect.before)} → ${error(effect.after)}`;
+}
+
+// The simulated runs behind the last update, and what was not tried.
+export function simulated(traces) {
+  const trace = traces.find((each) => each.steps.length);
+  if (!trace) return element("p", { class: "soft" }, "No update was sent.");
+  const { update } = trace.steps.at(-1), { verification } = update.body ?? {};
+  if (!verification) {
+    return element("p", {}, `Version ${update.version} follows from the estimate by a rule. It was not simulated before it was sent: no other plant, friction, delay or noise was tried.`);
+  }
+  const redesign = trace.evidence.find((one) => one.kind === "redesign" && one.body?.certificate);
+  const tried = [
+    `${verification.members} machines, drawn at random from what is stated and learnt, were simulated with this setting; ${percent(verification.settled)} of them settled.`,
+    verification.confidence ? `Of such machines at least ${percent(verification.settled_least)} settle, at a confidence of ${percent(verification.confidence)}.` : null,
+    `Largest overshoot ${percent(verification.overshoot)} of the step, largest error at the end ${brief(verification.tail * 1e6)} µm.`,
+    verification.Ms_worst ? `Peak of the sensitivity ${brief(verification.Ms)} on the model, ${brief(verification.Ms_worst)} on the worst plant; least phase margin ${brief(verification.phase_margin_worst * DEG)} deg.` : null,
+    `${verification.looked_at} settings were simulated until this one was chosen.`,
+    verification.saturated ? "A machine reached the limit of the command." : "No machine reached the limit of the command.",
+  ].filter(Boolean);
+  const region = redesign?.body.certificate.region ?? null;
+  return element("div", {},
+    element("p", {}, `Version ${update.version}, for a gap of ${brief((update.body.gap ?? NaN) * DEG)} deg:`),
+    element("ul", { class: "simulated" }, tried.map((line) => element("li", {}, line))),
+    element("p", { class: "soft" }, `Not tried: gaps${region ? rangeText(region) : ""} and machines outside the ranges that the twin's file states; faults of sensors, drive or structure; references other than steps. Verified in simulation is not proved.`));
+}
+
+function rangeText(region) {
+  const range = region.gap ?? region.gaps;
+  return Array.isArray(range) && range.length === 2 ? ` outside ${brief(range[0] * DEG)} to ${brief(range[1] * DEG)} deg` : "";
+}
+
+const HAPPENED = {
+  hello: (one) => `edge connected: boot ${one.status}, version ${one.version} in force`,
+  fallback: (one) => `fallback from version ${one.version}: ${one.status}`,
+  answer: (one) => `the edge answers a request: ${one.status}`,
+  alarm: (one) => `alarm: ${one.status}`,
+};
+
+export function eventList(events) {
+  if (!events.length) return element("p", { class: "soft" }, "Nothing but windows and updates.");
+  return element("table", {}, element("tbody", {}, events.map((one) =>
+    element("tr", {}, cell(stamp(one.created), true), cell((HAPPENED[one.kind] ?? ((each) => each.status || each.kind))(one))))));
+}

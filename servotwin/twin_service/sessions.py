@@ -1,0 +1,85 @@
+"""Sessions of browsers: an operator's token is given once, and a cookie that cannot be read by scripts follows from it.
+
+The cookie holds the operator's name, an end and a message authentication code under the digest of the token. So no
+session is stored, a restart of the twin ends none, and a token that is revoked ends all of its own.
+"""
+
+from __future__ import annotations
+
+import hmac
+import math
+import re
+from collections.abc import Callable
+from hashlib import sha256
+
+from servotwin.messages import Refusal
+from servotwin.twin_service.auth import AccessControl
+from servotwin.twin_service.http_app import HttpRequest
+from servotwin.twin_service.limits import RequestRejected
+
+COOKIE = "servotwin-operator"
+SESSION_S = 12 * 3600.0
+"""s after which a browser has to give the token again."""
+_COOKIE = re.compile(r"([0-9a-f]{2,256})\.(\d{1,12})\.([0-9a-f]{64})")
+_LABEL = b"servotwin operator session 1\0"
+_ENDED = "the session has ended, or its token was revoked: give the token again"
+
+
+class OperatorAccess:
+    """Admits operators by their token, or by the cookie of a session.
+
+    Parameters
+    ----------
+    access : AccessControl
+    wall : callable
+        s since the epoch.
+    secure : bool
+        The cookie is sent over TLS only.
+    """
+
+    def __init__(self, access: AccessControl, wall: Callable[[], float], secure: bool) -> None:
+        self._access, self._wall, self._secure = access, wall, secure
+
+    @property
+    def open(self) -> bool:
+        """True where no tokens are configured."""
+        return self._access.open
+
+    def check(self, request: HttpRequest) -> None:
+        """Check that a request is an operator's; raises RequestRejected."""
+        cookie = None if request.token is not None else request.cookie(COOKIE)
+        if cookie is None or self._access.open:
+            self._access.check_operator(request.token)
+        elif not self._valid(cookie):
+            raise RequestRejected(Refusal.BAD_TOKEN, _ENDED, 401)
+
+    def session_cookie(self, token: bytes) -> str:
+        """Set-Cookie header of a new session; raises RequestRejected where the token is no operator's."""
+        self._access.check_operator(token)
+        name = self._access.operator_of(token)
+        end = str(math.ceil(self._wall() + SESSION_S))
+        encoded = name.encode().hex()
+        return self._header(f"{encoded}.{end}.{self._code(name, end)}", SESSION_S)
+
+    def ended_cookie(self) -> str:
+        """Set-Cookie header that ends a session."""
+        return self._header("", 0.0)
+
+    def _valid(self, cookie: str) -> bool:
+        match = _COOKIE.fullmatch(cookie)
+        if match is None:
+            return False
+        try:
+            name = bytes.fromhex(match[1]).decode()
+        except ValueError:
+            return False
+        return hmac.compare_digest(self._code(name, match[2]), match[3]) and self._wall() < int(match[2])
+
+    def _code(self, name: str, end: str) -> str:
+        """Authentication code; of an operator that does not exist, one that nobody knows."""
+        key = self._access.operator_key(name)
+        return hmac.digest(key, _LABEL + f"{name}\0{end}".encode(), sha256).hex()
+
+    def _header(self, value: str, seconds: float) -> str:
+        secure = "; Secure" if self._secure else ""
+        return f"{COOKIE}={value}; Path=/; Max-Age={seconds:.0f}; HttpOnly; SameSite=Strict{secure}"

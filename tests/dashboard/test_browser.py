@@ -1,0 +1,266 @@
+"""The dashboard in Debian's Chromium: each page and state, accessibility, and pictures in build/screenshots."""
+
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import httpx
+import pytest
+from dashboard_fleet import SILENT, WEARING, wearing_fleet
+from servers import needed
+from service_system import OPERATOR, OTHER, TOKEN, bearer, place, process, window
+
+from servotwin.link.seal import verifier_of
+from servotwin.messages import encode
+from servotwin.twin_service.auth import Verifiers, write_tokens
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is in the extra dev")
+pytestmark = pytest.mark.slow
+
+PICTURES = Path(__file__).parents[2] / "build" / "screenshots"
+AXE = (Path(__file__).parents[1] / "data" / "axe" / "axe.min.js").read_text(encoding="utf-8")
+OTHERS = 1000
+WAIT_MS = 30_000
+MARKUP = '<img src=x onerror="window.hacked=1"><script>window.hacked=1</script>'
+
+
+class Twin:
+    """A twin's service that can be killed and started again on its port."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self._entered = path, None
+        self.start("0")
+
+    def start(self, port: str) -> None:
+        self._entered = process(self.path, "--port", port)
+        self._process, self.url = self._entered.__enter__()
+
+    def kill(self) -> None:
+        os.killpg(self._process.pid, signal.SIGKILL)
+        self._entered.__exit__(None, None, None)
+
+    def restart(self) -> None:
+        self.start(self.url.rpartition(":")[2])
+
+
+@pytest.fixture(scope="module")
+def twin(tmp_path_factory):
+    running = Twin(wearing_fleet(tmp_path_factory.mktemp("twin"), time.time(), OTHERS))
+    yield running
+    running.kill()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with playwright.sync_playwright() as engine:
+        # Root, as in containers, has no sandbox.
+        opened = engine.chromium.launch(executable_path=needed("chromium"), args=["--no-sandbox"])
+        yield opened
+        opened.close()
+
+
+@pytest.fixture
+def open_page(browser, twin):
+    """Opens pages; in the end no script may have failed, and nothing may have been executed that came as a name."""
+    contexts, faults = [], []
+
+    def opened(login=True, width=1280, height=900, theme="light", expected=()):
+        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
+        context.set_default_timeout(WAIT_MS)
+        contexts.append(context)
+        page = context.new_page()
+        page.on("pageerror", lambda error: faults.append(str(error)))
+
+        def note(message):
+            if message.type in ("error", "warning") and not any(each in message.text for each in expected):
+                faults.append(message.text)
+
+        page.on("console", note)
+        if login:
+            answer = context.request.post(f"{twin.url}/v1/session", data={"token": OPERATOR})
+            assert answer.status == 204
+            page.goto(twin.url)
+            page.wait_for_selector(".rows .row")
+        return page
+
+    yield opened
+    for context in contexts:
+        for page in context.pages:
+            assert page.evaluate("window.hacked") is None
+        context.close()
+    assert faults == []
+
+
+def has_text(page, selector, text):
+    page.locator(selector, has_text=text).first.wait_for()
+
+
+def open_machine(page, name):
+    page.evaluate("name => { location.hash = '#/machine/' + name }", name)
+    page.wait_for_selector(".facts")
+
+
+def test_a_token_is_given_once_and_kept_where_no_script_reads_it(open_page, twin):
+    page = open_page(login=False, expected=("status of 401", "status of 403"))
+    page.goto(twin.url)
+    for wrong in ("guess", TOKEN):
+        page.fill("#token", wrong)
+        page.click("#login-form button")
+        has_text(page, "#login-error", "not an operator's token")
+    page.fill("#token", OPERATOR)
+    page.press("#token", "Enter")
+    page.wait_for_selector(".rows .row")
+    (cookie,) = page.context.cookies()
+    assert cookie["httpOnly"]
+    assert cookie["sameSite"] == "Strict"
+    assert OPERATOR not in cookie["value"]
+    assert page.evaluate("document.cookie") == ""
+    page.reload()
+    page.wait_for_selector(".rows .row")
+    page.click("#logout")
+    page.wait_for_selector("#token")
+    assert page.context.cookies() == []
+
+
+def test_a_thousand_machines_are_sorted_filtered_searched_and_opened_with_the_keyboard(open_page):
+    page = open_page()
+    has_text(page, ".chips button", f"{OTHERS + 2} all")
+    assert page.locator(".rows .row").count() < 60
+    page.click(".heads [data-column=gap] button")
+    assert page.get_attribute(".heads [data-column=gap]", "aria-sort") == "descending"
+    has_text(page, ".rows .row[aria-rowindex='2']", "m-0016")
+    page.evaluate("scrollTo(0, document.body.scrollHeight)")
+    has_text(page, ".rows .row", SILENT)  # what is unknown comes last
+    page.keyboard.press("/")
+    page.keyboard.type("AX-")
+    has_text(page, ".rows .row", WEARING)
+    assert page.locator(".rows .row").count() == 2
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("ArrowUp")
+    page.keyboard.press("Enter")
+    has_text(page, "h1", WEARING)
+
+
+def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
+    page = open_page()
+    open_machine(page, WEARING)
+    has_text(page, ".fact", "± 0.039")  # of the estimate that the co-simulation gives
+    has_text(page, ".fact", "limit 20.0 deg")
+    page.wait_for_selector(".hysteresis svg")
+    assert page.locator(".uplot").count() == 6
+    has_text(page, "[aria-label=Updates] tbody tr", "applied it")
+    assert page.locator("[aria-label=Updates] tbody tr").count() == 4
+    has_text(page, "[aria-label='Behind the last update']", "not simulated")
+    has_text(page, "[aria-label=Events]", "edge connected: boot boot-1")
+    page.set_viewport_size({"width": 360, "height": 740})
+    page.select_option("[aria-label=Window] select", index=1)
+    has_text(page, "[aria-label=Window] p", "The least and greatest sample")
+    page.click("text=Every sample")
+    has_text(page, "[aria-label=Window] p", "Every sample is shown")
+    with page.expect_download() as download:
+        page.click("[aria-label='Gap over time'] a")
+    assert download.value.path().read_text().startswith("received,sample_time,boot")
+
+
+def test_states_without_data_are_said_in_words(open_page):
+    page = open_page(expected=("status of 404",))
+    open_machine(page, SILENT)
+    has_text(page, ".empty", "No window of this machine has come yet")
+    open_machine(page, "nobody")
+    has_text(page, ".empty", "The twin knows no machine of this name")
+    open_machine(page, "m-0001")  # its window holds no samples that can be read
+    has_text(page, "[aria-label=Window] p", "no longer stored")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_pages_are_accessible_and_fit_every_width(open_page, theme):
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    page = open_page(theme=theme)
+    for name, width, height in (("phone", 360, 740), ("desk", 1280, 900), ("wall", 3840, 2160)):
+        page.set_viewport_size({"width": width, "height": height})
+        for view in ("fleet", "machine"):
+            page.evaluate(f"location.hash = '#/{'' if view == 'fleet' else 'machine/' + WEARING}'")
+            page.wait_for_selector(
+                ".rows .row svg path[d^=M]" if view == "fleet" else ".hysteresis svg", state="attached"
+            )
+            page.wait_for_timeout(150)
+            picture = page.screenshot(full_page=view == "machine")
+            (PICTURES / f"{view}-{theme}-{name}.png").write_bytes(picture)
+            assert page.evaluate("document.documentElement.scrollWidth") <= width, f"{view} scrolls sideways at {width}"
+            if name != "wall":
+                assert serious_faults(page) == []
+
+
+def serious_faults(page):
+    page.evaluate(AXE)
+    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    faults = [each for each in found["violations"] if each["impact"] in ("serious", "critical")]
+    return [(each["id"], [node["html"][:120] for node in each["nodes"][:3]]) for each in faults]
+
+
+def test_a_new_window_appears_by_itself(open_page, twin):
+    page = open_page()
+    page.fill(".search", SILENT)
+    has_text(page, ".rows .row", "none yet")
+    sent = window(5, SILENT)
+    answer = httpx.put(twin.url + place(sent), content=encode(sent), headers=bearer(OTHER))
+    assert answer.status_code == 201
+    has_text(page, ".rows .row [data-column=window]", "s ago")
+
+
+def test_text_from_outside_is_never_executed(open_page, twin):
+    page = open_page(expected=("status of 400", "status of 404"))
+    rows = httpx.get(f"{twin.url}/v1/fleet?limit=1", headers=bearer(OPERATOR)).json()
+    hostile = {**rows["rows"][0], "servo": MARKUP, "status": MARKUP, "receipt": MARKUP}
+    rows["rows"] = [{**hostile, "alarms": [{"time": 0.0, "sentence": MARKUP}]}]
+    page.route("**/v1/fleet?*", lambda route: route.fulfill(body=json.dumps(rows), content_type="application/json"))
+    page.reload()
+    has_text(page, ".rows .row a", "<img src=x")
+    page.locator(".rows .row a").first.click()
+    has_text(page, "h1", "<script>")
+    has_text(page, ".alarms li", "onerror")
+
+
+def test_a_malformed_event_keeps_the_last_good_data(open_page):
+    page = open_page()
+    broken = "id: 1-1\nevent: rows\ndata: {broken\n\n"
+    page.route("**/v1/fleet/events*", lambda route: route.fulfill(body=broken, content_type="text/event-stream"))
+    page.reload()
+    has_text(page, "#state", "What is shown is of")
+    assert page.locator(".rows .row").count() > 10
+    assert page.locator(".table.stale").count() == 1
+    page.unroute("**/v1/fleet/events*")
+    page.wait_for_selector("[data-live=live]", state="attached")
+
+
+def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):
+    page = open_page(expected=("ERR_", "Failed to load"))
+    page.evaluate("window.kept = 1")
+    twin.kill()
+    has_text(page, "#state", "cannot be reached")
+    has_text(page, "#state", "What is shown is of")
+    assert page.locator(".rows .row").count() > 10
+    twin.restart()
+    page.wait_for_selector("[data-live=live]", state="attached")
+    assert page.evaluate("window.kept") == 1
+    page.locator(".table:not(.stale)").wait_for()
+
+
+def test_a_revoked_token_ends_the_session(open_page, twin):
+    page = open_page(expected=("status of 401", "status of 403"))
+    known = {"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}
+    write_tokens(twin.path.parent / "tokens.toml", Verifiers(known, {"me": verifier_of("another")}))
+    try:
+        page.wait_for_timeout(1500)  # the twin looks at the file once a second
+        open_machine(page, WEARING)
+        page.wait_for_selector("#token")
+        has_text(page, "#state", "session has ended")
+        assert page.is_visible("h1 >> text=ax-1")
+        page.fill("#token", "another")
+        page.press("#token", "Enter")
+        page.wait_for_selector(".hysteresis svg")
+    finally:
+        write_tokens(twin.path.parent / "tokens.toml", Verifiers(known, {"me": verifier_of(OPERATOR)}))
