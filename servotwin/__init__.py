@@ -42,6 +42,7 @@ _HOMES = {
     "VelocityDrive": "servotwin.plant.actuator",
     "Window": "servotwin.estimation.window",
     "certify": "servotwin.redesign.certified.certify",
+    "commission": "servotwin.commissioning.commission",
     "cosimulate": "servotwin.cosim",
     "estimate_gap": "servotwin.estimation.gap",
     "estimate_jointly": "servotwin.estimation.joint.estimator",
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
     from servotwin.analysis.maps.result import StabilityMap
     from servotwin.analysis.tuning.tune import Tuning
+    from servotwin.commissioning.commission import commission
     from servotwin.control import Controller
     from servotwin.control.cascade import Cascade
     from servotwin.control.linear_law import LinearLaw
@@ -117,6 +119,7 @@ __all__ = [
     "VelocityDrive",
     "Window",
     "certify",
+    "commission",
     "cosimulate",
     "estimate_gap",
     "estimate_jointly",

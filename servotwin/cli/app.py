@@ -104,6 +104,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "simulate": study.simulate,
     "convert": study.convert,
     "identify": study.identify,
+    "commission": study.commission,
     "edge": deployed.edge,
     "limit-cycle": design.limit_cycle,
     "tune": design.tune,

@@ -124,6 +124,89 @@ def identify(
     show(options, json)
 
 
+def commission(
+    logs: Annotated[
+        list[Path], typer.Argument(help="Recordings of one drive: .csv, .txt, .npz, .parquet, .mat, .h5 ...")
+    ],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="The axis file, axis.toml.")] = None,
+    motor: Annotated[str | None, typer.Option(help="Column of the motor's position.")] = None,
+    command: Annotated[str | None, typer.Option(help="Column of the command to the drive.")] = None,
+    reference: Annotated[str | None, typer.Option(help="Column of the position's reference.")] = None,
+    load: Annotated[str | None, typer.Option(help="Column of a second encoder, at the load.")] = None,
+    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
+    motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as rad or mm.")] = None,
+    reference_unit: Annotated[str | None, typer.Option(help="Where it is not that of the position.")] = None,
+    load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it.")] = None,
+    command_unit: Annotated[str | None, typer.Option(help="Where the header does not say it: N, 'N m', A, V.")] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Force (rotary: torque) at the encoder per unit of the command, N or N m.")
+    ] = None,
+    inertia: Annotated[
+        float | None, typer.Option(help="Instead: known mass (rotary: inertia) of all that moves, kg or kg m^2.")
+    ] = None,
+    lead_mm: Annotated[float | None, typer.Option(help="Travel of a linear load per turn of the motor, mm.")] = None,
+    ratio: Annotated[float | None, typer.Option(help="Turns of the motor per turn of a rotary load.")] = None,
+    position_gain: Annotated[
+        float | None, typer.Option(help="Of the controller that ran, 1/s; fitted by default.")
+    ] = None,
+    velocity_gain: Annotated[
+        float | None, typer.Option(help="Command per speed of the position, per m/s or rad/s; fitted by default.")
+    ] = None,
+    integral_time: Annotated[float | None, typer.Option(help="Of the velocity loop, s; fitted by default.")] = None,
+    speed_filter: Annotated[float | None, typer.Option(help="Of the measured speed, s; fitted by default.")] = None,
+    feedback: Annotated[
+        str,
+        typer.Option(help="Encoder of the axis that its position loop reads: motor, or load, which the twin needs."),
+    ] = "motor",
+    applied: Annotated[
+        bool, typer.Option("--applied", help="The command is what the drive gave, also at its limit.")
+    ] = False,
+    crossover: Annotated[
+        float | None,
+        typer.Option(
+            help="Tune the axis's cascade to this crossover of its velocity loop, rad/s; the one that ran by default."
+        ),
+    ] = None,
+    scenario: Annotated[
+        Path | None, typer.Option(help="Scenario with a twin that knows how sure the parameters are, scenario.toml.")
+    ] = None,
+    largest_gap: Annotated[
+        float | None, typer.Option(help="Gap at the load to which it grows in the scenario, mm (rotary: deg).")
+    ] = None,
+    page: Annotated[Path | None, typer.Option(help="Page or picture of the fit: .html, .png or .svg.")] = None,
+    json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
+) -> None:
+    """Identify inertia and friction from logs of command and position in closed loop, and write an axis file."""
+    import math
+
+    from servotwin.cli.commission import CommissionOptions, show
+    from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
+    from servotwin.logs.drive_recordings import DriveColumns, travel_of
+
+    columns = DriveColumns(
+        motor, command, reference, load, time, rate, motor_unit, command_unit, reference_unit, load_unit, scale,
+        travel_of(lead_mm, ratio),
+    )  # fmt: skip
+    unit = 1e-3 if ratio is None else math.pi / 180.0
+    show(
+        CommissionOptions(
+            logs=logs,
+            columns=columns,
+            gains=GivenGains(position_gain, velocity_gain, integral_time, speed_filter),
+            inertia=inertia,
+            feedback=feedback,
+            applied=applied,
+            crossover=crossover,
+            output=output,
+            scenario=scenario,
+            largest_gap=None if largest_gap is None else largest_gap * unit,
+            page=page,
+            as_json=json,
+        )
+    )
+
+
 def bench(context: typer.Context) -> None:
     """Measure speed and accuracy beside other solvers; part of the source checkout: python -m benchmarks."""
     try:

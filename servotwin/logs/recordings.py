@@ -91,10 +91,10 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
     columns = read_columns(path, tuple(chosen.values()))
     arrays = _arrays(path, chosen, columns)
     size = len(arrays["motor"])
-    units = {part: _unit(name) for part, name in chosen.items()}
+    units = {part: named_unit(name) for part, name in chosen.items()}
     motor_unit = wanted.motor_unit or units["motor"] or "motor unit"
     load_unit = wanted.load_unit or units["load"] or "load unit"
-    time = _times(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size)
+    time = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size)
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
     clean = cleaned(time, arrays, turns)
     _check_left(path, clean, size, columns)
@@ -112,7 +112,7 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
 
 def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
     """Columns by their parts, of one length."""
-    arrays = {part: _numbers(path, name, columns) for part, name in chosen.items()}
+    arrays = {part: numbers_of(path, name, columns) for part, name in chosen.items()}
     size = len(arrays["motor"])
     for part, values in arrays.items():
         if len(values) != size:
@@ -155,7 +155,7 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
 
 def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
     """The column of that name, with its unit or without."""
-    fitting = [name for name in names if given in (name, _bare(name))]
+    fitting = [name for name in names if given in (name, bare_name(name))]
     if not fitting:
         hint = did_you_mean(given, names)
         raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
@@ -163,11 +163,11 @@ def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
 
 
 def _guessed(part: str, names: Sequence[str]) -> str | None:
-    bare = {_bare(name).lower().replace(" ", "_"): name for name in reversed(names)}
+    bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
     return next((bare[guess] for guess in _GUESSES[part] if guess in bare), None)
 
 
-def _bare(name: str) -> str:
+def bare_name(name: str) -> str:
     """A column's name without its unit."""
     found = _UNIT.match(name)
     if found:
@@ -176,7 +176,7 @@ def _bare(name: str) -> str:
     return name[: -len(ending) - 1] if ending else name
 
 
-def _unit(name: str) -> str:
+def named_unit(name: str) -> str:
     """The unit that a column's name says; empty where it says none."""
     found = _UNIT.match(name)
     if found:
@@ -191,7 +191,14 @@ def _ending(name: str) -> str:
     return next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
 
 
-def _times(path: Path, time: Array | None, unit: str, rate: float | None, size: int) -> Array:
+def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size: int) -> Array:
+    """Times in s, of a column or by the rate.
+
+    Raises
+    ------
+    InvalidInput
+        An unknown unit, or neither times nor a rate.
+    """
     if time is not None and rate is None:
         if unit and unit.lower() not in _SECONDS:
             raise InvalidInput(f"log {path}: times in {unit!r}: allowed are {', '.join(_SECONDS)}")
@@ -201,7 +208,14 @@ def _times(path: Path, time: Array | None, unit: str, rate: float | None, size: 
     return np.arange(size) / rate
 
 
-def _numbers(path: Path, name: str, columns: LogColumns) -> Array:
+def numbers_of(path: Path, name: str, columns: LogColumns) -> Array:
+    """A column's numbers.
+
+    Raises
+    ------
+    InvalidInput
+        It holds none.
+    """
     values = columns.values[name]
     if getattr(values, "dtype", None) is not None and values.dtype.kind == "M":
         values = values.astype("datetime64[ns]").astype(np.int64) * 1e-9

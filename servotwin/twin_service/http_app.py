@@ -18,11 +18,12 @@ from urllib.parse import parse_qsl
 
 import msgspec
 
-from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal
+from servotwin.messages import Refusal
 from servotwin.messages.codec import ENCODINGS
 from servotwin.twin_service.auth import bearer_token
-from servotwin.twin_service.limits import STATUS, Disconnected, Receive, RequestRejected
+from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.openapi import JSON, MAX_INTEGER, MSGPACK, Operation, openapi_document
 
 log = logging.getLogger(__name__)
 
@@ -30,15 +31,9 @@ Scope = MutableMapping[str, Any]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 _Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
-MSGPACK, JSON, TEXT = "application/msgpack", "application/json", "text/plain"
-HTML, CSV, EVENTS = "text/html; charset=utf-8", "text/csv; charset=utf-8", "text/event-stream"
-_MAX_INTEGER = 2**53
-"""Largest integer in a request: the largest that JSON readers with float64 numbers represent exactly."""
 _SAFE = ("GET", "HEAD")
-_TITLE, _VERSION = "servotwin twin", "1"
-_DESCRIPTION = (
-    """MessagePack in, MessagePack out; errors are JSON: {"code": ..., "detail": ...}. Times in s, angles in rad."""
-)
+_UNBUFFERED = (b"x-accel-buffering", b"no")
+"""Header that keeps a proxy from collecting the parts of a stream."""
 _pack = msgspec.msgpack.Encoder().encode
 
 
@@ -81,10 +76,12 @@ class HttpRequest:
     @property
     def foreign(self) -> bool:
         """True where a browser sends it for a page of another site."""
-        origin, host = self.header(b"origin"), self.header(b"host")
-        if origin is not None:
-            return origin.partition(b"://")[2] != (host or b"")
-        return self.header(b"sec-fetch-site") in (b"cross-site", b"same-site")
+        # A browser says it itself, except on plain HTTP: there is no proxy then that would change the host.
+        site = self.header(b"sec-fetch-site")
+        if site is not None:
+            return site not in (b"same-origin", b"none")
+        origin = self.header(b"origin")
+        return origin is not None and origin.partition(b"://")[2] != self.header(b"host")
 
     @property
     def claim(self) -> str:
@@ -119,8 +116,8 @@ class HttpRequest:
         if text is None and default is not None:
             return default
         digits = text is not None and text.isascii() and text.isdecimal() and len(text) <= 16
-        if text is None or not (digits and int(text) <= _MAX_INTEGER):
-            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"{key}: give a whole number from 0 to {_MAX_INTEGER}")
+        if text is None or not (digits and int(text) <= MAX_INTEGER):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, f"{key}: give a whole number from 0 to {MAX_INTEGER}")
         return int(text)
 
     def seconds(self, key: str, default: float | None = None) -> float:
@@ -180,7 +177,7 @@ class HttpStream:
 
     async def send(self, send: Send) -> None:
         """Send the parts as they come."""
-        headers = [(b"content-type", self._content_type.encode()), (b"cache-control", b"no-store")]
+        headers = [(b"content-type", self._content_type.encode()), (b"cache-control", b"no-store"), _UNBUFFERED]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
         gone = asyncio.create_task(self._until_gone())
         sending = asyncio.create_task(self._send_parts(send))
@@ -214,7 +211,6 @@ def json_response(value: object, status: int = 200, headers: Mapping[str, str] |
 
 AnyResponse = HttpResponse | HttpStream
 Handler = Callable[[HttpRequest], Awaitable[AnyResponse]]
-Operation = dict[str, Any]
 
 
 class HttpRoute(NamedTuple):
@@ -254,7 +250,9 @@ class HttpApp:
         self._metrics, self.lifespan = metrics, lifespan
         declared = list(routes)
         # Encoded once: the routes do not change.
-        document = msgspec.json.encode(_openapi(declared))
+        document = msgspec.json.encode(
+            openapi_document((route.method, route.path, route.operation) for route in declared)
+        )
 
         async def openapi(_request: HttpRequest) -> HttpResponse:
             return HttpResponse(200, document, JSON)
@@ -329,99 +327,3 @@ def _pattern(path: str) -> re.Pattern[str]:
     literals = re.split(r"\{(\w+)\}", path)
     parts = (f"(?P<{part}>[^/]+)" if i % 2 else re.escape(part) for i, part in enumerate(literals))
     return re.compile("".join(parts))
-
-
-# OpenAPI
-
-_NAME = NAME_PATTERN.replace(r"\A", "^").replace(r"\Z", "$")
-_BYTES: Operation = {"type": "string", "format": "binary"}
-INTEGER: Operation = {"type": "integer", "minimum": 0, "maximum": _MAX_INTEGER}
-SECONDS: Operation = {"type": "number", "minimum": 0}
-_CONTENT: dict[str, Operation] = {
-    MSGPACK: _BYTES,
-    JSON: {},
-    **{key: {"type": "string"} for key in (TEXT, HTML, CSV, EVENTS)},
-}
-_ERROR: Operation = {
-    "type": "object",
-    "required": ["code", "detail"],
-    "properties": {
-        "code": {"type": "string", "enum": [refusal.value for refusal in STATUS]},
-        "detail": {"type": "string"},
-    },
-}
-MESSAGE_ERRORS = (400, 401, 403, 404, 409, 413, 422, 429, 503)
-QUERY_ERRORS = (400, 401, 403, 404, 503)
-
-
-def parameter(
-    name: str, schema: Operation, description: str, where: str = "query", required: bool = False
-) -> Operation:
-    """OpenAPI parameter object."""
-    return {
-        "name": name,
-        "in": where,
-        "required": required or where == "path",
-        "schema": schema,
-        "description": description,
-    }
-
-
-SERVO = parameter("servo", {"type": "string", "pattern": _NAME}, "Name of the servo.", "path")
-BOOT = parameter("boot", {"type": "string", "pattern": _NAME}, "Boot of the edge.", "path")
-SEQUENCE = parameter("sequence", INTEGER, "Number of the window within the boot.", "path")
-CLAIM = parameter("servotwin-claim", {"type": "string"}, "Number and run of the sender's claim.", "header")
-ENCODING = parameter(
-    "content-encoding",
-    {"type": "string", "enum": ["identity", "deflate", "zstd"]},
-    "Compression of the body.",
-    "header",
-)
-
-
-def operation(
-    summary: str,
-    responses: Mapping[int, tuple[str, str | None]],
-    parameters: Iterable[Operation] = (),
-    body: str = "",
-    errors: Iterable[int] = (),
-    body_type: str = MSGPACK,
-) -> Operation:
-    """OpenAPI operation object.
-
-    Parameters
-    ----------
-    summary : str
-    responses : mapping of int to (str, str or None)
-        Status to description and content type.
-    parameters : iterable of dict
-        As `parameter` makes them.
-    body : str
-        Description of the request's body; empty: it has none.
-    errors : iterable of int
-        Statuses of error bodies.
-    body_type : str
-        Content type of the request's body.
-    """
-    described: Operation = {}
-    for status, (description, kind) in responses.items():
-        content = {} if kind is None else {"content": {kind: {"schema": _CONTENT[kind]}}}
-        described[str(status)] = {"description": description, **content}
-    for status in errors:
-        described.setdefault(str(status), {"description": "Rejected.", "content": {JSON: {"schema": _ERROR}}})
-    declared: Operation = {"summary": summary, "parameters": list(parameters), "responses": described}
-    if body:
-        schema = {**_BYTES, "maxLength": MAX_BYTES} if body_type == MSGPACK else {}
-        declared["requestBody"] = {"required": True, "description": body, "content": {body_type: {"schema": schema}}}
-    return declared
-
-
-def _openapi(routes: Iterable[HttpRoute]) -> Operation:
-    """OpenAPI 3.1 document of the routes."""
-    paths: Operation = {}
-    for route in routes:
-        name = f"{route.method.lower()} {route.path}"
-        declared = {**route.operation, "operationId": re.sub(r"\W+", "_", name).strip("_")}
-        paths.setdefault(route.path, {})[route.method.lower()] = declared
-    info = {"title": _TITLE, "description": _DESCRIPTION, "version": _VERSION}
-    return {"openapi": "3.1.0", "info": info, "paths": paths}

@@ -12,7 +12,11 @@ from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, encode
 from servotwin.store.records import OutgoingMessage, PutResult
 from servotwin.twin_service.auth import EdgeGate
 from servotwin.twin_service.claims import EdgeClaims
-from servotwin.twin_service.http_app import (
+from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response, msgpack_response
+from servotwin.twin_service.http_server import BodyReader
+from servotwin.twin_service.ingest import Ingest, acknowledgement
+from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.openapi import (
     BOOT,
     CLAIM,
     ENCODING,
@@ -23,17 +27,9 @@ from servotwin.twin_service.http_app import (
     SECONDS,
     SEQUENCE,
     SERVO,
-    HttpRequest,
-    HttpResponse,
-    HttpRoute,
-    json_response,
-    msgpack_response,
     operation,
     parameter,
 )
-from servotwin.twin_service.http_server import BodyReader
-from servotwin.twin_service.ingest import Ingest, acknowledgement
-from servotwin.twin_service.limits import RequestRejected
 
 Read = Callable[[str, int], Awaitable[Sequence[OutgoingMessage]]]
 """(servo, serial) -> messages with higher serials, rising."""

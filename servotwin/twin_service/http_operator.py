@@ -16,7 +16,11 @@ from servotwin.messages import NAME_PATTERN, Refusal
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import Backlog, StoredEvidence, StoredMessage, WindowTrace
 from servotwin.store.store import Store
-from servotwin.twin_service.http_app import (
+from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
+from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
+from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.monitoring import CONTENT_TYPE, Metrics
+from servotwin.twin_service.openapi import (
     BOOT,
     INTEGER,
     JSON,
@@ -26,16 +30,9 @@ from servotwin.twin_service.http_app import (
     SEQUENCE,
     SERVO,
     TEXT,
-    HttpRequest,
-    HttpResponse,
-    HttpRoute,
-    json_response,
     operation,
     parameter,
 )
-from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
-from servotwin.twin_service.limits import RequestRejected
-from servotwin.twin_service.monitoring import CONTENT_TYPE, Metrics
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 

@@ -101,7 +101,9 @@ def test_a_session_ends_with_its_token_and_its_time_and_cannot_be_made_up(tmp_pa
         ({"origin": "http://evil.example"}, 403),
         ({"origin": "null"}, 403),
         ({"sec-fetch-site": "cross-site"}, 403),
+        ({"sec-fetch-site": "same-site", "origin": "http://twin"}, 403),
         ({"origin": "http://twin"}, 204),
+        ({"sec-fetch-site": "same-origin", "origin": "https://outside.example"}, 204),  # behind a proxy
         ({}, 204),
     ],
 )

@@ -1,0 +1,273 @@
+"""`servotwin commission`: an axis file from logs of a drive's command and position."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from servotwin.commissioning.commission import CommissionedAxis, commission
+from servotwin.commissioning.scenario_file import scenario_of
+from servotwin.errors import InvalidInput
+from servotwin.estimation.inverse_dynamics.fit import ParameterFit
+from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
+from servotwin.logs.drive_recordings import DriveColumns
+from servotwin.plant.axis import Axis
+from servotwin.runtime import files
+
+_WORDS = {
+    "inertia": "inertia",
+    "viscous": "viscous friction",
+    "coulomb": "Coulomb friction",
+    "offset": "offset",
+    "viscous_forward": "viscous, forwards",
+    "coulomb_forward": "Coulomb, forwards",
+    "viscous_backward": "viscous, backwards",
+    "coulomb_backward": "Coulomb, backwards",
+}
+
+
+@dataclass(frozen=True)
+class CommissionOptions:
+    """The command's options, in SI."""
+
+    logs: Sequence[Path]
+    columns: DriveColumns
+    gains: GivenGains
+    inertia: float | None = None
+    feedback: str = "motor"
+    applied: bool = False
+    crossover: float | None = None
+    output: Path | None = None
+    scenario: Path | None = None
+    largest_gap: float | None = None
+    page: Path | None = None
+    as_json: bool = False
+
+
+def show(options: CommissionOptions) -> None:
+    """Identify, write the files that are asked for, and print what was found.
+
+    Raises
+    ------
+    InvalidInput
+        As `commission`; a file cannot be written; no controller is known for the axis file.
+    """
+    _check_files(options)
+    console = Console(stderr=options.as_json)
+    with console.status("reading and fitting"):
+        found = commission(
+            options.logs,
+            options.columns,
+            gains=options.gains,
+            inertia=options.inertia,
+            feedback=options.feedback,
+            applied=options.applied,
+            crossover=options.crossover,
+        )
+    texts = _texts(options, found)
+    if options.page is not None:
+        from servotwin.cli.commission_page import write_page
+
+        write_page(options.page, found, headline(found))
+    for path, text in texts.items():
+        with files.atomic_output(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    if options.as_json:
+        print(json.dumps(as_dict(found), indent=2, allow_nan=False))
+        return
+    _print(console, found)
+    for path in (*texts, *((options.page,) if options.page is not None else ())):
+        console.print(f"written: {path}", highlight=False)
+
+
+def _check_files(options: CommissionOptions) -> None:
+    for path in (options.output, options.scenario):
+        if path is not None:
+            files.check_file(path, (".toml",))
+    if options.page is not None:
+        from servotwin.cli.lost_motion_page import check_page
+
+        check_page(options.page)
+    if options.scenario is not None and (options.output is None or options.largest_gap is None):
+        raise InvalidInput("servotwin commission: --scenario needs -o, the axis that it names, and --largest-gap")
+    if options.output is not None and options.scenario is not None and options.output.parent != options.scenario.parent:
+        raise InvalidInput(f"--scenario {options.scenario}: must be in the folder of {options.output}, which it names")
+
+
+def _texts(options: CommissionOptions, found: CommissionedAxis) -> dict[Path, str]:
+    """Texts of the files to be written."""
+    if options.output is None:
+        return {}
+    axis = found.axis
+    if axis is None:
+        raise InvalidInput(
+            f"{found.logs[0].recording.source}: an axis file holds the controller, which a log without a reference "
+            "does not show: give --reference COLUMN, or --position-gain and --velocity-gain"
+        )
+    texts = {options.output: axis_text(found, axis)}
+    if options.scenario is not None and options.largest_gap is not None:
+        texts[options.scenario] = scenario_of(found, options.output, options.largest_gap)
+    return texts
+
+
+def axis_text(found: CommissionedAxis, axis: Axis) -> str:
+    """The axis file, with how sure its numbers are in comments."""
+    fit, unit = found.best, found.logs[0].recording.force_unit
+    known, names = found.uncertainty, ", ".join(Path(log.recording.source).name for log in found.logs)
+    lines = [
+        f"# Identified by servotwin commission from {names}.",
+        *(f"# {line}" for line in _lines(found, fit)),
+        "# For the twin, at the motor (95 %): [twin.uncertainty]",
+        f"#   k_t_percent = {100.0 * known.k_T:.3g}, k_b_percent = {100.0 * known.k_B:.3g},",
+        f"#   friction_n_m = [{known.friction[0]:.4g}, {known.friction[1]:.4g}], "
+        f"input_bias_n_m = [{known.input_bias[0]:.4g}, {known.input_bias[1]:.4g}]",
+    ]
+    if found.force_per_command is None:
+        lines.append(f"# No scale of the command was known: where the keys say N or N m they count {unit}.")
+    return "\n".join(lines) + "\n\n" + axis.dumps()
+
+
+def headline(found: CommissionedAxis) -> str:
+    """The result in one line."""
+    return ", ".join(_lines(found, found.best))
+
+
+def _lines(found: CommissionedAxis, fit: ParameterFit) -> list[str]:
+    units = _units(found)
+    return [f"{_WORDS[name]} {fit[name]:.6g} +- {fit.half_width(name):.2g} {units[name]}" for name in fit.names]
+
+
+def _units(found: CommissionedAxis) -> dict[str, str]:
+    recording = found.logs[0].recording
+    force, position = recording.force_unit, recording.unit
+    if found.force_per_command is not None:
+        inertia, viscous = ("kg m^2", "N m s/rad") if recording.rotary else ("kg", "N s/m")
+    else:
+        inertia, viscous = f"{force} s^2/{position}", f"{force} s/{position}"
+    return {
+        name: inertia if name == "inertia" else viscous if name.startswith("viscous") else force for name in (*_WORDS,)
+    }
+
+
+def _print(console: Console, found: CommissionedAxis) -> None:
+    drive = found.drive
+    for log, band in zip(found.logs, drive.bands, strict=True):
+        recording = log.recording
+        name = recording.source.removeprefix("log ")
+        parts = ", ".join(f"{part} {column}" for part, column in log.columns.items())
+        console.print(
+            f"{name}: {recording.duration:.4g} s at {recording.rate:g} Hz ({parts})", markup=False, highlight=False
+        )
+        for defect, count in log.found.items():
+            console.print(f"  {count} {defect}", style="dim", highlight=False)
+        console.print(
+            f"  the motion's band ends at {band.motion:.3g} Hz; filtered at {band.corner:.3g} Hz, every "
+            f"{band.decimation}. sample",
+            style="dim",
+            highlight=False,
+        )
+    console.print(_table(found), highlight=False)
+    for line in _remarks(found):
+        console.print(line, highlight=False)
+
+
+def _table(found: CommissionedAxis) -> Table:
+    units, drive = _units(found), found.drive
+    table = Table("parameter", "inverse dynamics", "simulated loop", "unit", box=None, pad_edge=False)
+    refined = drive.refinement
+    pairs = [
+        (drive.symmetric, None if refined is None else refined.symmetric),
+        (drive.asymmetric, None if refined is None else refined.asymmetric),
+    ]
+    for first, second in pairs:
+        for name in first.names:
+            if first is drive.asymmetric and name == "inertia":
+                continue
+            shown = "-" if second is None else f"{second[name]:.6g} +- {second.half_width(name):.2g}"
+            table.add_row(_WORDS[name], f"{first[name]:.6g} +- {first.half_width(name):.2g}", shown, units[name])
+    errors = [f"{100.0 * first.relative_error:.2f}" for first, _ in pairs]
+    table.add_row(
+        "left by the model", errors[0], "" if refined is None else f"{100 * refined.symmetric.relative_error:.2f}", "%"
+    )
+    table.add_row("  with a friction for each direction", errors[1],
+                  "" if refined is None else f"{100 * refined.asymmetric.relative_error:.2f}", "%")  # fmt: skip
+    return table
+
+
+def _remarks(found: CommissionedAxis) -> list[str]:
+    drive, recording = found.drive, found.logs[0].recording
+    lines = []
+    if drive.law is not None and math.isfinite(drive.law.left):
+        law = drive.law
+        reset = "" if law.integral_time is None else f", integral time {law.integral_time:.4g} s"
+        lines.append(
+            f"controller: position gain {law.position_gain:.5g} 1/s, velocity gain "
+            f"{law.velocity_gain / (found.force_per_command or 1.0):.5g} {recording.command_unit or 'command'} s/"
+            f"{recording.unit}{reset}, speed filter {1e3 * law.speed_filter:.3g} ms; "
+            f"{100 * law.left:.2g} % of the command is left"
+        )
+    if drive.refinement is not None:
+        simulated = drive.refinement.simulated
+        lines.append(
+            f"simulated loop beside the log: position off by {100 * simulated.position_error:.2g} %, "
+            f"force by {100 * simulated.force_error:.2g} %"
+        )
+    lines += [f"no simulation: {doubt}" for doubt in drive.doubts]
+    if found.force_per_command is None:
+        lines.append(
+            f"no scale of the command is known: parameters are per {recording.force_unit}; give --scale, or "
+            "--inertia of all that moves"
+        )
+    return [*lines, f"next experiment: {drive.advice}"]
+
+
+def as_dict(found: CommissionedAxis) -> dict[str, Any]:
+    """Make the JSON object; null where there is no number."""
+    drive, units = found.drive, _units(found)
+    refined = drive.refinement
+
+    def fit(each: ParameterFit) -> dict[str, Any]:
+        parameters = {
+            name: {
+                "value": each[name],
+                "std": each.std(name),
+                "half_width_95": each.half_width(name),
+                "unit": units[name],
+            }
+            for name in each.names
+        }
+        shared = {"relative_error": each.relative_error, "condition": each.condition}
+        return {"parameters": parameters, **shared}
+
+    return {
+        "logs": [log.recording.source.removeprefix("log ") for log in found.logs],
+        "corner_hz": [band.corner for band in drive.bands],
+        "inverse_dynamics": {"symmetric": fit(drive.symmetric), "asymmetric": fit(drive.asymmetric)},
+        "simulated_loop": None
+        if refined is None
+        else {
+            "symmetric": fit(refined.symmetric),
+            "asymmetric": fit(refined.asymmetric),
+            "position_error": refined.simulated.position_error,
+            "force_error": refined.simulated.force_error,
+            "settled": refined.settled,
+        },
+        "controller": None
+        if drive.law is None
+        else {
+            "position_gain_per_s": drive.law.position_gain,
+            "velocity_gain": drive.law.velocity_gain,
+            "integral_time_s": drive.law.integral_time,
+            "speed_filter_s": drive.law.speed_filter,
+        },
+        "force_per_command": found.force_per_command,
+        "doubts": list(drive.doubts),
+        "next_experiment": str(drive.advice),
+    }

@@ -1,0 +1,171 @@
+"""From recordings of a drive to an axis with its uncertainty: `commission`."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from servotwin.analysis.tuning.cascade import tune_cascade
+from servotwin.errors import InvalidInput
+from servotwin.estimation.inverse_dynamics.closed_loop import rigid_axis
+from servotwin.estimation.inverse_dynamics.fit import ParameterFit
+from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
+from servotwin.estimation.inverse_dynamics.identify import IdentifiedDrive, identify_drive
+from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
+from servotwin.plant.axis import Axis
+from servotwin.plant.sensors import LOAD, MOTOR, Sensors
+from servotwin.redesign.certified.uncertainty import Uncertainty
+
+_WIDEST = 0.99  # relative half-width that an uncertainty may have
+_PHASE_MARGIN = math.radians(60.0)
+_BY_NAME, _FITTED = DriveColumns(), GivenGains()
+
+
+@dataclass(frozen=True, eq=False)
+class CommissionedAxis:
+    """What recordings say of a drive.
+
+    Attributes
+    ----------
+    logs : tuple of DriveLog
+    drive : IdentifiedDrive
+    axis : Axis or None
+        None where no controller is known.
+    uncertainty : Uncertainty
+        Of that axis: 95 % of its parameters, beside the defaults of what the recordings do not show.
+    force_per_command : float or None
+        N (rotary: N m) per unit of the command; None: unknown, inertia and friction are in units of the command.
+    """
+
+    logs: tuple[DriveLog, ...]
+    drive: IdentifiedDrive
+    axis: Axis | None
+    uncertainty: Uncertainty
+    force_per_command: float | None
+
+    @property
+    def best(self) -> ParameterFit:
+        """The refined fit, or the first where there is no refinement."""
+        refined = self.drive.refinement
+        return self.drive.symmetric if refined is None or not refined.settled else refined.symmetric
+
+    @property
+    def asymmetric(self) -> ParameterFit:
+        """The fit with a friction for each direction, of the same kind."""
+        refined = self.drive.refinement
+        return self.drive.asymmetric if refined is None or not refined.settled else refined.asymmetric
+
+
+def commission(
+    logs: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
+    columns: DriveColumns = _BY_NAME,
+    *,
+    gains: GivenGains = _FITTED,
+    inertia: float | None = None,
+    feedback: str = MOTOR,
+    applied: bool = False,
+    crossover: float | None = None,
+) -> CommissionedAxis:
+    """Identify a drive from logs of its command and position in closed loop.
+
+    Parameters
+    ----------
+    logs : path or sequence of paths
+        Of one drive; the first one's reference is simulated.
+    columns : DriveColumns
+        Which columns and units; by default found by their names.
+    gains : GivenGains
+        Of the controller that ran, the velocity gain in units of the command per m/s (rotary: rad/s) of the position;
+        fitted where they are not given.
+    inertia : float, optional
+        kg (rotary: kg m^2) of all that moves, seen from the load: gives the force per command where no scale is known.
+    feedback : {"motor", "load"}
+        Encoder of the axis on which the position is controlled; with "load" it gets an encoder at the load as fine as
+        the motor's, which the twin needs.
+    applied : bool
+        The command of the logs is what the drive gave, also at its limit.
+    crossover : float, optional
+        rad/s, of the velocity loop: the axis gets a cascade that is tuned to it, with a phase margin of 60 degrees.
+        None: the controller that ran.
+
+    Raises
+    ------
+    InvalidInput
+        A log cannot be read, logs are of different kinds, or they do not show the parameters.
+    """
+    paths = [logs] if isinstance(logs, str | os.PathLike) else list(logs)
+    if not paths:
+        raise InvalidInput("commission: give at least one log")
+    if feedback not in (MOTOR, LOAD):
+        raise InvalidInput(f"commission: feedback {feedback!r}: must be {MOTOR!r} or {LOAD!r}")
+    read = tuple(read_drive_log(Path(path), columns) for path in paths)
+    _check_alike(read)
+    read = read if inertia is None else _scaled(read, inertia, gains, applied)
+    first = read[0].recording
+    scale = first.force_per_command
+    if gains.velocity_gain is not None and scale is not None:
+        gains = replace(gains, velocity_gain=gains.velocity_gain * scale)
+    travel = 1.0 if read[0].travel is None else read[0].travel
+    drive = identify_drive([each.recording for each in read], gains, travel, applied)
+    found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
+    axis = None if drive.law is None else rigid_axis(found.best, drive.law, first, travel)
+    if axis is not None and feedback == LOAD:
+        axis = _with_load_encoder(axis, first.load_resolution or first.resolution)
+    if axis is not None and crossover is not None:
+        axis = replace(axis, controller=tune_cascade(axis, crossover, _PHASE_MARGIN).controller)
+    return replace(found, axis=axis, uncertainty=_uncertainty(found, travel))
+
+
+def _check_alike(logs: Sequence[DriveLog]) -> None:
+    first = logs[0].recording
+    for each in (log.recording for log in logs[1:]):
+        if (each.rotary, each.force_unit) != (first.rotary, first.force_unit):
+            raise InvalidInput(
+                f"{each.source}: counts in {each.unit} and {each.force_unit}, {first.source} in {first.unit} and "
+                f"{first.force_unit}: the logs must be of one drive"
+            )
+
+
+def _scaled(logs: Sequence[DriveLog], inertia: float, gains: GivenGains, applied: bool) -> tuple[DriveLog, ...]:
+    """The logs with the force per command that gives the known inertia."""
+    if not (math.isfinite(inertia) and inertia > 0.0):
+        raise InvalidInput(f"commission: --inertia {inertia!r}: must be positive and finite")
+    first = logs[0].recording
+    if first.force_per_command is not None:
+        raise InvalidInput(
+            f"{first.source}: the force per command is known already ({first.force_per_command:g} {first.force_unit}): "
+            "leave out --inertia"
+        )
+    unscaled = identify_drive([replace(log.recording, reference=None) for log in logs], gains, 1.0, applied)
+    scale = inertia / unscaled.symmetric["inertia"]
+    return tuple(
+        replace(log, recording=replace(log.recording, force=log.recording.force * scale, force_per_command=scale))
+        for log in logs
+    )
+
+
+def _with_load_encoder(axis: Axis, resolution: float) -> Axis:
+    law = axis.controller.replace(on=LOAD)  # type: ignore[call-arg]
+    sensors = Sensors(axis.sensors.encoder_resolution, resolution, LOAD)
+    return replace(axis, controller=law, sensors=sensors)
+
+
+def _uncertainty(found: CommissionedAxis, p: float) -> Uncertainty:
+    """95 % of the parameters; friction covers both directions of the motion too."""
+    fit, sides = found.best, found.asymmetric
+    inertia = fit.half_width("inertia") / fit["inertia"]
+    sided = [sides[name] for name in ("viscous_forward", "viscous_backward")]
+    widest = [abs(each - fit["viscous"]) for each in sided]
+    viscous = (fit.half_width("viscous") + max(widest)) / fit["viscous"] if fit["viscous"] > 0.0 else _WIDEST
+    coulomb = max(fit["coulomb"], sides["coulomb_forward"], sides["coulomb_backward"]) - fit["coulomb"]
+    offset, half = -fit["offset"] * p, fit.half_width("offset") * p
+    return Uncertainty(
+        # The inertia of a rigid axis turns with the motor: less inertia is more torque per inertia.
+        k_T=min(inertia, _WIDEST),
+        k_B=min(viscous, _WIDEST),
+        friction=(0.0, (coulomb + fit.half_width("coulomb")) * p),
+        input_bias=(offset - half, offset + half),
+    )

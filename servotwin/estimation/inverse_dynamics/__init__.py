@@ -1,0 +1,1 @@
+"""Parameters of a drive from its command and position: filtered inverse dynamics and least squares."""

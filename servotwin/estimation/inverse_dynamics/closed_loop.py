@@ -1,0 +1,153 @@
+"""Closed-loop simulation of an identified drive beside its log, and the fit to the simulated motion.
+
+The regressors of the first fit are derivatives of a measured position. Here they are those of the simulated motion,
+free of its noise, until the parameters come to rest: direct and inverse dynamic identification (Gautier, Janot and
+Vandanjon, A new closed-loop output error method for parameter identification of robot dynamics, IEEE TCST 2013).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from servotwin.control.cascade import Cascade
+from servotwin.control.linear_law import MOTOR
+from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, low_passed, motion_of
+from servotwin.estimation.inverse_dynamics.fit import SYMMETRIC, ParameterFit, Rows, fit_models, regressors, rows_of
+from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade
+from servotwin.estimation.inverse_dynamics.recording import DriveRecording
+from servotwin.plant.actuator import TorqueDrive
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import LINEAR, ROTARY, Load
+from servotwin.plant.sensors import Sensors
+from servotwin.plant.signals import Array, Samples
+from servotwin.plant.transmission import Transmission
+from servotwin.simulation import simulate
+
+_ROUNDS = 8
+_SETTLED = 1e-3  # relative change of inertia and Coulomb friction, of the force
+_TRACKS = 0.05  # of the position: a simulation that leaves more is not near enough for its motion to be used
+
+
+@dataclass(frozen=True, eq=False)
+class SimulatedLog:
+    """A simulation beside its log.
+
+    Attributes
+    ----------
+    position, force : (n,) array
+        In the recording's units.
+    position_error, force_error : float
+        Norm of the difference over that of the log; forces are compared in the band of the regression.
+    """
+
+    position: Array
+    force: Array
+    position_error: float
+    force_error: float
+
+
+@dataclass(frozen=True, eq=False)
+class Refinement:
+    """Fits to the simulated motion; `settled`: the parameters came to rest."""
+
+    symmetric: ParameterFit
+    asymmetric: ParameterFit
+    simulated: SimulatedLog
+    settled: bool
+
+
+def rigid_axis(fit: ParameterFit, law: FittedCascade, recording: DriveRecording, p: float) -> Axis:
+    """The axis that a fit describes: a torque drive on a rigid transmission, p travel per radian of the motor.
+
+    Raises
+    ------
+    InvalidInput
+        A parameter is out of its range.
+    """
+    controller = Cascade(
+        position_gain=law.position_gain,
+        ratio=p,
+        velocity_gain=law.velocity_gain * p * p,
+        integral_time=law.integral_time,
+        speed_filter=law.speed_filter,
+        on=law.on,
+        voltage_limit=None if recording.limit is None else recording.limit * p,
+        sample_rate=recording.rate,
+    )
+    inertia = fit["inertia"]
+    return Axis(
+        TorqueDrive(inertia * p * p, friction=max(fit["viscous"], 0.0) * p * p, coulomb=max(fit["coulomb"], 0.0) * p),
+        Transmission(p),
+        # Rigid with the motor, whose inertia contains it.
+        Load((inertia,), motion=ROTARY if recording.rotary else LINEAR),
+        controller,
+        Sensors(recording.resolution / p, 0.0 if law.on == MOTOR else recording.load_resolution, law.on),
+    )
+
+
+def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: RegressionBand) -> SimulatedLog:
+    """Run the axis along the recording's reference; `offset` is a force that resists the forward motion."""
+    assert recording.reference is not None
+    start, size = recording.position[0], recording.position.size
+    run = simulate(
+        axis,
+        (size - 1) / recording.rate,
+        reference=Samples(tuple(np.arange(size) / recording.rate), tuple(recording.reference - start)),
+        sample_rate=recording.rate,
+        input_bias=-offset * axis.p,
+    )
+    position, force = run.theta_m * axis.p + start, run.voltage / axis.p
+    both = low_passed(np.column_stack([recording.force, force]), band.corner, recording.rate)
+    return SimulatedLog(
+        position,
+        force,
+        _relative(recording.position - start, position - start),
+        _relative(both[:, 0], both[:, 1]),
+    )
+
+
+def refine(
+    first: ParameterFit, law: FittedCascade, recording: DriveRecording, band: RegressionBand, cycle: float, p: float
+) -> Refinement | None:
+    """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track.
+
+    Raises
+    ------
+    InvalidInput
+        A parameter is out of its range.
+    """
+    fit, found = first, None
+    for _ in range(_ROUNDS):
+        simulated = simulated_log(rigid_axis(fit, law, recording, p), fit["offset"], recording, band)
+        if not simulated.position_error < _TRACKS:
+            return None
+        motion = motion_of(simulated.position, recording.rate, band)
+        symmetric, asymmetric = fit_models(_rows(recording, motion, band, cycle, fit, simulated))
+        change = np.abs(symmetric.values - fit.values)
+        settled = bool(np.all(change < _SETTLED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
+        found, fit = Refinement(symmetric, asymmetric, simulated, settled), symmetric
+        if settled:
+            break
+    return found
+
+
+def _rows(
+    recording: DriveRecording,
+    motion: DriveMotion,
+    band: RegressionBand,
+    cycle: float,
+    fit: ParameterFit,
+    simulated: SimulatedLog,
+) -> Rows:
+    """Rows whose force is that of the model, and by how much the log's differs from the simulated one.
+
+    What derivatives and the hold of a sampled command do to the simulation they do to the log, and cancel.
+    """
+    modelled = regressors(motion)[:, : len(SYMMETRIC)] @ fit.values
+    return rows_of(replace(recording, force=modelled + recording.force - simulated.force), motion, band, cycle)
+
+
+def _relative(measured: Array, simulated: Array) -> float:
+    return float(np.linalg.norm(measured - simulated) / np.linalg.norm(measured))

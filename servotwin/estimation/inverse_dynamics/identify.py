@@ -1,0 +1,106 @@
+"""A drive's parameters from recordings: `identify_drive`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from servotwin.estimation.inverse_dynamics import checks
+from servotwin.estimation.inverse_dynamics.closed_loop import Refinement, refine
+from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
+from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of
+from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade, GivenGains, fitted_cascade
+from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
+from servotwin.estimation.inverse_dynamics.recording import DriveRecording
+
+_FITTED = GivenGains()
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedDrive:
+    """Parameters of a drive.
+
+    Attributes
+    ----------
+    symmetric, asymmetric : ParameterFit
+        By inverse dynamics, of all recordings together.
+    bands : tuple of RegressionBand
+        One for each recording.
+    law : FittedCascade or None
+        Of the first recording; None: no reference, and no gains were given.
+    refinement : Refinement or None
+        By closed-loop simulation of the first recording; None where it is not possible.
+    doubts : tuple of str
+        Why there is no refinement.
+    advice : NextExperiment
+    """
+
+    symmetric: ParameterFit
+    asymmetric: ParameterFit
+    bands: tuple[RegressionBand, ...]
+    law: FittedCascade | None
+    refinement: Refinement | None
+    doubts: tuple[str, ...]
+    advice: NextExperiment
+
+
+def identify_drive(
+    recordings: Sequence[DriveRecording], gains: GivenGains = _FITTED, p: float = 1.0, applied: bool = False
+) -> IdentifiedDrive:
+    """Fit inertia, friction and offset, then refine them by simulating the loop.
+
+    Parameters
+    ----------
+    recordings : sequence of DriveRecording
+        Of one drive.
+    gains : GivenGains
+        Of the controller that ran.
+    p : float
+        Travel per radian of the motor.
+    applied : bool
+        The recorded command is what the drive gave, also at its limit.
+
+    Raises
+    ------
+    InvalidInput
+        A recording does not show the parameters: no motion, one direction or one speed only, a command at its limit, of
+        the wrong sign or of something else.
+    """
+    used, rows, motions, bands = [], [], [], []
+    for each in recordings:
+        checks.check_motion(each)
+        band = band_of(each)
+        motion = motion_of(each.position, each.rate, band)
+        if not applied:
+            checks.check_limit(each, motion)
+            each = checks.without_limit(each)
+        checks.check_directions(each, motion)
+        used.append(each)
+        motions.append(motion)
+        bands.append(band)
+        rows.append(rows_of(each, motion, band, cycle_time(motion)))
+    every = joined(rows)
+    checks.check_separable(used[0], every)
+    symmetric, asymmetric = fit_models(every)
+    checks.check_sense(used[0], symmetric)
+    law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
+    advice = next_experiment(symmetric, every, motions[0], used[0].unit)
+    return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice)
+
+
+def _refined(
+    recording: DriveRecording, fit: ParameterFit, gains: GivenGains, filtering: tuple[RegressionBand, float], p: float
+) -> tuple[FittedCascade | None, Refinement | None, tuple[str, ...]]:
+    """The law that ran, the refinement, and why there is none."""
+    if recording.reference is None:
+        law = fitted_cascade(recording, gains) if gains.complete else None
+        return law, None, ("without a reference the loop cannot be simulated beside the log",)
+    law = fitted_cascade(recording, gains)
+    if not law.explains:
+        checks.check_reference(recording, gains)
+        left = f"{100.0 * law.left:.0f} %"
+        return law, None, (f"no position controller with velocity loop explains the command ({left} are left)",)
+    found = refine(fit, law, recording, *filtering, p)
+    if found is None:
+        return law, None, ("the simulated loop does not follow the log",)
+    return law, found, () if found.settled else ("the fit to the simulated motion did not come to rest",)
