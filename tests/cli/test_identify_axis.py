@@ -33,6 +33,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "servo"), [("own", None), ("foreign", "two-mass-drive")])
 def test_a_log_of_a_rotary_axis_shows_its_gap(logs: Path, name: str, servo: str | None) -> None:
     found = identify(IdentifyOptions(logs / f"{name}.npz", servo, start=0.0, duration=3.9))

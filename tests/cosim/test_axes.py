@@ -31,6 +31,7 @@ def true_gaps(loop: st.Loop) -> np.ndarray:
     return np.interp([estimate.time for estimate in loop.estimates], loop.run.time, loop.run.gap)
 
 
+@pytest.mark.slow
 def test_the_paper_s_twin_runs_on_a_torque_drive() -> None:
     """Its estimates are those on the servo, whose machine is the same but for the winding's back EMF."""
     scenario = st.Scenario.preset("fig15")

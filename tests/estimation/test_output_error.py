@@ -96,6 +96,7 @@ def test_a_stiffness_and_an_inertia_that_are_off_stay_inside_the_interval() -> N
     assert estimate.interval[0] < 0.03 < estimate.interval[1]
 
 
+@pytest.mark.slow
 def test_the_same_machine_in_other_units_has_the_same_estimate() -> None:
     """Ten times as slow, a hundred times as heavy, geared a hundred to one: gap and spread scale with the ratio."""
     slow, mass, ratio = 10.0, 100.0, 0.01
@@ -158,6 +159,7 @@ def test_one_flank_gives_a_lower_bound() -> None:
     assert math.isinf(estimate.interval[1])
 
 
+@pytest.mark.slow
 def test_a_load_that_does_not_follow_the_model_is_refused() -> None:
     window = recorded(TWO_MASS, 0.03)
     slack = window.position + 0.02 * np.sin(7.0 * window.time)
@@ -198,6 +200,7 @@ def test_windows_and_settings_that_do_not_fit_are_refused() -> None:
     assert "position is constant" in still.reasons[0]
 
 
+@pytest.mark.slow
 def test_a_gap_that_may_grow_within_the_window_widens_the_interval_only() -> None:
     """By the standard deviation of a place anywhere in the window, 1/sqrt(12) of its growth."""
     window = recorded(TWO_MASS, 0.03, 1e-4)
