@@ -6,7 +6,17 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from benchmarks import accuracy, certificates, compensation, endurance, friction_feedforward, glances, overload, tick
+from benchmarks import (
+    accuracy,
+    certificates,
+    compensation,
+    endurance,
+    faults,
+    friction_feedforward,
+    glances,
+    overload,
+    tick,
+)
 from benchmarks import windows as from_windows
 from benchmarks.fleet import command as whole
 from benchmarks.fleet.setting import QUICK, FleetScale
@@ -39,6 +49,7 @@ ALONE: Mapping[str, QualityBenchmark] = {
     endurance.NAME: QualityBenchmark(endurance.endurance, endurance.QUICK, endurance.MACHINES),
     whole.NAME: QualityBenchmark(whole.fleet, QUICK, FleetScale()),
     overload.NAME: QualityBenchmark(overload.overload, overload.QUICK, overload.SMALL),
+    faults.NAME: QualityBenchmark(faults.endure, faults.QUICK, faults.MINUTES),
     glances.NAME: QualityBenchmark(glances.triage, glances.QUICK, glances.GAPS),
     side_by_side.NAME: QualityBenchmark(side_by_side.policies, side_by_side.QUICK, side_by_side.MACHINES),
     in_the_loop.NAME: QualityBenchmark(in_the_loop.loops, in_the_loop.QUICK, in_the_loop.MACHINES),
@@ -54,7 +65,7 @@ ALONE: Mapping[str, QualityBenchmark] = {
 
 FULL: Mapping[str, Any] = {whole.NAME: FleetScale().full(), overload.NAME: overload.OverloadScale()}
 """Scale of the full length, for benchmarks that have one."""
-SEEDED = (from_windows.NAME, in_the_loop.NAME, certificates.NAME)
+SEEDED = (from_windows.NAME, in_the_loop.NAME, certificates.NAME, faults.NAME)
 """Benchmarks whose machines follow a seed that can be chosen."""
 
 
@@ -66,10 +77,12 @@ def run_alone(
     others: bool,
     full: bool = False,
     seed: int | None = None,
+    minutes: float | None = None,
 ) -> bool:
     """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
-    `full` applies to those of `FULL`: the full length of the documented figures. `seed` applies to those of `SEEDED`.
+    `full` applies to those of `FULL`: the full length of the documented figures. `seed` applies to those of `SEEDED`,
+    `minutes` to the endurance.
 
     Raises
     ------
@@ -81,12 +94,15 @@ def run_alone(
         raise InvalidInput(f"--full: only bench {' or '.join(FULL)} takes it, and not with --quick")
     if seed is not None and not (len(names) == 1 and names[0] in SEEDED):
         raise InvalidInput(f"--seed: only bench {', '.join(SEEDED[:-1])} or {SEEDED[-1]} takes it")
+    if minutes is not None and list(names) != [faults.NAME]:
+        raise InvalidInput(f"--minutes: only bench {faults.NAME} takes it")
     if name is None:
         return False
     if len(names) > 1 or others:
         raise InvalidInput(f"bench {name} stands alone: of the options it takes --json and --quick only")
     chosen = ALONE[name]
     scale = FULL[name] if full else chosen.quick if quick else chosen.whole
+    scale = scale if minutes is None else minutes
     if seed is None:
         chosen.run(date, output, scale)
     else:

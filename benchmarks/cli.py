@@ -15,8 +15,9 @@ def bench(
     workloads: Annotated[
         list[str] | None,
         typer.Argument(
-            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, hostile, "
-            "policies, loops, certificates, compensation, friction, tick, novelty, triage, fleet, overload."
+            help="W1, two-mass, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, "
+            "hostile, policies, loops, certificates, compensation, friction, tick, novelty, triage, fleet, overload, "
+            "endurance."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,
@@ -25,7 +26,11 @@ def bench(
     full: Annotated[
         bool, typer.Option("--full", help="fleet: five minutes, and an outage of ten; overload: ten minutes.")
     ] = False,
-    seed: Annotated[int | None, typer.Option(min=0, help="windows, loops, certificates: seed of the machines.")] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="Seed of the machines (windows, loops, certificates) or faults (endurance)."),
+    ] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="endurance: length; 10 by default.")] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Add jobs of many seconds: scipy, compilation.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
 ) -> None:
@@ -36,7 +41,7 @@ def bench(
 
     date = datetime.now(UTC).isoformat(timespec="seconds")
     others = slow or runs is not None or reference is not None
-    if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed):
+    if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed, minutes):
         return
     from benchmarks.catalogue import Options
     from benchmarks.command import bench as run

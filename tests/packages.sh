@@ -1,5 +1,6 @@
 #!/bin/sh
-# Debian's mosquitto, PostgreSQL and Chromium, which some tests start for themselves; without root or apt-get those tests are skipped.
+# Debian's mosquitto, PostgreSQL, Chromium, Prometheus (for promtool) and docker-compose, which some tests start for
+# themselves; without root or apt-get those tests are skipped.
 set -eu
 
 POLICY=/usr/sbin/policy-rc.d
@@ -13,6 +14,8 @@ missing=""
 have_mosquitto || missing="$missing mosquitto"
 have_postgresql || missing="$missing postgresql"
 have_chromium || missing="$missing chromium"
+command -v promtool >/dev/null || missing="$missing prometheus"
+command -v docker-compose >/dev/null || missing="$missing docker-compose"
 [ -n "$missing" ] || exit 0
 
 go_on() {

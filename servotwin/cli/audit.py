@@ -16,8 +16,11 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Requ
 import msgspec
 
 from servotwin.cli.audit_report import SERVOS, JsonObject, lines_of, servo_line
+from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear, is_encrypted
+from servotwin.store.records import ServoSummary
+from servotwin.store.store import Store
 from servotwin.twin_service.auth import read_secret
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.http_operator import MAX_ROWS, evidence_as_json, trace_as_json
@@ -73,14 +76,14 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
     Raises
     ------
     InvalidInput
-        No window of the servo is stored, or the source cannot be read.
+        The servo is unknown or has sent no window, or the source cannot be read.
     """
     if source.url is None:
         evidence = _read_store(servo, source.config, limit)
     else:
         evidence = _read_service(servo, source, limit)
     if not evidence.traces:
-        raise InvalidInput(f"servo {servo!r}: the store has no window of it")
+        raise InvalidInput(f"servo {servo!r}: has sent messages, but no window yet")
     if json:
         print(msgspec.json.format(msgspec.json.encode(evidence.traces)).decode())
         return
@@ -121,11 +124,20 @@ def _all_pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:
     return rows
 
 
+def known_servo(store: Store, servo: str) -> ServoSummary:
+    """Return a servo's summary; raises InvalidInput where it has never sent a message."""
+    summary = store.servo(servo)
+    if summary is None:
+        names = [row["servo"] for row in _all_pages(lambda after: [each._asdict() for each in store.servos(after)])]
+        raise InvalidInput(f"servo {servo!r}: has never sent a message to this twin{did_you_mean(servo, names)}")
+    return summary
+
+
 def _read_store(servo: str, config: Path, limit: int) -> _ServoEvidence:
     store = open_existing_store(service_of(config))
     try:
-        traces, summary = store.audit(servo, limit=limit), store.servo(servo)
-        if summary is None or not traces:
+        summary, traces = known_servo(store, servo), store.audit(servo, limit=limit)
+        if not traces:
             return _ServoEvidence({}, [], [])
         events = store.events(servo, _since(traces[-1].window.received), MAX_ROWS)
         return _ServoEvidence(
@@ -138,12 +150,11 @@ def _read_store(servo: str, config: Path, limit: int) -> _ServoEvidence:
 def _read_service(servo: str, source: Source, limit: int) -> _ServoEvidence:
     get_json, name = _json_client(source), quote(servo, safe="")
     traces = get_json(f"/v1/servos/{name}/audit?limit={limit}")
+    summary = get_json(f"/v1/servos/{name}")
     if not traces:
         return _ServoEvidence({}, [], [])
     since = _since(traces[-1]["window"]["received"])
-    return _ServoEvidence(
-        get_json(f"/v1/servos/{name}"), traces, get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
-    )
+    return _ServoEvidence(summary, traces, get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}"))
 
 
 def _since(oldest: float) -> float:

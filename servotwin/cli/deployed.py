@@ -63,8 +63,15 @@ def twin(
 
 
 def enroll(
-    name: Annotated[str, typer.Argument(help="The servo's name, or the operator's.")],
+    name: Annotated[str | None, typer.Argument(help="The servo's name, or the operator's; not with --csv.")] = None,
     twin: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+    csv: Annotated[
+        Path | None,
+        typer.Option(
+            help="Enroll a servo for each row, all or none. Columns: name, and edge, role, sample_rate_hz, drive, url, "
+            "noise_um, ca; where one is absent, the option of that name holds."
+        ),
+    ] = None,
     edge: Annotated[Path | None, typer.Option(help="Folder of the edge; the servo's name by default.")] = None,
     role: Annotated[
         str, typer.Option(help="control: the edge runs the controller; supervise: the drive does.")
@@ -84,14 +91,18 @@ def enroll(
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the edge checks the twin's.")] = None,
 ) -> None:
     """Enroll a servo: write its token and a folder with everything that its edge needs."""
+    from servotwin.errors import InvalidInput
     from servotwin.up import enrolment
+    from servotwin.up.bulk_enrolment import enroll_all, read_enrolments
 
+    if (name is None) == (csv is None) or (csv is not None and (edge or operator)):
+        raise InvalidInput("give a name, or --csv with a file; --edge and --operator are for one name")
     if operator is not None:
-        written = enrolment.enroll_operator(twin, name, operator, replace_token=again)
+        written = enrolment.enroll_operator(twin, name or "", operator, replace_token=again)
     else:
         request = enrolment.Enrolment(
-            servo=name,
-            folder=edge or Path(name),
+            servo=name or "",
+            folder=edge or Path(name or ""),
             role=role,
             sample_rate=sample_rate_hz,
             drive=enrolment.drive_of(drive),
@@ -100,7 +111,10 @@ def enroll(
             noise=noise_um * 1e-6,
             ca=ca,
         )
-        written = enrolment.enroll(twin, request)
+        if csv is not None:
+            written = enroll_all(twin, csv, read_enrolments(csv, request))
+        else:
+            written = enrolment.enroll(twin, request)
     for path in written:
         print(f"written: {path}")
 

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from servotwin.cli.audit import known_servo
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, InvalidMessage
 from servotwin.messages.codec import decompress
@@ -78,6 +79,8 @@ def print_replay(servo: str, config: Path, window: str | None, present: bool) ->
             differing.update(replayed.differs)
             if replayed.detail:
                 print(f"window {replayed.window}: {replayed.detail}")
+        if not counts:
+            known_servo(store, servo)
     finally:
         store.close()
     if not counts:

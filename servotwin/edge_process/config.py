@@ -82,6 +82,14 @@ class StoredFiles:
     parameters: Annotated[str, key(help="Last parameters under which the loop kept its band.")] = "parameters.json"
     status: Annotated[str, key(help="Status that `servotwin edge` shows.")] = "status.json"
     boots: Annotated[str, key(help="Number of starts of this edge.")] = "boots"
+    metrics: Annotated[
+        str | None,
+        key(
+            help="Metrics in Prometheus' text format, for node_exporter's textfile collector: a name that ends with "
+            ".prom, in the collector's folder; none where absent.",
+            later=True,
+        ),
+    ] = None
     windows: Annotated[int, key(minimum=1, help="Largest number of windows in the outbox.")] = 5000
     bytes: Annotated[int, key("megabytes", minimum=MB, help="Largest size of the outbox.")] = 256 * MB
     acknowledged_bytes: Annotated[
@@ -101,6 +109,8 @@ class StoredFiles:
 
     def __post_init__(self) -> None:
         check(self)
+        if self.metrics is not None and not self.metrics.endswith(".prom"):
+            raise InvalidInput(f"metrics = {self.metrics!r}: the name must end with .prom; others are not collected")
 
 
 @settings("sensor")

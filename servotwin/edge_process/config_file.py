@@ -23,8 +23,12 @@ from servotwin.edge.settings_file import (
     supervision_values,
 )
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltySettings
+
+_BEGIN, _END = "# complete with the line: # end", "# end"
+"""First and last line of a written file: half of one could be read, and would leave out what protects the machine."""
 
 
 def load(path: str | os.PathLike[str]) -> EdgeConfig:
@@ -36,7 +40,15 @@ def load(path: str | os.PathLike[str]) -> EdgeConfig:
         The file is missing or not TOML, a key is unknown or missing, or its value is not allowed.
     """
     config = read_config(read_toml(path))
+    _check_complete(Path(path))
     return replace(config, folder=Path(path).resolve().parent)
+
+
+def _check_complete(path: Path) -> None:
+    """Refuse a written file that was cut short: its last tables would have their defaults; raises InvalidInput."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    if _BEGIN in lines and _END not in lines:
+        raise InvalidInput(f"{path}: is cut short: its line {_END!r} is missing; copy the edge's folder again")
 
 
 def read_config(table: Table) -> EdgeConfig:
@@ -127,4 +139,4 @@ def edge_toml(config: EdgeConfig) -> str:
         values["own"] = written_gains(agent.own, agent.controller)
     if isinstance(agent.window_filter, NoveltySettings):
         values["novelty"] = values_of(agent.window_filter)
-    return dumps(values)
+    return f"{_BEGIN}\n{dumps(values)}{_END}\n"

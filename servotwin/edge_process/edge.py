@@ -21,6 +21,7 @@ from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.frames import StatusFrame, Value
 from servotwin.edge_process.monitoring import TickHistogram, log
 from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.runtime.service_manager import ServiceManager
 
 Clock = Callable[[], float]
 CHECK_PERIOD_S, STATUS_PERIOD_S, PAUSE_S = 0.1, 1.0, 0.005
@@ -65,6 +66,8 @@ class EdgeRuntime:
         Parameters stored by an earlier start.
     clock, pause : callable
         Returns monotonic seconds; waits for a number of seconds.
+    manager : ServiceManager, optional
+        Gets a sign of life while samples, or tries to reach the drive, follow each other.
 
     Attributes
     ----------
@@ -81,6 +84,7 @@ class EdgeRuntime:
         first: Parameters | None,
         clock: Clock,
         pause: Callable[[float], None],
+        manager: ServiceManager | None = None,
     ) -> None:
         self.config, self.clock, self.pause = config, clock, pause
         self.counts: Counter[str] = Counter()
@@ -88,6 +92,7 @@ class EdgeRuntime:
         self.ticks = TickHistogram()
         self._boot, self._boots = boot, 0
         self._outlet, self._child = outlet, child
+        self._manager = manager or ServiceManager({})
         self._check_due = self._status_due = clock()
         self.agent = self._new_agent(first)
 
@@ -143,6 +148,7 @@ class EdgeRuntime:
         if now < self._check_due:
             return
         self._check_due = now + CHECK_PERIOD_S
+        self._manager.alive(now)
         self._child.check(now)
         if now >= self._status_due:
             self._status_due = now + STATUS_PERIOD_S

@@ -25,6 +25,7 @@ from servotwin.edge_process import frames
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
+from servotwin.edge_process.metrics import write_metrics
 from servotwin.edge_process.monitoring import TroubleLog, log, overwrite_status, read_status, summarise, write_status
 from servotwin.edge_process.transports import exclusive_transport, link_token
 from servotwin.errors import InvalidInput
@@ -140,7 +141,7 @@ class LinkProcess:
 
     def _write_status(self) -> None:
         """Write the status; on a full disk into the old file's place, so that it does not go on saying "safe"."""
-        path = self._config.path(self._config.files.status)
+        path, metrics = self._config.path(self._config.files.status), self._config.files.metrics
         try:
             write_status(path, self._status())
             self._status_trouble = ""
@@ -149,6 +150,15 @@ class LinkProcess:
             self._status_trouble = str(error)
             with suppress(OSError):
                 overwrite_status(path, self._status())
+        if metrics is None:
+            return
+        trouble = ""
+        try:
+            write_metrics(self._config.path(metrics), self._status())
+        except OSError as error:
+            self._faults["metrics not written"] += 1
+            trouble = str(error)
+        self._troubles.update("metrics", trouble)
 
     def _check_token(self) -> None:
         """End where the token was replaced: the next link process reads the new one."""

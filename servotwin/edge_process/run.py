@@ -23,6 +23,7 @@ from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.startup import check, exclusive, next_boot, permitted, stored_parameters
 from servotwin.edge_process.supervise import SupervisingRole
 from servotwin.errors import InvalidInput
+from servotwin.runtime.service_manager import ServiceManager
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _RECONNECT_S, _PAUSE_S, _FINISH_S = 1.0, 0.02, 3.0
@@ -76,11 +77,13 @@ def _run(config: EdgeConfig, path: Path) -> None:
     boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
     child = LinkChild(link_command(path, boot), outlet)
-    stop = StopSignal()
+    stop, manager = StopSignal(), ServiceManager()
     before = {each: signal.signal(each, stop) for each in SIGNALS if not _is_ignored(each)}
     try:
-        edge = EdgeRuntime(config, boot, outlet, child, first, time.monotonic, time.sleep)
+        edge = EdgeRuntime(config, boot, outlet, child, first, time.monotonic, time.sleep, manager)
+        manager.ready()
         until(stop, edge, drive, lambda: _role(edge, drive))
+        manager.stopping()
         edge.finish(_FINISH_S)
     finally:
         child.close()

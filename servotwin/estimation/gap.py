@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation import output_error, paper, whitened
+from servotwin.estimation import motor_side, output_error, paper, whitened
 from servotwin.estimation.axis_model import has_servo, servo_of
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.window import Window
@@ -50,7 +50,13 @@ _SAME = 1e-9  # of the motion: rounding
 _ALLOWED, _ROUNDED = 0.6, 0.5  # of a count
 _ALL = {
     **METHODS,
-    output_error.METHOD: Method(output_error.estimate, output_error.OutputErrorSettings, output_error.shortest_window),
+    **{
+        module.METHOD: Method(module.estimate, settings, module.shortest_window)
+        for module, settings in (
+            (output_error, output_error.OutputErrorSettings),
+            (motor_side, motor_side.MotorSideSettings),
+        )
+    },
 }
 
 
@@ -71,7 +77,8 @@ def estimate_gap(
     method : str, optional
         "whitened" (`servotwin.estimation.whitened`), the default where the driven end is held in the gap;
         "output_error" (`servotwin.estimation.output_error`), the default for a shaft that is free in the gap and for
-        one mass behind a rigid transmission; or "paper", the published one (`servotwin.estimation.paper`).
+        one mass behind a rigid transmission; "motor_side" (`servotwin.estimation.motor_side`), the default where the
+        window does not have the load's position; or "paper", the published one (`servotwin.estimation.paper`).
     prior : float or GapEstimate, optional
         Total gap known before, rad; an estimate that is not OK is ignored. The search starts there, among other
         places; "whitened" also returns it where the window does not show the gap.
@@ -85,11 +92,11 @@ def estimate_gap(
         An unknown method, a prior that is not a gap, settings of another method, a window that lacks a channel or
         is too short, a method that is not for this axis.
     """
-    method = default_method(servo) if method is None else method
+    method = _method_for(window, servo) if method is None else method
     chosen, known = settings_of(method, settings), _usable_prior(prior)
-    if isinstance(servo, Axis):
+    if isinstance(servo, Axis) and method != motor_side.METHOD:
         _check_position(window, servo)
-    if isinstance(servo, Servo) or method == output_error.METHOD:
+    if isinstance(servo, Servo) or method in (output_error.METHOD, motor_side.METHOD):
         return _ALL[method].estimate(window, servo, known, chosen)
     chosen = options_for(servo, method, settings)
     estimate: GapEstimate = _ALL[method].estimate(window, servo_of(servo), known, chosen)
@@ -107,6 +114,13 @@ def options_for(servo: Plant, method: str, settings: Any = None) -> Any:
 def default_method(servo: Plant) -> str:
     """The method that estimates a servo's or an axis's gap where none is named."""
     return whitened.METHOD if isinstance(servo, Servo) or has_servo(servo) else output_error.METHOD
+
+
+def _method_for(window: Window, servo: Plant) -> str:
+    """The default method for a window: without the load's position the one that reads the motor."""
+    if window.has_position and not (isinstance(servo, Axis) and _at_motor(window, servo)):
+        return default_method(servo)
+    return motor_side.METHOD
 
 
 def settings_of(method: str, settings: Any = None) -> Any:
@@ -141,15 +155,20 @@ def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.Wh
     )
 
 
+def _at_motor(window: Window, axis: Axis) -> bool:
+    """True where a window's position is the motor's own."""
+    if not window.has_position or window.theta_m is None or not axis.at_motor:
+        return False
+    lead = window.position - axis.p * window.theta_m
+    return bool(np.ptp(lead) <= axis.p * axis.encoder_resolution + _SAME * np.ptp(window.position))
+
+
 def _check_position(window: Window, axis: Axis) -> None:
     """Refuse a window whose position is the motor's own."""
-    if window.theta_m is None or not axis.at_motor:
-        return
-    lead = window.position - axis.p * window.theta_m
-    if np.ptp(lead) <= axis.p * axis.encoder_resolution + _SAME * np.ptp(window.position):
+    if _at_motor(window, axis):
         raise InvalidInput(
             f'{window.where}axis sensors feedback = "motor": position is the motor\'s angle times the ratio, and '
-            "the gap lies behind the motor; give the load's own position"
+            'the gap lies behind the motor; give the load\'s own position, or method = "motor_side"'
         )
 
 

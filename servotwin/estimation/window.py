@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 MINIMUM_SAMPLES = 16
 CHANNELS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
+_OTHERS = tuple(name for name in CHANNELS if name != "position")
 _JITTER = 0.05  # of a sample interval: largest deviation of (rounded) time stamps from a uniform grid
 
 
@@ -38,10 +39,10 @@ class Window:
 
     Parameters
     ----------
-    position : (n,) array_like
-        Measured position of the last mass, m; at least 16 samples.
+    position : (n,) array_like, optional
+        Measured position of the last mass, m; at least 16 samples. Without it only the method "motor_side" estimates.
     theta_m : (n,) array_like, optional
-        Motor angle, rad.
+        Motor angle, rad; needed without a position.
     voltage : (n,) array_like, optional
         Motor voltage, V.
     reference : (n,) array_like, optional
@@ -58,11 +59,11 @@ class Window:
     Raises
     ------
     InvalidInput
-        A channel is not one-dimensional, has another length than `position`, is too short or holds a value that is not
+        A channel is not one-dimensional, has another length than the first, is too short or holds a value that is not
         finite; the rate is missing, doubled or not positive; the times are not uniform.
     """
 
-    position: Array
+    measured_position: Array | None
     theta_m: Array | None
     voltage: Array | None
     reference: Array | None
@@ -72,7 +73,7 @@ class Window:
 
     def __init__(
         self,
-        position: ArrayLike,
+        position: ArrayLike | None = None,
         theta_m: ArrayLike | None = None,
         voltage: ArrayLike | None = None,
         reference: ArrayLike | None = None,
@@ -86,6 +87,7 @@ class Window:
         channels = {name: None if v is None else _channel(where, name, v) for name, v in given.items()}
         size = _common_size(where, channels)
         rate, start = _timing(where, size, sample_rate, time, start)
+        channels["measured_position"] = channels.pop("position")
         for name, value in {**channels, "sample_rate": rate, "start": start, "source": source}.items():
             object.__setattr__(self, name, value)
 
@@ -133,13 +135,14 @@ class Window:
     def slice(self, start: float, duration: float) -> Window:
         """Cut the part of `duration` (s) from the sample nearest to `start` (s, on the window's own clock)."""
         rate = self.sample_rate
-        part = _samples(self.where, self.start, rate, self.position.size, start, duration)
+        part = _samples(self.where, self.start, rate, self.samples, start, duration)
         channels: dict[str, Any] = {name: value[part] for name, value in self.channels.items()}
         return Window(**channels, sample_rate=rate, start=self.start + part.start / rate, source=self.source)
 
     def replace(self, **channels: ArrayLike) -> Window:
         """Copy the window with other samples in some channels; they are validated again."""
-        return replace(self, **channels)  # type: ignore[arg-type]
+        kept: dict[str, Any] = {**self.channels, **channels}
+        return Window(**kept, sample_rate=self.sample_rate, start=self.start, source=self.source)
 
     def driven(self, limit: float | None) -> Window:
         """The window with the voltage that a drive gives that follows commands up to `limit` (V); None: any command."""
@@ -148,25 +151,50 @@ class Window:
         return self.replace(voltage=np.clip(self.voltage, -limit, limit))
 
     @property
+    def has_position(self) -> bool:
+        """True where the load's position was measured."""
+        return self.measured_position is not None
+
+    @property
+    def position(self) -> Array:
+        """(n,) measured position of the last mass, m.
+
+        Raises
+        ------
+        InvalidInput
+            The window has none.
+        """
+        if self.measured_position is None:
+            raise InvalidInput(
+                f"{self.where}the window has no position of the load: only method 'motor_side' does without it"
+            )
+        return self.measured_position
+
+    @property
+    def samples(self) -> int:
+        """Number of samples, n."""
+        return next(iter(self.channels.values())).size
+
+    @property
     def channels(self) -> Mapping[str, Array]:
         """The channels that were measured, by name."""
-        values = {name: getattr(self, name) for name in CHANNELS}
+        values = {"position": self.measured_position} | {name: getattr(self, name) for name in _OTHERS}
         return {name: value for name, value in values.items() if value is not None}
 
     @property
     def time(self) -> Array:
         """(n,) sample times, s."""
-        return self.start + np.arange(self.position.size) / self.sample_rate
+        return self.start + np.arange(self.samples) / self.sample_rate
 
     @property
     def duration(self) -> float:
         """Number of samples over sample rate, s."""
-        return self.position.size / self.sample_rate
+        return self.samples / self.sample_rate
 
     @property
     def mid_time(self) -> float:
         """Time half-way between the first and the last sample, s."""
-        return self.start + 0.5 * (self.position.size - 1) / self.sample_rate
+        return self.start + 0.5 * (self.samples - 1) / self.sample_rate
 
     @property
     def where(self) -> str:
@@ -204,12 +232,14 @@ def _channel(where: str, name: str, values: ArrayLike) -> Array:
 
 
 def _common_size(where: str, channels: Mapping[str, Array | None]) -> int:
-    """Check that all measured channels have as many samples as the position; return that number."""
+    """Check that all measured channels have as many samples as the first; return that number."""
     sizes = {name: samples.size for name, samples in channels.items() if samples is not None}
-    size = sizes["position"]
+    if not {"position", "theta_m"} & sizes.keys():
+        raise InvalidInput(f"{where}the window has neither position nor theta_m: must have one of them")
+    first, size = next(iter(sizes.items()))
     for name, other in sizes.items():
         if other != size:
-            raise InvalidInput(f"{where}{name} has {other} samples and position {size}: must be equally many")
+            raise InvalidInput(f"{where}{name} has {other} samples and {first} {size}: must be equally many")
     return size
 
 

@@ -21,6 +21,7 @@ from servotwin.store.engine import (
     public_address,
     transaction,
 )
+from servotwin.store.incoming import insert_once
 from servotwin.store.migrate import migrate
 from servotwin.store.records import (
     Backlog,
@@ -36,8 +37,11 @@ from servotwin.store.records import (
     WindowTrace,
     WorkResult,
 )
+from servotwin.store.schema import contexts
 
 WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER)
+_FLEET = "fleet"
+"""Key of the fleet's name among the contexts, whose other keys are digests."""
 _RACES = 8
 _MAX_SERIAL = 2**52
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
@@ -196,6 +200,14 @@ class Store:
     def servo(self, name: str) -> ServoSummary | None:
         """Summary of one servo; None: it is unknown."""
         return self._read(lambda connection: queries.servo(connection, name))
+
+    def fleet(self, name: str) -> str:
+        """Name of the fleet whose servos the store holds: the first one that was ever given."""
+        if _FLEET not in (known := self.contexts([_FLEET])):
+            noted = {"key": _FLEET, "text": name}
+            self._write(lambda connection: connection.execute(insert_once(connection.dialect.name, contexts), noted))
+            known = self.contexts([_FLEET])
+        return known[_FLEET]
 
     def window(self, servo: str, boot: str, sequence: int) -> StoredMessage | None:
         """A window with its body, which is empty once retention deleted it; None: it is unknown."""

@@ -13,16 +13,15 @@ from servotwin import messages
 from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
 from servotwin.errors import InvalidInput
-from servotwin.estimation import whitened
+from servotwin.estimation import motor_side, output_error, whitened
 from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.controller import ControllerComparison, compare_controller
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
-from servotwin.estimation.gap import estimate_gap, options_for
+from servotwin.estimation.gap import default_method, estimate_gap, options_for
 from servotwin.estimation.learning.machine import nameplate
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
-from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
 from servotwin.messages import Setting
@@ -67,13 +66,18 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
             f"[twin] method = {settings.method!r} and its settings: are for axes that are held in the gap and have "
             "two masses or more; leave them out for this axis"
         )
+    own = default_method(servo)
+    if servo.at_motor:
+        # Its windows hold the motor's angle twice.
+        motor_side.check_reaction(servo)
+        own, model = motor_side.METHOD, None
     options = options_for(servo, settings.method, settings.estimator)
     new = stated_machine(settings) if settings.learning.learn and model is not None and model.rigid else None
 
     def of_model(window: Window, expected: Expectation) -> GapEstimate:
         if model is None:
             # The methods that settings name are those of a servo.
-            return estimate_gap(window, servo, prior=expected.prior, settings=_worn(expected, settings))
+            return estimate_gap(window, servo, own, expected.prior, _worn(own, expected, settings))
         if not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
         growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
@@ -92,10 +96,14 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     return of_model if model is servo else estimate
 
 
-def _worn(expected: Expectation, settings: TwinSettings) -> OutputErrorSettings:
-    """Settings of the output-error estimator for a gap that grows as the trend says, once two windows have told it."""
-    known = expected.trend is not None and expected.trend.updates > 1
-    return OutputErrorSettings(gap_rate=expected.gap_rate(settings.trend) if known else 0.0)
+def _worn(
+    method: str, expected: Expectation, settings: TwinSettings
+) -> output_error.OutputErrorSettings | motor_side.MotorSideSettings:
+    """Settings of an axis's own estimator for a gap that grows as the trend says, or as was assumed of it before."""
+    rate = expected.gap_rate(settings.trend)
+    if method == motor_side.METHOD:
+        return motor_side.MotorSideSettings(gap_rate=rate)
+    return output_error.OutputErrorSettings(gap_rate=rate)
 
 
 def motor_learning_of(servo: Plant, settings: TwinSettings) -> MotorLearning | None:

@@ -48,10 +48,13 @@ class Verifiers:
     ----------
     servos, operators : mapping of str to bytes
         Name to `link.seal.verifier_of` its token.
+    fleet : str
+        Name that `servotwin enroll` draws for the file, and that the twin's store keeps; empty: not named yet.
     """
 
     servos: Mapping[str, bytes] = field(default_factory=dict)
     operators: Mapping[str, bytes] = field(default_factory=dict)
+    fleet: str = field(default="", compare=False)
 
     def __repr__(self) -> str:
         return f"Verifiers({len(self.servos)} servos, {len(self.operators)} operators)"
@@ -98,6 +101,13 @@ class AccessControl:
         matches = [hmac.compare_digest(verifier, known) for known in self._verifiers.operators.values()]
         if not any(matches):
             raise self._rejected(verifier, "the token is not an operator's")
+
+    def knows(self, token: bytes | None) -> bool:
+        """Test whether a token is anybody's."""
+        try:
+            return _digest(token) in self._known
+        except RequestRejected:
+            return False
 
     @property
     def open(self) -> bool:
@@ -244,7 +254,8 @@ def read_tokens(path: Path) -> Verifiers:
     if not path.read_bytes().strip():
         return Verifiers()
     table = read_toml(path)
-    verifiers = Verifiers(_read_verifiers(table.table("servos")), _read_verifiers(table.table("operators")))
+    servos, operators = (_read_verifiers(table.table(name)) for name in ("servos", "operators"))
+    verifiers = Verifiers(servos, operators, _read_fleet(table))
     table.done()
     owner: dict[bytes, str] = {}
     for name, verifier in [*verifiers.servos.items(), *verifiers.operators.items()]:
@@ -261,7 +272,8 @@ def write_tokens(path: Path, verifiers: Verifiers) -> None:
         f"[{name}]\n" + "".join(f'"{key}" = "{value.hex()}"\n' for key, value in sorted(entries.items()))
         for name, entries in tables.items()
     ]
-    write_private(path, _HEAD + "\n".join(parts))
+    fleet = f'fleet = "{verifiers.fleet or secrets.token_hex(8)}"\n'
+    write_private(path, "\n".join([_HEAD + fleet, *parts]))
 
 
 @contextmanager
@@ -273,6 +285,14 @@ def tokens_locked(path: Path) -> Iterator[None]:
         except OSError as error:
             raise InvalidInput(f"{lock_beside(path)}: cannot be made ({error.strerror})") from None
         yield
+
+
+def _read_fleet(table: Table) -> str:
+    fleet = table.values.get("fleet", "")
+    table.known("fleet")
+    if not isinstance(fleet, str) or (fleet and re.fullmatch(NAME_PATTERN, fleet) is None):
+        raise InvalidInput(f"{table.source}: fleet is no name: 1 to 64 letters, digits, . _ or -")
+    return fleet
 
 
 def _read_verifiers(table: Table) -> dict[str, bytes]:

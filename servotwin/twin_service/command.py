@@ -6,15 +6,16 @@ import asyncio
 import logging
 import socket
 from collections.abc import Iterator
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
 from servotwin.runtime.locks import lock_beside, locked
-from servotwin.store.engine import parse_address, sqlite_file
+from servotwin.store.engine import StoreUnavailable, parse_address, sqlite_file
 from servotwin.store.store import Store, open_store
+from servotwin.twin_service.auth import read_tokens
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_server import HttpServer, check_tls, listening_socket, raise_descriptor_limit
 from servotwin.twin_service.monitoring import configure_logging
@@ -44,6 +45,7 @@ def run(path: Path, port: int | None = None) -> None:
         closing(_open_configured_store(twin.service)) as store,
         listening_socket(twin.service, port) as listener,
     ):
+        check_fleet(store, twin.service.tokens)
         serve(twin, store, listener, pool)
 
 
@@ -53,16 +55,39 @@ def serve(twin: TwinFile, store: Store, listener: socket.socket, pool: WorkerPoo
         log.warning("no tokens: whoever reaches this machine itself may do everything")
     raise_descriptor_limit()
     service = TwinService(twin, store, pool=pool)
-    server = HttpServer(twin.service, service.http_app(), service.end_streams)
+    server = HttpServer(
+        twin.service, service.http_app(), service.end_streams, service.strangers, lambda: service.dispatching
+    )
     asyncio.run(server.serve([listener]))
 
 
 def _open_configured_store(config: ServiceConfig) -> Store:
-    """Open the store, with its password."""
+    """Open the store, with its password and the certificates that its server's is checked against."""
     address = config.store
-    if config.store_password is not None:
-        address = sa.make_url(address).set(password=config.store_password).render_as_string(hide_password=False)
-    return open_store(address)
+    if config.store_ca is not None:
+        verified = {"sslmode": "verify-full", "sslrootcert": str(config.store_ca)}
+        address = sa.make_url(address).update_query_dict(verified).render_as_string(hide_password=False)
+    return open_store(address, config.store_password)
+
+
+def check_fleet(store: Store, tokens: Path | None) -> None:
+    """Have a new store keep the name of its fleet, which is in the file of tokens.
+
+    Servos of two fleets may have the same names: one machine's updates would follow from the other's past.
+
+    Raises
+    ------
+    InvalidInput
+        The store is another fleet's.
+    """
+    fleet = known = "" if tokens is None else read_tokens(tokens).fleet
+    with suppress(StoreUnavailable):  # a full disk: the service says so itself, and recovers when there is room
+        known = store.fleet(fleet) if fleet else ""
+    if known != fleet:
+        raise InvalidInput(
+            f"store {store.name}: belongs to the fleet {known!r}, and {tokens} to {fleet!r}; give the store of this "
+            f"fleet, or, where the tokens were made anew for the same machines, write fleet = {known!r} there"
+        )
 
 
 def open_existing_store(config: ServiceConfig) -> Store:

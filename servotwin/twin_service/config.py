@@ -122,6 +122,14 @@ class ServiceConfig:
         str, key(parse=_store_url, help="SQLAlchemy URL without a password; a SQLite file is relative to this one.")
     ] = "sqlite:///twin.db"
     store_password: str | None = None
+    store_ca: Annotated[
+        Path | None,
+        key(
+            parse=_file,
+            help="PEM file with the certificates against which PostgreSQL's is checked, with its host's name "
+            "(sslmode=verify-full); where absent, the connection is as the URL says.",
+        ),
+    ] = None
     workers: Annotated[int, key(minimum=1, maximum=256, help="Processes that estimate.")] = 2
     tls_certificate: Annotated[Path | None, key(parse=_file, help="PEM file; both or none.")] = None
     tls_key: Annotated[Path | None, key(parse=_file, help="PEM file with the certificate's key.")] = None
@@ -152,6 +160,31 @@ class ServiceConfig:
     max_body_bytes: Annotated[
         int, key(minimum=1024, maximum=MAX_BYTES, help="Largest size of a body, as sent and as decompressed.")
     ] = MAX_BYTES
+    samples_per_window: Annotated[
+        int,
+        key(minimum=1, help="Largest number of samples of a window; a worker's time and memory for it grow with them."),
+    ] = 100_000
+    megabytes_per_day: Annotated[
+        float,
+        key(
+            above=0.0,
+            infinite=True,
+            help="Largest mean rate at which one servo fills the disk, in MB of messages as they are stored; of a rate "
+            "above it the edge keeps what is too much, and sends it later.",
+        ),
+    ] = 2000.0
+    strangers: Annotated[
+        int, key(minimum=1, maximum=_MOST, help="Largest number of connections open at once that have shown no token.")
+    ] = 8192
+    strangers_per_address: Annotated[
+        int,
+        key(
+            minimum=1,
+            maximum=_MOST,
+            help="Largest number of them from one address, once they are older than 2 s; with tokens only, and not "
+            "behind a proxy.",
+        ),
+    ] = 128
     body_timeout_s: Annotated[float, key(above=0.0, help="Time within which a body must arrive.")] = 30.0
     long_polls: Annotated[int, key(minimum=1, maximum=_MOST, help="Largest number of long polls open at once.")] = (
         20_000
@@ -194,6 +227,12 @@ class ServiceConfig:
         check(self)
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise InvalidInput("tls_certificate and tls_key belong together: give both or none")
+        if self.store_ca is not None and not self.store.startswith("postgresql"):
+            raise InvalidInput(f"store_ca is for PostgreSQL; store is {self.store!r}")
+        if self.store_ca is not None and "ssl" in self.store.partition("?")[2]:
+            raise InvalidInput(
+                "store_ca and options ssl... of the store's URL exclude each other; leave the latter out"
+            )
         if not self.local and (self.tokens is None or (self.tls_key is None and not self.behind_proxy)):
             raise InvalidInput(
                 f"bind = {self.bind!r} can be reached from other machines: this requires tokens, and tls_certificate "

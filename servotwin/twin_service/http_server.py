@@ -7,17 +7,23 @@ import resource
 import signal
 import socket
 import ssl
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
+from typing import Any
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
+from servotwin.runtime.service_manager import ServiceManager
+from servotwin.twin_service.auth import bearer_token
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
+from servotwin.twin_service.strangers import Stranger, StrangerLimit
 
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
@@ -46,12 +52,23 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     _head = _unreported = _drained = 0
     _timer: asyncio.TimerHandle | None = None
     _drain_timer: asyncio.TimerHandle | None = None
+    _stranger: Stranger | None = None
+
+    def __init__(self, *, strangers: StrangerLimit | None, **options: Any) -> None:
+        super().__init__(**options)
+        self._strangers = strangers
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._start_timer()
+        if self._strangers is not None:
+            self._stranger = self._strangers.enter(_address_of(transport), transport.abort)
+            if self._stranger is None:
+                transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
+        if self._stranger is not None:
+            self._stranger.leave()
         self._stop_timer()
         self._stop_drain()
         super().connection_lost(exc)
@@ -88,6 +105,8 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         self._unreported = 0
         self._stop_timer()
+        if self._stranger is not None:
+            self._stranger.show(bearer_token(dict(self.headers).get(b"authorization")))
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
@@ -207,11 +226,22 @@ class HttpServer(uvicorn.Server):
     app : HttpApp
     close_polls : callable
         Ends all long polls.
+    strangers : StrangerLimit or None
+        Limit of the connections that have shown no token.
+    works : callable
+        Test whether the service still does its work; where it does not, the service manager's watchdog restarts it.
     """
 
-    def __init__(self, config: ServiceConfig, app: HttpApp, close_polls: Callable[[], None]) -> None:
-        super().__init__(_server_config(config, app))
-        self._close_polls = close_polls
+    def __init__(
+        self,
+        config: ServiceConfig,
+        app: HttpApp,
+        close_polls: Callable[[], None],
+        strangers: StrangerLimit | None,
+        works: Callable[[], bool],
+    ) -> None:
+        super().__init__(_server_config(config, app, strangers))
+        self._close_polls, self._works, self._manager = close_polls, works, ServiceManager()
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -227,17 +257,30 @@ class HttpServer(uvicorn.Server):
         await super().startup(sockets)
         for each in sockets or ():
             print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
+        if self.started:
+            self._manager.ready()
+
+    async def on_tick(self, counter: int) -> bool:
+        if self._works():
+            self._manager.alive(time.monotonic())
+        return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        self._manager.stopping()
         self._close_polls()
         await super().shutdown(sockets)
 
 
-def _server_config(config: ServiceConfig, app: HttpApp) -> uvicorn.Config:
+def _address_of(transport: asyncio.Transport) -> str:
+    peer = transport.get_extra_info("peername")
+    return str(peer[0]) if isinstance(peer, tuple) and peer else ""
+
+
+def _server_config(config: ServiceConfig, app: HttpApp, strangers: StrangerLimit | None) -> uvicorn.Config:
     """Configure uvicorn."""
     return uvicorn.Config(
         app,
-        http=_LimitedHttpProtocol,
+        http=partial(_LimitedHttpProtocol, strangers=strangers),  # type: ignore[arg-type]
         ws="none",
         lifespan="on",
         log_config=None,

@@ -24,7 +24,7 @@ from servotwin.messages.codec import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.store.soundness import message_digest
-from servotwin.twin_service.limits import RequestRejected, SampleTimeLimiter
+from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 
 LETTERS = (Hello, Receipt, Fallback, Answer)
@@ -62,6 +62,10 @@ class Ingest:
     clocks : Clocks
     note : callable
         Called with each window that was new.
+    samples : int
+        Largest number of samples of a window: the time and the memory of the work on it grow with them.
+    disk : RateLimiter, optional
+        Limits the bytes that a servo adds to the store.
     """
 
     def __init__(
@@ -73,8 +77,10 @@ class Ingest:
         limit: int = MAX_BYTES,
         clocks: Clocks | None = None,
         note: Callable[[WindowMessage], None] = lambda _window: None,
+        samples: int = MAX_BYTES,
+        disk: RateLimiter | None = None,
     ) -> None:
-        self._note = note
+        self._note, self._samples, self._disk = note, samples, disk
         self._put, self._has_servo, self._sample_times = put, has_servo, sample_times
         self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
@@ -113,6 +119,7 @@ class Ingest:
         data, message = self._decoded(servo, body, encoding)
         now, digest = self._clocks.monotonic(), message_digest(data)
         if isinstance(message, WindowMessage):
+            self._check_samples(message)
             self._sample_times.check(servo, message.boot, end_of(message), now)
             incoming = Incoming(
                 servo=servo,
@@ -143,13 +150,19 @@ class Ingest:
         Raises
         ------
         RequestRejected
-            CONFLICT: another message was committed under this key. UNAVAILABLE: it may succeed later.
+            CONFLICT: another message was committed under this key. UNAVAILABLE, TOO_MANY: it may succeed later.
         """
         begun = self._clocks.monotonic()
+        if self._disk is not None:
+            self._disk.take(incoming.servo, len(incoming.body))
+        put = PutResult.CONFLICT
         try:
             put = await self._put(incoming)
         except (StoreBusy, StoreUnavailable) as error:
             raise RequestRejected(Refusal.UNAVAILABLE, _unavailable(error)) from None
+        finally:
+            if self._disk is not None and put is not PutResult.NEW:
+                self._disk.give_back(incoming.servo, len(incoming.body))
         if put is PutResult.CONFLICT:
             raise RequestRejected(
                 Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another message is stored under this key"
@@ -159,6 +172,11 @@ class Ingest:
         if put is PutResult.NEW and isinstance(message, WindowMessage):
             self._note(message)
         return put
+
+    def _check_samples(self, window: WindowMessage) -> None:
+        if window.samples > self._samples:
+            detail = f"the window has {window.samples} samples; at most {self._samples} are allowed"
+            raise RequestRejected(Refusal.TOO_LARGE, detail)
 
     def _decoded(self, servo: str, body: bytes, encoding: str) -> tuple[bytes, Message]:
         # Before the body is decompressed and decoded, which costs far more.

@@ -57,7 +57,7 @@ class Disconnected(Exception):
 
 
 class RateLimiter:
-    """Token bucket per servo: a message takes one token, `rate` tokens per s are added up to `burst`.
+    """Token bucket per servo: a message takes one token or more, `rate` tokens per s are added up to `burst`.
 
     The least recently used buckets are dropped; a bucket that was dropped is full when it is used again.
 
@@ -75,26 +75,34 @@ class RateLimiter:
         self._rate, self._burst, self._now, self._counted = rate, max(1.0, burst), monotonic, counted
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
-    def take(self, servo: str) -> None:
-        """Take a token of a servo.
+    def take(self, servo: str, number: float = 1.0) -> None:
+        """Take tokens of a servo.
 
         Raises
         ------
         RequestRejected
-            TOO_MANY: the bucket is empty.
+            TOO_MANY: the bucket holds fewer, and is not full.
         """
         now = self._now()
         level, at = self._levels.get(servo, (self._burst, now))
         level = min(self._burst, level + self._rate * (now - at))
+        # What is larger than the bucket passes when that is full, or it would never.
+        empty = level < min(number, self._burst)
         # A rejected message takes no token: a servo that repeats too fast gets through at the allowed rate.
-        self._levels[servo] = (level if level < 1.0 else level - 1.0), now
+        self._levels[servo] = (level if empty else level - number), now
         self._levels.move_to_end(servo)
         if len(self._levels) > MAX_SERVOS:
             self._levels.popitem(last=False)
-        if level < 1.0:
+        if empty:
             raise RequestRejected(
                 Refusal.TOO_MANY, f"more than {self._rate:g} {self._counted} per s of servo {servo!r}"
             )
+
+    def give_back(self, servo: str, number: float) -> None:
+        """Give tokens back that were taken for nothing."""
+        if servo in self._levels:
+            level, at = self._levels[servo]
+            self._levels[servo] = level + number, at
 
 
 class _SampleTime(NamedTuple):

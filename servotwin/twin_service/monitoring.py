@@ -1,7 +1,6 @@
-"""Monitoring: metrics in Prometheus' text format 0.0.4, and logs as JSON lines.
+"""Monitoring: metrics for Prometheus, and logs as JSON lines.
 
-One thread updates the metrics, so that nothing is locked. No client library: the format is a page long, and nothing
-else of a library would be used.
+One thread updates the metrics, so that nothing is locked.
 """
 
 from __future__ import annotations
@@ -10,16 +9,20 @@ import collections
 import logging
 import sys
 from bisect import bisect_left
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, TextIO
 
 import msgspec
 
-CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+from servotwin.messages import Refusal
+from servotwin.runtime.prometheus import Sample, metric_lines, number_text
+
 _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0)
 """Upper bounds of the histograms' buckets."""
 
+_WATCHED = ("alarm", "failed", "fallback", "withdrawn")
+"""Kinds of evidence that an operator must see."""
 _Labels = tuple[str, ...]
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
 """Attributes that every log record has."""
@@ -33,22 +36,25 @@ class Counter:
     name, help_ : str
     labels : str
         Names of the labels, which have few values: the name of a servo is not a label.
+    known : collection of str
+        Values of the only label that are 0 from the start: of a series that appears, Prometheus sees no increase.
     """
 
     kind = "counter"
 
-    def __init__(self, name: str, help_: str, *labels: str) -> None:
+    def __init__(self, name: str, help_: str, *labels: str, known: Collection[str] = ()) -> None:
         self.name, self.help, self.labels = name, help_, labels
-        self.values: collections.Counter[_Labels] = collections.Counter({} if labels else {(): 0})
+        none: dict[_Labels, int] = {(value,): 0 for value in known} if labels else {(): 0}
+        self.values: collections.Counter[_Labels] = collections.Counter(none)
 
     def add(self, *values: str, by: int = 1) -> None:
         """Add to the counter of these label values."""
         self.values[values] += by
 
-    def lines(self) -> Iterator[str]:
-        """Sample lines."""
+    def samples(self) -> Iterator[Sample]:
+        """Values of all combinations."""
         for values, number in sorted(self.values.items()):
-            yield f"{self.name}{_labels(self.labels, values)} {number}"
+            yield Sample(number, dict(zip(self.labels, values, strict=True)))
 
 
 class Gauge:
@@ -59,14 +65,14 @@ class Gauge:
     def __init__(self, name: str, help_: str, read: Callable[[], float | Mapping[str, float]], label: str = "") -> None:
         self.name, self.help, self._read, self._label = name, help_, read, label
 
-    def lines(self) -> Iterator[str]:
-        """Sample lines."""
+    def samples(self) -> Iterator[Sample]:
+        """Present values."""
         reading = self._read()
         if not isinstance(reading, Mapping):
-            yield f"{self.name} {_number(reading)}"
+            yield Sample(reading)
             return
         for value, number in sorted(reading.items()):
-            yield f"{self.name}{_labels((self._label,), (value,))} {_number(number)}"
+            yield Sample(number, {self._label: value})
 
 
 class Histogram:
@@ -88,14 +94,14 @@ class Histogram:
         """Number of times."""
         return sum(self._counts)
 
-    def lines(self) -> Iterator[str]:
-        """Sample lines."""
+    def samples(self) -> Iterator[Sample]:
+        """Buckets, sum and number."""
         below = 0
-        for end, count in zip((*map(_number, self._ends), "+Inf"), self._counts, strict=True):
+        for end, count in zip((*map(number_text, self._ends), "+Inf"), self._counts, strict=True):
             below += count
-            yield f'{self.name}_bucket{{le="{end}"}} {below}'
-        yield f"{self.name}_sum {_number(self._sum)}"
-        yield f"{self.name}_count {below}"
+            yield Sample(below, {"le": end}, "_bucket")
+        yield Sample(self._sum, suffix="_sum")
+        yield Sample(below, suffix="_count")
 
 
 class Metrics:
@@ -103,12 +109,16 @@ class Metrics:
 
     def __init__(self) -> None:
         self.stored = Counter("servotwin_messages_total", "Messages committed, by kind and whether new.", "kind", "put")
-        self.rejected = Counter("servotwin_refused_total", "Messages and requests rejected, by reason code.", "code")
+        self.rejected = Counter(
+            "servotwin_refused_total", "Messages and requests rejected, by reason code.", "code", known=list(Refusal)
+        )
         self.commit = Histogram("servotwin_commit_seconds", "From a message's last byte to its commit.")
         self.age = Histogram("servotwin_queue_age_seconds", "From a message's commit to that of its result.")
         self.work = Histogram("servotwin_work_seconds", "A worker's time for one servo's messages.")
         self.results = Counter("servotwin_outcomes_total", "Results of leases that workers processed.", "result")
-        self.evidence = Counter("servotwin_evidence_total", "Pieces of evidence committed, by kind.", "kind")
+        self.evidence = Counter(
+            "servotwin_evidence_total", "Pieces of evidence committed, by kind.", "kind", known=_WATCHED
+        )
         self.sent = Counter("servotwin_posted_total", "Messages posted to edges.")
         self.workers_lost = Counter("servotwin_workers_lost_total", "Worker processes that were replaced.")
         self.missing = Counter(
@@ -127,26 +137,9 @@ class Metrics:
 
     def text(self) -> str:
         """All metrics in the text format."""
-        return "".join(line + "\n" for metric in self._all for line in _lines(metric))
-
-
-def _lines(metric: Counter | Gauge | Histogram) -> Iterator[str]:
-    yield f"# HELP {metric.name} {metric.help}"
-    yield f"# TYPE {metric.name} {metric.kind}"
-    yield from metric.lines()
-
-
-def _labels(names: Sequence[str], values: Sequence[str]) -> str:
-    pairs = ",".join(f'{name}="{_escaped(value)}"' for name, value in zip(names, values, strict=True))
-    return f"{{{pairs}}}" if pairs else ""
-
-
-def _escaped(value: str) -> str:
-    return value.replace("\\", r"\\").replace('"', r"\"").replace("\n", r"\n")
-
-
-def _number(value: float) -> str:
-    return f"{value:.12g}"
+        return "".join(
+            line + "\n" for each in self._all for line in metric_lines(each.name, each.kind, each.help, each.samples())
+        )
 
 
 class _JsonLines(logging.Formatter):

@@ -41,6 +41,7 @@ from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
+from servotwin.twin_service.strangers import StrangerLimit
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.worker import WorkerPool
 
@@ -78,6 +79,7 @@ class TwinService:
         self.pool = pool or WorkerPool(config.workers, twin.start, config.job_timeout_s)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
+        self.strangers = StrangerLimit.of(config, self.access)
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
@@ -101,6 +103,8 @@ class TwinService:
             limit=config.max_body_bytes,
             clocks=self.clocks,
             note=sequences.note,
+            samples=config.samples_per_window,
+            disk=_disk_limiter(config.megabytes_per_day, self.clocks.monotonic),
         )
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
@@ -194,11 +198,15 @@ class TwinService:
 
     def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
-        store, workers = self._store_healthy(), self.pool.alive
-        # A task that ended without an error did so because of the damage.
-        dispatching = not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
+        store, workers, dispatching = self._store_healthy(), self.pool.alive, self.dispatching
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
         return {"ok": store and workers > 0 and dispatching, "degraded": self._lagging(backlog), **parts}
+
+    @property
+    def dispatching(self) -> bool:
+        """False where a task of the service has failed; only a restart begins it again."""
+        # A task that ended without an error did so because of the damage.
+        return not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
 
     def _lagging(self, backlog: Backlog | None) -> list[str]:
         """The lag in a sentence, where it is above its limit."""
@@ -270,6 +278,9 @@ class TwinService:
         add = self.metrics.add_gauge
         waiting = "Messages and results that wait for their commit."
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
+        strangers = self.strangers
+        if strangers is not None:
+            add("servotwin_strangers", "Connections that have shown no token.", lambda: strangers.open)
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.feed.watchers)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
@@ -298,6 +309,14 @@ def _log_failure(task: asyncio.Task[None]) -> None:
     """Log the exception of a background task at once: the task is awaited only when the service stops."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.error("a task of the service ended", exc_info=error)
+
+
+def _disk_limiter(megabytes_per_day: float, monotonic: Callable[[], float]) -> RateLimiter | None:
+    """Limit of the bytes that a servo stores; a day's worth may come at once, as after an outage."""
+    if math.isinf(megabytes_per_day):
+        return None
+    daily = megabytes_per_day * 1e6
+    return RateLimiter(daily / _DAY, daily, monotonic, "bytes to be stored")
 
 
 def _servo_test(servos: ServoNames) -> Callable[[str], bool]:

@@ -6,7 +6,8 @@ import re
 import secrets
 import shutil
 import ssl
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -79,28 +80,50 @@ def enroll(path: Path, request: Enrolment) -> list[Path]:
         The servo has no model, it has a token already, or a file cannot be written.
     """
     twin = read_twin(path)
-    tokens = _tokens_file(twin)
-    _check(request, _read_or_create(tokens))
-    new = not (request.folder / CONFIG).exists()
-    text = edge_toml(_edge_config(twin, request)) if new else ""
-    token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
-    written = _write_configuration(_trusted_certificates(twin, request), folder, text) if new else []
-    write_private(folder / TOKEN, token + "\n")
-    written.append(folder / TOKEN)
-    _add(tokens, "servos", request.servo, token, request.replace_token)
+    with open_tokens(twin) as (tokens, known):
+        written, verifier = write_folder(twin, request, edge_file_text(twin, request, known))
+        write_tokens(tokens, replace(known, servos={**known.servos, request.servo: verifier}))
     return [*written, tokens]
+
+
+def edge_file_text(twin: TwinFile, request: Enrolment, known: Verifiers) -> str:
+    """Check a request, and return the text of its edge.toml; "" where there is one already.
+
+    Raises
+    ------
+    InvalidInput
+        The servo has no model, it or its folder has a token already, or no setting is verified for its stated range.
+    """
+    _check(request, known)
+    return "" if (request.folder / CONFIG).exists() else edge_toml(_edge_config(twin, request))
+
+
+def write_folder(twin: TwinFile, request: Enrolment, text: str) -> tuple[list[Path], bytes]:
+    """Write the folder of an edge with a new token; return the files and the token's verifier."""
+    token, folder = secrets.token_urlsafe(32), make_directory(request.folder)
+    written = _write_configuration(_trusted_certificates(twin, request), folder, text) if text else []
+    write_private(folder / TOKEN, token + "\n")
+    return [*written, folder / TOKEN], verifier_of(token)
+
+
+@contextmanager
+def open_tokens(twin: TwinFile) -> Iterator[tuple[Path, Verifiers]]:
+    """Hold the lock of a twin's file of tokens; yield its path and verifiers, for `write_tokens`."""
+    tokens = _tokens_file(twin)
+    with tokens_locked(tokens):
+        yield tokens, _read_or_create(tokens)
 
 
 def enroll_operator(path: Path, name: str, file: Path, replace_token: bool = False) -> list[Path]:
     """Enrol an operator with the twin of a file, and write the token to `file`; returns and raises as `enroll`."""
     twin = read_twin(path, models=False)
-    tokens = _tokens_file(twin)
-    _check_name(name, _read_or_create(tokens).operators, replace_token)
-    if file.exists() and not replace_token:
-        raise InvalidInput(f"{file}: exists already; give another file, or --again to replace it by a new token")
-    token = secrets.token_urlsafe(32)
-    write_private(file, token + "\n")
-    _add(tokens, "operators", name, token, replace_token)
+    with open_tokens(twin) as (tokens, known):
+        _check_name(name, known.operators, replace_token)
+        if file.exists() and not replace_token:
+            raise InvalidInput(f"{file}: exists already; give another file, or --again to replace it by a new token")
+        token = secrets.token_urlsafe(32)
+        write_private(file, token + "\n")
+        write_tokens(tokens, replace(known, operators={**known.operators, name: verifier_of(token)}))
     return [file, tokens]
 
 
@@ -121,7 +144,7 @@ def revoke(path: Path, name: str) -> Path:
         servos, operators = dict(known.servos), dict(known.operators)
         servos.pop(name, None)
         operators.pop(name, None)
-        write_tokens(tokens, Verifiers(servos, operators))
+        write_tokens(tokens, replace(known, servos=servos, operators=operators))
     return tokens
 
 
@@ -195,16 +218,6 @@ def _tokens_file(twin: TwinFile) -> Path:
     if twin.service.tokens is None:
         raise InvalidInput(f'{twin.path}: [service] has no key tokens; add tokens = "tokens.toml"')
     return twin.service.tokens
-
-
-def _add(tokens: Path, role: str, name: str, token: str, replace_token: bool) -> None:
-    """Add a verifier to the file of tokens."""
-    # Read again under the lock: another process may have enrolled a servo since the file was checked.
-    with tokens_locked(tokens):
-        known = _read_or_create(tokens)
-        verifiers: Mapping[str, bytes] = getattr(known, role)
-        _check_name(name, verifiers, replace_token)
-        write_tokens(tokens, replace(known, **{role: {**verifiers, name: verifier_of(token)}}))
 
 
 def _read_or_create(tokens: Path) -> Verifiers:

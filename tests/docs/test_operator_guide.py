@@ -118,7 +118,7 @@ def test_every_answer_and_every_cause_is_explained(title: str, names: Any) -> No
 @pytest.fixture
 def system(tmp_path: Path) -> Iterator[TwinService]:
     """A service that has not begun, with a broker, so that it has every metric."""
-    twin = read_twin(twin_file(tmp_path, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n', tokens=False))
+    twin = read_twin(twin_file(tmp_path, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n'))
     store = open_store(twin.service.store)
     made = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
     try:
@@ -138,7 +138,12 @@ def test_every_metric_is_explained(system: TwinService) -> None:
         "twin_service", "counts.add", ".add"
     )
     everywhere = re.findall(r"\bservotwin_[a-z_]+", ALARM + GUIDE)
-    assert set(everywhere) - told <= {"servotwin_version"}
+    assert {name for name in everywhere if not name.startswith("servotwin_edge_")} - told <= {"servotwin_version"}
+
+
+def test_every_metric_of_an_edge_is_explained() -> None:
+    made = calls("edge_process", "_Metric", "metric_lines")
+    assert set(named("Metrics of an edge")) == made | {"servotwin_edge_tick_seconds"}
 
 
 def test_every_field_of_health_is_explained(system: TwinService) -> None:

@@ -179,6 +179,22 @@ def test_a_file_of_the_version_before_is_read_and_written_as_it_was() -> None:
     assert tomllib.loads(edge_toml(load(folder / "edge.toml"))) == before
 
 
+def test_a_written_file_that_was_cut_short_is_refused_wherever_it_ends(tmp_path: Path) -> None:
+    """Without its last tables the edge would run, and watch nothing."""
+    path, text = tmp_path / "edge.toml", edge_toml(read_config(parse_toml(PLAIN, "edge.toml")))
+    lines = text.splitlines(keepends=True)
+    said = []
+    for number in range(1, len(lines)):
+        path.write_text("".join(lines[:number]))
+        with pytest.raises(InvalidInput) as refused:
+            load(path)
+        said.append(str(refused.value))
+    assert said[-1] == f"{path}: is cut short: its line '# end' is missing; copy the edge's folder again"
+    for whole in (text, f"{text}# mine\n", "\n".join(line for line in text.splitlines() if line[:1] != "#")):
+        path.write_text(whole)
+        load(path)
+
+
 def test_a_key_that_released_edges_refuse_is_written_only_where_it_says_something() -> None:
     config = read_config(parse_toml(PLAIN, "edge.toml"))
     assert "acknowledged" not in edge_toml(config)

@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from faketwin import FakeTwin, Handler
+from notify_socket import listening
 from stubmachine import StubMachine
 
 import servotwin
@@ -55,7 +56,7 @@ class RunningEdge:
         blocked.mkdir()
         (blocked / "sitecustomize.py").write_text(BLOCKER)
         root = Path(servotwin.__file__).parents[1]
-        self._environment = {**os.environ, "PYTHONPATH": f"{blocked}{os.pathsep}{root}"}
+        self.environment = {**os.environ, "PYTHONPATH": f"{blocked}{os.pathsep}{root}"}
         self.process: subprocess.Popen[bytes] | None = None
 
     def write(self, **changes: Any) -> None:
@@ -65,7 +66,7 @@ class RunningEdge:
     def start(self) -> None:
         command = [sys.executable, "-m", "servotwin.edge_process", str(self.folder / "edge.toml")]
         with (self.folder / "log").open("ab") as log:
-            self.process = subprocess.Popen(command, stderr=log, env=self._environment, start_new_session=True)
+            self.process = subprocess.Popen(command, stderr=log, env=self.environment, start_new_session=True)
 
     def signal(self, number: int) -> int:
         assert self.process is not None
@@ -134,9 +135,13 @@ def is_complete(sequence: list[int]) -> bool:
 def test_an_edge_controls_records_and_sends_without_numpy(
     edge: RunningEdge, machine: StubMachine, twin: FakeTwin
 ) -> None:
-    edge.start()
-    until(lambda: len(twin.windows) >= 4 and edge.status().get("samples", 0) > 0)
-    assert edge.signal(signal.SIGTERM) == 0
+    with listening() as heard:
+        edge.environment |= {"NOTIFY_SOCKET": str(heard.path), "WATCHDOG_USEC": "500000"}
+        edge.start()
+        until(lambda: len(twin.windows) >= 4 and edge.status().get("samples", 0) > 0)
+        heard.wait_for("WATCHDOG=1", 2)
+        assert edge.signal(signal.SIGTERM) == 0
+        assert (heard.received()[0], heard.states[-1]) == ("READY=1", "STOPPING=1")
     (found,) = sequences(twin).values()
     left = {sequence for _, sequence in edge.outbox()}
     assert is_complete(sorted({*found, *left}))

@@ -2,16 +2,17 @@
 
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mosquitto import Mosquitto, broker, free_port
-from mqttparts import PATIENCE, TOKENS, edge, insist, kept, parcel, raw, refusals, twin
+from mqttparts import PATIENCE, SERVOS, TOKENS, edge, insist, kept, parcel, raw, refusals, twin
 from relay import Relay, State, Weather
 
 from servotwin.link import mqtt_messages as wire
@@ -203,6 +204,38 @@ def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -
             raw(server, wire.response_topic("axis-1"), payload)
         with pytest.raises(Unreachable, match="no twin listens"):
             here.deliver(parcel(0))
+
+
+@pytest.mark.parametrize("way", [wire.request_topic, wire.response_topic])
+def test_a_broker_that_swaps_its_clients_topics_loses_nothing_and_brings_no_update_to_the_wrong_edge(
+    server: Mosquitto, store: Store, monkeypatch: pytest.MonkeyPatch, way: Callable[[str], str]
+) -> None:
+    """It gives what one edge sends in the other's name, or the twin's answers to the other edge."""
+    swapped, publish = dict[str, str](), Connection.publish
+
+    def astray(connection: Connection, topic: str, *rest: Any) -> int | None:
+        return publish(connection, swapped.get(topic, topic), *rest)
+
+    monkeypatch.setattr(Connection, "publish", astray)
+    with twin(Broker(server.url), store) as there, ExitStack() as stack:
+        edges = (edge(Broker(server.url), each, timeout_s=1.0, wait_s=0.1) for each in SERVOS)
+        first, second = map(stack.enter_context, edges)
+        first.deliver(parcel(0))
+        there.post("axis-1", b"update")
+        swapped.update({way("axis-1"): way("axis-2"), way("axis-2"): way("axis-1")})
+        for here, servo in ((first, "axis-1"), (second, "axis-2")):
+            with pytest.raises((Refused, Unreachable)) as failed:
+                here.deliver(parcel(1, servo))
+            assert not isinstance(failed.value, Refused) or failed.value.reason.temporary
+        with pytest.raises((Refused, Unreachable)):
+            second.listen(0)
+        assert bool(refusals(there)) == (way is wire.request_topic)
+        swapped.clear()
+        first.deliver(parcel(1))
+        second.deliver(parcel(1, "axis-2"))
+        assert len(first.listen(0)) == 1
+        assert second.listen(0) == []
+    assert (kept(store), kept(store, "axis-2")) == ([0, 1], [1])
 
 
 def test_a_twin_that_does_not_answer_is_not_waited_for_for_ever(server: Mosquitto) -> None:

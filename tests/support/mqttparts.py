@@ -129,7 +129,7 @@ def kept(store: Store, servo: str = "axis-1") -> list[int]:
 
 
 def refusals(running: Twin) -> dict[str, int]:
-    return {code: number for (code,), number in running.metrics.rejected.values.items()}
+    return {code: number for (code,), number in running.metrics.rejected.values.items() if number}
 
 
 def raw(server: Mosquitto, topic: str, payload: bytes) -> None:

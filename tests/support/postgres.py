@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import psycopg
+from mosquitto import free_port
 from servers import needed
 
 PATIENCE_S = 60.0
@@ -23,6 +24,7 @@ class Server(NamedTuple):
 
     folder: Path
     user: str
+    port: int = 5432
 
     def database(self, name: str, language: str = "") -> str:
         """A new, empty database; its URL. With a `language` (of ICU) it sorts as people there do."""
@@ -45,12 +47,15 @@ class Server(NamedTuple):
         return True
 
     def _parameters(self, name: str) -> str:
-        return f"host={self.folder} user={self.user} dbname={name}"
+        return f"host={self.folder} port={self.port} user={self.user} dbname={name}"
 
 
 @contextlib.contextmanager
-def running() -> Iterator[Server]:
-    """A server, until the block ends. It refuses to run as root, who therefore starts it as user postgres."""
+def running(certificate: tuple[Path, Path] | None = None) -> Iterator[Server]:
+    """A server, until the block ends. It refuses to run as root, who therefore starts it as user postgres.
+
+    With a `certificate` and its key it also listens at 127.0.0.1, over TLS.
+    """
     initdb = needed("initdb")
     user = "postgres" if os.geteuid() == 0 else None
     folder = Path(tempfile.mkdtemp(prefix="pg-"))
@@ -69,7 +74,11 @@ def running() -> Iterator[Server]:
         }
         make = [initdb, "--no-sync", "--auth=trust", "--username=postgres", "--encoding=UTF8", "--locale=C"]
         subprocess.run([*make, folder / "data"], check=True, timeout=PATIENCE_S, **silent, **started)
-        settings = [word for name, value in OPTIONS.items() for word in ("-c", f"{name}={value}")]
+        options = dict(OPTIONS)
+        if certificate is not None:
+            options |= _tls(certificate, folder, user)
+            server = server._replace(port=int(options["port"]))
+        settings = [word for name, value in options.items() for word in ("-c", f"{name}={value}")]
         command = [initdb.with_name("postgres"), "-D", folder / "data", "-k", folder, *settings]
         process = subprocess.Popen(command, start_new_session=True, **silent, **started)
         _wait(server, process)
@@ -78,6 +87,17 @@ def running() -> Iterator[Server]:
         if process is not None:
             _end(process)
         shutil.rmtree(folder)
+
+
+def _tls(certificate: tuple[Path, Path], folder: Path, user: str | None) -> dict[str, str]:
+    """Options with which a server does TLS; it demands that its key is its own user's, and private."""
+    copies = [Path(shutil.copy(file, folder)) for file in certificate]
+    for file in copies:
+        file.chmod(0o600)
+        if user:
+            shutil.chown(file, user, user)
+    names = {"ssl": "on", "ssl_cert_file": str(copies[0]), "ssl_key_file": str(copies[1])}
+    return {"listen_addresses": "127.0.0.1", "port": str(free_port()), **names}
 
 
 def _wait(server: Server, process: subprocess.Popen[bytes]) -> None:

@@ -33,7 +33,7 @@ def twin_file(folder: Path, service: str = "", tokens: bool = True, servos: str 
     if tokens:
         result = Verifiers({"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}, {"me": verifier_of(OPERATOR)})
         write_tokens(folder / "tokens.toml", result)
-        service += '\ntokens = "tokens.toml"'
+        service = f'tokens = "tokens.toml"\n{service}'
     path.write_text(f"[service]\nport = 0\nworkers = 1\n{service}\n{servos}")
     return path
 

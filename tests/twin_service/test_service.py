@@ -30,6 +30,7 @@ from servotwin.messages.codec import compress
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import WorkResult
 from servotwin.twin_service.auth import read_tokens, write_tokens
+from servotwin.twin_service.limits import RateLimiter
 from servotwin.twin_service.service import TwinService
 
 Body = Callable[[TwinService, httpx.AsyncClient], Coroutine[Any, Any, None]]
@@ -224,6 +225,35 @@ def test_a_servo_that_sends_too_much_waits(serving):
         assert (await put(client, window(0, "ax-2"), OTHER)).status_code == 201
 
     serving(body, "rate_limit_per_s = 0.001\nrate_burst = 3.0")
+
+
+def test_a_servo_that_fills_the_disk_waits_and_what_is_known_already_costs_nothing(serving):
+    size = len(encode(window(0)))
+
+    async def body(system, client):
+        times = iter((0.0,) * 100)
+        disk = RateLimiter(size / 3600.0, 3.5 * size, lambda: next(times), "bytes to be stored")
+        system.ingest._disk = disk
+        for sequence in (0, 0, 0, 1, 1, 2):
+            assert (await put(client, window(sequence))).status_code in (200, 201)
+        answer = await put(client, window(3))
+        assert code(answer) == (429, "too_many")
+        assert "bytes to be stored" in answer.json()["detail"]
+        times = iter((1900.0,) * 100)  # half an hour later there is room again
+        assert (await put(client, window(3))).status_code == 201
+        assert code(await put(client, window(4))) == (429, "too_many")
+
+    serving(body)
+
+
+def test_a_window_of_too_many_samples_is_refused_before_a_worker_gets_it(serving):
+    async def body(system, client):
+        assert (await put(client, window(0, samples=200))).status_code == 201
+        answer = await put(client, window(1, samples=201))
+        assert code(answer) == (413, "too_large")
+        assert "201 samples; at most 200" in answer.json()["detail"]
+
+    serving(body, "samples_per_window = 200")
 
 
 def test_a_full_queue_and_a_store_that_cannot_write_are_temporary_refusals(serving):

@@ -16,6 +16,7 @@ from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import Refusal
+from servotwin.runtime.prometheus import metric_lines
 from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.auth import Verifiers, read_secret, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
@@ -173,16 +174,23 @@ def test_an_incomplete_body_is_discarded_and_too_many_at_once_are_refused():
     assert bodies.buffered == 0
 
 
+def lines_of(metric):
+    head, kind, *lines = metric_lines(metric.name, metric.kind, metric.help, metric.samples())
+    assert (head, kind) == (f"# HELP {metric.name} {metric.help}", f"# TYPE {metric.name} {metric.kind}")
+    return lines
+
+
 def test_metrics_are_prometheus_text():
     count, metrics = Counter("a_total", "How many.", "kind", "put"), Metrics()
     count.add('w"\n\\', "new", by=2)
-    assert list(count.lines()) == ['a_total{kind="w\\"\\n\\\\",put="new"} 2']
-    assert list(Gauge("g", "Now.", lambda: {"x": 1.5}, "of").lines()) == ['g{of="x"} 1.5']
+    assert lines_of(count) == ['a_total{kind="w\\"\\n\\\\",put="new"} 2']
+    assert lines_of(Gauge("g", "Now.", lambda: {"x": 1.5}, "of")) == ['g{of="x"} 1.5']
+    assert lines_of(Counter("k", "Known.", "why", known=("a", "b"))) == ['k{why="a"} 0', 'k{why="b"} 0']
     histogram = Histogram("h", "Times.", (0.1, 1.0))
     for value in (0.05, 0.1, 0.5, 7.0):
         histogram.observe(value)
     lines = ['h_bucket{le="0.1"} 2', 'h_bucket{le="1"} 3', 'h_bucket{le="+Inf"} 4', "h_sum 7.65", "h_count 4"]
-    assert list(histogram.lines()) == lines
+    assert lines_of(histogram) == lines
     metrics.add_gauge("w", "Watched.", lambda: True)
     text = metrics.text()
     assert text.endswith("# HELP w Watched.\n# TYPE w gauge\nw 1\n")

@@ -21,6 +21,7 @@ from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
+from notify_socket import listening
 from service_system import (
     MSGPACK,
     OPERATOR,
@@ -95,8 +96,17 @@ def children(pid: int) -> list[int]:
 
 
 @pytest.mark.slow
-def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_order(tmp_path):
+def test_a_window_is_processed_to_the_end_and_a_signal_stops_the_service_in_order(tmp_path, monkeypatch):
+    with listening() as heard:
+        monkeypatch.setenv("NOTIFY_SOCKET", str(heard.path))
+        monkeypatch.setenv("WATCHDOG_USEC", "400000")
+        process_a_window_and_stop(tmp_path, heard)
+        assert (heard.received()[0], heard.states[-1]) == ("READY=1", "STOPPING=1")
+
+
+def process_a_window_and_stop(tmp_path, heard):
     with process(twin_file(tmp_path)) as (running, url):
+        heard.wait_for("WATCHDOG=1", 2)
         with httpx.Client(base_url=url, timeout=PATIENCE) as client:
             assert send(client, 0).status_code == 201
             links = until(

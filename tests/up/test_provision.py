@@ -2,8 +2,10 @@
 
 import json
 import re
+import sqlite3
 import stat
 import threading
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 
 import httpx
@@ -21,6 +23,8 @@ from servotwin.edge_process.config import token_of
 from servotwin.edge_process.config_file import load
 from servotwin.link.seal import verifier_of
 from servotwin.messages import encode
+from servotwin.store.records import Incoming, MessageKind
+from servotwin.store.soundness import message_digest
 from servotwin.store.store import open_store
 from servotwin.twin_service.auth import read_tokens
 from servotwin.up import enrolment
@@ -150,9 +154,29 @@ def test_an_operator_reads_what_the_service_and_its_store_know(tmp_path, monkeyp
     gone = run("audit", "ax-1", "--url", url, "--token", token)
     assert gone.exit_code == 2
     assert gone.stderr.count("\n") == 1
-    unknown = run("audit", "ax-9", "--config", twin)
-    assert unknown.exit_code == 2
-    assert "ax-9" in unknown.stderr
+
+
+def test_a_servo_that_nobody_knows_is_told_from_one_without_windows_and_a_store_is_checked(tmp_path):
+    twin = twin_file(tmp_path)
+    store = open_store(f"sqlite:///{tmp_path / 'twin.db'}")
+    store.put([Incoming("ax-1", MessageKind.LETTER, "k", b"body", "", message_digest(b"body"), 1.0)])
+    store.close()
+    for command in ("audit", "replay"):
+        unknown = run(command, "ax-l", "--config", twin)
+        assert unknown.exit_code == 2
+        said = "servo 'ax-l': has never sent a message to this twin (did you mean 'ax-1'?)"
+        assert said in " ".join(unknown.stderr.split())
+    silent = run("audit", "ax-1", "--config", twin)
+    assert (silent.exit_code, "has sent messages, but no window yet" in silent.stderr) == (2, True)
+    checked = run("twin", "check", "--config", twin)
+    assert (checked.exit_code, "is sound (1 messages agree" in checked.stdout) == (0, True), checked.output
+    database = sqlite3.connect(tmp_path / "twin.db")
+    with closing(database), database:
+        database.execute("UPDATE bodies SET body = x'00'")
+    damaged = run("twin", "check", "--config", twin)
+    assert damaged.exit_code == 2
+    assert "is damaged" in damaged.stderr
+    assert "restore a backup" in " ".join(damaged.stderr.split())
 
 
 def test_a_store_is_backed_up_and_restored(tmp_path):

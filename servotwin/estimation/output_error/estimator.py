@@ -10,13 +10,15 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
-from servotwin.estimation.output_error.fit import Problem, Search, search
+from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
+from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
@@ -32,6 +34,7 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
+_NEAR = 5  # samples
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -110,7 +113,19 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
         theta_m = _smooth(theta_m, _CUT * own / (2.0 * math.pi), window.sample_rate) if at_motor > 0.0 else theta_m
     priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
     model: MotionModel = ShaftModel(axis, priors) if free else PlayModel(axis, priors)
-    return Problem(model, axis.p * theta_m, window.position, interval, math.hypot(axis.p * at_motor, at_load))
+    count = math.hypot(axis.p * at_motor, at_load)
+    # Play does not depend on time: samples of a rest repeat one error, which the fit would take for many small ones.
+    told = slice(None) if free else _moving(theta_m, window.position)
+    return Problem(model, axis.p * theta_m[told], window.position[told], interval, count)
+
+
+def _moving(theta_m: Array, position: Array) -> NDArray[np.bool_]:
+    """(N,) samples near one at which a channel changes; all where these are too few."""
+    changes = np.zeros(theta_m.size)
+    changes[1:] = (np.diff(theta_m) != 0.0) | (np.diff(position) != 0.0)
+    near = np.convolve(changes, np.ones(2 * _NEAR + 1), "same") > 0.0
+    near[: _NEAR + 1] = near[-_NEAR:] = True
+    return near if np.count_nonzero(near) >= SHORTEST else np.ones(theta_m.size, dtype=bool)
 
 
 def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:

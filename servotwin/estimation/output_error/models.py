@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,9 @@ from servotwin.plant.structure import chain
 _FASTEST = 1.2  # of a sample: the largest rate of the flow times the interval, for the Taylor series to converge
 _EXPONENTIAL = 20  # terms of the series, for a norm below one
 _RELAXED = 12.0  # a shaft that relaxes faster than that in a sample is taken as relaxed
+
+
+Flags: TypeAlias = NDArray[np.bool_]
 
 
 class Motion(NamedTuple):
@@ -50,13 +53,23 @@ class Unknown(NamedTuple):
     unit: str
 
 
-class MotionModel(Protocol):
-    """Model of a window: its unknowns and its motion. The first two unknowns are half gap and offset, at the load."""
+class FittedModel(Protocol):
+    """Model of a window: its unknowns, of which the first is the half gap at the load, and its observer's rate, 1/s.
+
+    `slowing`: rates of the observer in the second fits and in the last ones, over the first.
+    """
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]: ...
     @property
     def speed(self) -> float: ...
+    @property
+    def slowing(self) -> tuple[float, float]: ...
+
+
+class MotionModel(FittedModel, Protocol):
+    """Model of the load's motion. The first two unknowns are half gap and offset, at the load."""
+
     def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion: ...
     def start(self, half: float, offset: float, first: tuple[float, float]) -> Array: ...
 
@@ -84,6 +97,40 @@ def _common(priors: Priors) -> tuple[Unknown, ...]:
     )
 
 
+class PreparedShaft(NamedTuple):
+    """Numbers of a simulation of `ShaftModel`, as `run_shaft` takes them.
+
+    Attributes
+    ----------
+    drive : (M,) array
+        Motor at the load, `fine` times as dense as the samples; `interval` (s) lies between two of it.
+    interval : float
+    fine : int
+    half : float
+        Half gap.
+    matrices : tuple
+        Flows, steps and the force's row.
+    friction : float
+    state : array
+        At the first sample; a simulation changes it.
+    zero : float
+        Offset of the position.
+    """
+
+    drive: Array
+    interval: float
+    fine: int
+    half: float
+    matrices: tuple[Array, Array, Array]
+    friction: float
+    state: Array
+    zero: float
+
+    def scratch(self) -> Array:
+        """Room for the Taylor series of the flow."""
+        return np.empty((18 + 14 // self.state.size, self.state.size))
+
+
 @dataclass(frozen=True)
 class ShaftModel:
     """Chain of masses behind an elastic shaft that is free in the gap."""
@@ -95,6 +142,11 @@ class ShaftModel:
     def speed(self) -> float:
         """Rate of the first observer, 1/s: the shaft's own frequency."""
         return math.sqrt(self.axis.transmission.k_d / self.axis.load.m[0])
+
+    @property
+    def slowing(self) -> tuple[float, float]:
+        """Slower fits see more of the load's slow motion."""
+        return 0.5, 0.15
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
@@ -127,11 +179,8 @@ class ShaftModel:
         values[-2 * n : -n], values[-n:] = first
         return values
 
-    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
-        """Motion under the motor's motion (N,) at the load, for unknowns (u,).
-
-        With a `rate` (1/s) above 0 an observer of that speed pulls the last mass towards the measured position (N,).
-        """
+    def prepared(self, drive: Array, interval: float, values: Array) -> PreparedShaft:
+        """The numbers of a simulation under the motor's motion (N,) at the load, for unknowns (u,)."""
         n = self.axis.n
         named = {unknown.name: value for unknown, value in zip(self.unknowns, values.tolist(), strict=True)}
         factors = tuple(
@@ -150,30 +199,41 @@ class ShaftModel:
         if fine > 1:
             at = np.arange((driven.size - 1) * fine + 1) / fine
             driven = np.interp(at, np.arange(driven.size), driven)
-        state = np.concatenate([values[-2 * n :], [values[-2 * n], 0.0, 1.0]])
-        out, sides = np.empty((3, driven.size)), np.empty(driven.size, dtype=np.int8)
-        work = np.empty((18 + 14 // state.size, state.size))
-        half = math.exp(named["ratio"]) * abs(named["half gap"])
-        zero = named.get("position offset", 0.0)
         friction = math.exp(named.get("load friction", 0.0)) * self.axis.load.friction / self.axis.load.m[-1]
-        gains = 2.0 * rate * interval, rate * rate * interval
-        run_shaft(
+        return PreparedShaft(
             driven,
             interval / fine,
-            half,
-            flows,
-            steps,
-            push,
-            measured - zero,
-            gains,
+            fine,
+            math.exp(named["ratio"]) * abs(named["half gap"]),
+            (flows, steps, push),
             friction * interval / fine,
-            work,
-            state,
+            np.concatenate([values[-2 * n :], [values[-2 * n], 0.0, 1.0]]),
+            named.get("position offset", 0.0),
+        )
+
+    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
+        """Motion under the motor's motion (N,) at the load, for unknowns (u,).
+
+        With a `rate` (1/s) above 0 an observer of that speed pulls the last mass towards the measured position (N,).
+        """
+        made = self.prepared(drive, interval, values)
+        out, sides = np.empty((3, made.drive.size)), np.empty(made.drive.size, dtype=np.int8)
+        gains = 2.0 * rate * interval, rate * rate * interval
+        run_shaft(
+            made.drive,
+            made.interval,
+            made.half,
+            *made.matrices,
+            measured - made.zero,
+            gains,
+            made.friction,
+            made.scratch(),
+            made.state,
             out,
             sides,
         )
-        position, velocity, end = out[:, ::fine]
-        return Motion(position + zero, velocity, end, sides[::fine])
+        position, velocity, end = out[:, :: made.fine]
+        return Motion(position + made.zero, velocity, end, sides[:: made.fine])
 
 
 @lru_cache(maxsize=64)
@@ -197,11 +257,11 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
     flows[:, 2 * n - 1, 2 * n + 2] = force * load.force / masses[-1]
     fastest = max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
     fine = max(1, math.ceil(fastest * interval / _FASTEST))
-    steps = np.array([_exponential(flow * interval / fine) for flow in flows])
+    steps = np.array([exponential(flow * interval / fine) for flow in flows])
     return flows, steps, push, fine
 
 
-def _exponential(matrix: Array) -> Array:
+def exponential(matrix: Array) -> Array:
     """Exponential of a small matrix by its series, scaled and squared: scipy's starts threads for it."""
     halvings = max(0, math.ceil(math.log2(max(1e-300, float(np.abs(matrix).sum(axis=1).max())))))
     part = matrix / 2.0**halvings
@@ -225,6 +285,11 @@ class PlayModel:
     def speed(self) -> float:
         """No observer."""
         return 0.0
+
+    @property
+    def slowing(self) -> tuple[float, float]:
+        """Any."""
+        return 1.0, 1.0
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:

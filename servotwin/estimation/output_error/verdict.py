@@ -6,9 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
-from servotwin.estimation.output_error.fit import Fit, Search, one_flank
+from servotwin.estimation.output_error.fit import Search, one_flank
 from servotwin.estimation.output_error.models import HALF
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.plant.signals import Array
@@ -52,10 +53,9 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFi
     """Decide on a fit; `unit` is the total gap at the motor (rad) per half gap at the load, for the words."""
     best, problem = found.best, found.problem
     half = float(best.values[HALF])
-    std = settings.calibration * best.std(HALF, found.free)
-    # The fit's gap is that of whenever the motor crossed it.
-    grown = settings.gap_rate / unit * problem.interval * problem.position.size * _EVENLY
-    total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count, grown)
+    std = settings.calibration * math.hypot(best.std(HALF, found.free), rounded(found))
+    growth = grown(found, settings.gap_rate / unit)
+    total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count, growth)
     mismatches = _mismatches(found)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)
@@ -100,6 +100,14 @@ def _mismatches(found: Search) -> tuple[str, ...]:
     share = _slow(best.raw) / variation if variation > 0.0 else math.inf
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
+    sentences += unusual_numbers(found)
+    sentences += differing_halves(found)
+    return tuple(sentences)
+
+
+def unusual_numbers(found: Search) -> tuple[str, ...]:
+    """List the numbers of the model that would have to be far off what is known of them."""
+    best, problem, sentences = found.best, found.problem, list[str]()
     limits = problem.limits()
     for i, unknown in enumerate(problem.model.unknowns):
         size = abs(float(best.values[i]))
@@ -108,10 +116,14 @@ def _mismatches(found: Search) -> tuple[str, ...]:
             late = unknown.unit == "time"
             change = f"{1e3 * best.values[i]:+.3g} ms" if late else f"{100.0 * math.expm1(best.values[i]):+.2g} %"
             sentences.append(f"the {unknown.name} would be off by {change}")
-    apart = _between_halves(best, found)
-    if apart > _APART:
-        sentences.append(f"the gaps of the window's halves are {apart:.2g} standard deviations apart")
     return tuple(sentences)
+
+
+def differing_halves(found: Search) -> tuple[str, ...]:
+    """Sentence for a window whose halves show different gaps."""
+    difference, spread = between_halves(found)
+    apart = abs(difference) / spread
+    return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > _APART else ()
 
 
 def _slow(raw: Array) -> float:
@@ -121,24 +133,63 @@ def _slow(raw: Array) -> float:
     return math.sqrt(max(0.0, left - _CHANCE * 0.5 * float(np.mean(np.diff(raw) ** 2)) / size))
 
 
-def _between_halves(fit: Fit, found: Search) -> float:
-    """Difference of the gap between the halves of a window, linearised, in its standard deviations."""
-    data = fit.raw.size
-    middle = data // 2
+def influence(found: Search, keep: NDArray[np.intp]) -> tuple[float, float, float]:
+    """Change of the half gap that some of the residuals ask for, linearised, its std, and that of rounding.
+
+    Samples that show the same count have the same error: noise averages out over them, rounding does not. The second
+    and third are inf where these residuals do not show the gap.
+    """
+    fit, problem = found.best, found.problem
     places = np.flatnonzero(found.free)
-    at = int(np.flatnonzero(places == HALF)[0])
-    gaps, spreads = [], []
-    for part in (slice(0, middle), slice(middle, data)):
-        keep = np.r_[part, data : fit.residual.size]
-        rows, residual = fit.rows[np.ix_(places, keep)], fit.residual[keep]
-        size = np.linalg.norm(rows, axis=1)
-        size[size == 0.0] = 1.0
-        scaled = rows / size[:, None]
-        inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)
-        gaps.append(-float(inverse[at] @ (scaled @ residual)) / size[at])
-        spreads.append(math.sqrt(max(0.0, inverse[at, at]) * fit.variance()) / size[at])
-    joint = math.hypot(*spreads, _ROUNDED * found.problem.count)
-    return abs(gaps[0] - gaps[1]) / joint if min(spreads) > 0.0 else 0.0
+    at, data = int(np.flatnonzero(places == HALF)[0]), fit.raw.size
+    rows = fit.rows[np.ix_(places, keep)]
+    size = np.linalg.norm(rows, axis=1)
+    size[size == 0.0] = 1.0
+    scaled = rows / size[:, None]
+    inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)
+    if not inverse[at, at] > 0.0:
+        return 0.0, math.inf, math.inf
+    weights = -(inverse[at] @ scaled) / size[at]
+    white = np.zeros(data)
+    seen = keep < data
+    white[keep[seen]] = weights[seen]
+    # Back from the whitened residual to the samples: the whitening filter, transposed.
+    filtered = np.convolve(white[::-1], found.noise.predictors[-1])[:data][::-1] / found.noise.spread[-1]
+    margin = (problem.position.size - data) // 2
+    begins = np.flatnonzero(np.diff(problem.position[margin : margin + data])) + 1
+    sums = np.add.reduceat(filtered, np.concatenate([[0], begins]))
+    rounding = problem.count * _EVENLY * float(np.linalg.norm(sums))
+    std = math.sqrt(inverse[at, at] * fit.variance()) / size[at]
+    return float(weights @ fit.residual[keep]), std, rounding
+
+
+def rounded(found: Search) -> float:
+    """Standard deviation of the half gap that the rounding of the encoders makes."""
+    rounding = influence(found, np.arange(found.best.residual.size))[2]
+    return rounding if math.isfinite(rounding) else 0.0
+
+
+def between_halves(found: Search) -> tuple[float, float]:
+    """Difference of the half gap between the second and the first half of a window, linearised, and its std.
+
+    The standard deviation is inf where a half does not show the gap.
+    """
+    data = found.best.raw.size
+    prior = np.arange(data, found.best.residual.size)
+    parts = np.array_split(np.arange(data), 2)
+    (one, *first), (two, *second) = (influence(found, np.concatenate([part, prior])) for part in parts)
+    return two - one, math.hypot(*first, *second, _ROUNDED * found.problem.count)
+
+
+def grown(found: Search, rate: float) -> float:
+    """Standard deviation of the half gap that its growth makes: the fit's is that of whenever the motor crossed it.
+
+    The growth within the window is as likely as a `rate` (1/s, of the half gap) says, or what the halves of the window
+    show of it, whichever is less: the rate may be a mere assumption.
+    """
+    duration = found.problem.interval * found.problem.position.size
+    apart, spread = between_halves(found)
+    return _EVENLY * min(rate * duration, 2.0 * math.hypot(apart, _DOUBT * spread))
 
 
 def _deg(angle: float) -> str:

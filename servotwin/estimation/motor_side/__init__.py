@@ -1,0 +1,11 @@
+"""Estimator of the gap from the motor's encoder and the command alone, of axes whose shaft is free in the gap."""
+
+from servotwin.estimation.motor_side.estimator import (
+    METHOD,
+    MotorSideSettings,
+    check_reaction,
+    estimate,
+    shortest_window,
+)
+
+__all__ = ["METHOD", "MotorSideSettings", "check_reaction", "estimate", "shortest_window"]

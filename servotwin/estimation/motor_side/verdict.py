@@ -1,0 +1,104 @@
+"""Verdict on a fit from the motor's side: status, reasons and spread of a gap."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.estimation.estimate import NORMAL_95, GapStatus
+from servotwin.estimation.motor_side.settings import MotorSideSettings
+from servotwin.estimation.output_error.fit import Fit, Search, descend, one_flank
+from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.verdict import differing_halves, grown, unusual_numbers
+
+_BELIEVED = 60.0  # rise of the cost without the gap, or without the second flank, over the noise's variance
+_RIVAL = 30.0  # the same of another gap that explains the window as well
+_DOUBT = 3.0  # interval over the computed one: friction is not as modelled
+_MISLED = 0.2  # of what the gap does not explain: error of the gap that a wrong model makes
+_ROUNDED = 0.5  # of a count: standard deviation of an error that does not average out
+_AROUND = (0.01, 0.03, 0.08, 0.2)  # of a gap, either way: where the cost is looked at
+_STEPS = 5
+
+
+@dataclass(frozen=True)
+class JudgedGap:
+    """Status of a gap with its spread, all of the half gap at the load.
+
+    Attributes
+    ----------
+    status : GapStatus
+    half, std, std_total : float
+    reasons : tuple of str
+    """
+
+    status: GapStatus
+    half: float = math.nan
+    std: float = math.inf
+    std_total: float = math.inf
+    reasons: tuple[str, ...] = ()
+
+
+def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedGap:
+    """Decide on a fit; `unit` is the total gap at the motor (rad) per half gap at the load, for the words."""
+    best, problem = found.best, found.problem
+    half = float(best.values[HALF])
+    shut = _shut(found)
+    left = float(np.std(best.raw) / np.std(shut.raw))
+    if reason := _unseen(found, shut, left, settings):
+        return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=(reason,))
+    mismatches = unusual_numbers(found) + differing_halves(found)
+    if mismatches:
+        return JudgedGap(GapStatus.MODEL_MISMATCH, reasons=mismatches)
+    std = best.std(HALF, found.free)
+    if math.isinf(std):
+        return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=("the measurements do not depend on the gap",))
+    rivals = _rivals(found, half) / NORMAL_95
+    model = math.hypot(settings.model_share, _MISLED * left) * half
+    total = math.hypot(
+        _DOUBT * std, rivals, model, 0.5 * _ROUNDED * problem.count, grown(found, settings.gap_rate / unit)
+    )
+    allowed = max(settings.largest_share * half, 0.5 * settings.counts * problem.count)
+    if math.hypot(_DOUBT * std, rivals) > allowed:
+        known, limit = math.degrees(unit * math.hypot(_DOUBT * std, rivals)), math.degrees(unit * allowed)
+        words = f"the gap is known to {known:.3g} deg only, and {limit:.3g} deg are allowed"
+        return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=(words,))
+    return JudgedGap(GapStatus.OK, half, std, total)
+
+
+def _shut(found: Search) -> Fit:
+    """The best fit without a gap."""
+    free, values = found.free.copy(), found.best.values.copy()
+    free[HALF], values[HALF] = False, 0.0
+    rate = found.problem.model.slowing[1] * found.problem.model.speed
+    return descend(found.problem, values, found.noise, free, 2 * _STEPS, rate)
+
+
+def _unseen(found: Search, shut: Fit, left: float, settings: MotorSideSettings) -> str:
+    """Reason for which the motor does not show the gap; empty: none."""
+    best = found.best
+    if (shut.cost - best.cost) / best.variance() < _BELIEVED:
+        return "the motor feels no gap: friction, noise and counts hide it, or there is none"
+    if (one_flank(found)[0].cost - best.cost) / best.variance() < _BELIEVED:
+        return "one flank explains what the motor feels nearly as well as two"
+    if left > settings.explained:
+        return (
+            f"the gap explains too little of what the motor feels: {100.0 * left:.0f} % is left, against a model "
+            f"without a gap, {100.0 * settings.explained:.0f} % is allowed; friction dominates, or the model is wrong"
+        )
+    return ""
+
+
+def _rivals(found: Search, half: float) -> float:
+    """Distance of the farthest half gap that explains the window nearly as well."""
+    best, free = found.best, found.free.copy()
+    free[HALF] = False
+    rate = found.problem.model.slowing[1] * found.problem.model.speed
+    limit = best.cost + _RIVAL * best.variance()
+    fits = [fit for fit in found.others if fit.cost < limit]
+    for share in (each * sign for each in _AROUND for sign in (-1.0, 1.0)):
+        values = best.values.copy()
+        values[HALF] = half * (1.0 + share)
+        fits.append(descend(found.problem, values, found.noise, free, _STEPS, rate))
+    return max((abs(float(fit.values[HALF]) - half) for fit in fits if fit.cost < limit), default=0.0)

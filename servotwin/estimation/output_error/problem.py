@@ -1,0 +1,132 @@
+"""A window with a model of it, and the grid of starts of its fit."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, RATIO, Flags, Motion, MotionModel
+from servotwin.plant.signals import Array
+
+LARGEST = 4.0  # standard deviations by which an unknown may move
+_LARGEST_DELAY = 0.03  # of the window
+_HALVES = (0.5, 0.4, 0.3, 0.22, 0.15, 0.1, 0.06, 0.03, 0.015, 0.005)  # of the lead's range
+_PLACES = tuple(0.1 * step for step in range(-5, 6))  # of the lead's range
+_WIDE = 5.0  # of the lead's range
+_MOVED = 0.02  # of the window: what shows the first speed
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """A window and a model of it.
+
+    Attributes
+    ----------
+    model : MotionModel
+    drive, position : (N,) arrays
+        Motor's angle times the transmission's ratio, and measured position; m or rad.
+    interval : float
+        s.
+    count : float
+        One count of either channel, seen at the load.
+    """
+
+    model: MotionModel
+    drive: Array
+    position: Array
+    interval: float
+    count: float
+
+    @property
+    def lead(self) -> Array:
+        """(N,) motor before the load."""
+        return np.asarray(self.drive - self.position)
+
+    @property
+    def range(self) -> float:
+        """Of the lead."""
+        return float(np.ptp(self.lead))
+
+    @property
+    def margin(self) -> int:
+        """Samples at either end that do not count, because of the delay."""
+        return 1 + math.ceil(self.largest_delay / self.interval)
+
+    @property
+    def largest_delay(self) -> float:
+        """s."""
+        known = LARGEST * self.model.unknowns[DELAY].std
+        return min(known, _LARGEST_DELAY * self.interval * self.drive.size)
+
+    def sizes(self) -> Array:
+        """(u,) usual sizes of the unknowns."""
+        own = self.interval * self.drive.size
+        sizes = {"load": self.range, "speed": self.range / own, "time": self.interval, "factor": 1.0, "damping": 1.0}
+        return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
+
+    def limits(self) -> Array:
+        """(u,) largest sizes of the unknowns."""
+        limits = np.array([LARGEST * unknown.std for unknown in self.model.unknowns])
+        limits[DELAY] = self.largest_delay
+        return limits
+
+    def motion(self, values: Array, rate: float = 0.0) -> Motion:
+        """Simulate the window; `rate` (1/s) of the observer, 0: none.
+
+        The motor's angle is delayed in place of the position: the load's motion begins with the first sample.
+        """
+        drive = delayed(self.drive, float(values[DELAY]) / self.interval)
+        return self.model.simulate(drive, self.position, self.interval, values, rate)
+
+    def misfit(self, values: Array, rate: float = 0.0) -> Array:
+        """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
+        part = slice(self.margin, self.drive.size - self.margin)
+        return np.asarray((self.motion(values, rate).position - self.position)[part])
+
+    def first(self) -> tuple[float, float]:
+        """First position and speed of the load, by a line through the first samples."""
+        size = max(8, round(_MOVED * self.position.size))
+        slope, value = np.polyfit(self.interval * np.arange(size), self.position[:size], 1)
+        return float(value), float(slope)
+
+    @property
+    def free(self) -> Flags:
+        """(u,) unknowns that are fitted: all."""
+        return np.ones(len(self.model.unknowns), dtype=bool)
+
+    def grid(self, gap: float) -> list[list[Array]]:
+        """Unknowns (u,) to begin with, a list for each half gap: `gap` is an expected one at the load, 0: none."""
+        lead, reach, first = self.lead, self.range, self.first()
+        middle = -0.5 * float(lead.max() + lead.min())
+        halves = [share * reach for share in _HALVES] + ([gap] if gap > 0.0 else [])
+        return [[self.model.start(half, middle + place * reach, first) for place in _PLACES] for half in halves]
+
+    def on_one_flank(self, values: Array) -> list[list[Array]]:
+        """Unknowns (u,) of a gap whose other flank is out of reach, a list for each flank, the lower one first."""
+        wide, middle = _WIDE * self.range, -0.5 * float(self.lead.max() + self.lead.min())
+        tables = []
+        for side in (-1.0, 1.0):
+            tried = [values.copy() for _ in _PLACES]
+            for each, place in zip(tried, _PLACES, strict=True):
+                each[HALF], each[OFFSET] = wide, middle + place * self.range + side * wide
+            tables.append(tried)
+        return tables
+
+    def off_flank(self, values: Array, side: float, rate: float) -> float:
+        """Largest way (m or rad at the load) of the motor off the flank on a side, that of `on_one_flank`."""
+        driven = math.exp(values[RATIO]) * self.drive + values[OFFSET]
+        wide = math.exp(values[RATIO]) * values[HALF]
+        return float(np.max(wide - side * (driven - self.motion(values, rate).driven)))
+
+
+def delayed(drive: Array, samples: float) -> Array:
+    """A signal (N,) that is late by a number of samples, by cubics through four neighbours; its ends last."""
+    if samples == 0.0:
+        return drive
+    at = np.arange(drive.size) - samples
+    whole = np.floor(at).astype(int)
+    t = at - whole
+    a, b, c, d = (drive[np.clip(whole + shift, 0, drive.size - 1)] for shift in (-1, 0, 1, 2))
+    return np.asarray(b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a))))

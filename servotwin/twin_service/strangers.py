@@ -1,0 +1,94 @@
+"""Connections of strangers, which have shown no valid token: bounded in all, and from each address."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Callable
+
+from servotwin.twin_service.auth import AccessControl
+from servotwin.twin_service.config import ServiceConfig
+
+_GRACE_S = 2.0
+"""s in which a client shows its token: after an outage all edges of a network connect at once, from one address."""
+
+
+class StrangerLimit:
+    """Limit of the connections that have shown no valid token.
+
+    Parameters
+    ----------
+    access : AccessControl
+    most, per_address : int
+        Connections in all; and from one address, of those that are older than a grace period.
+    """
+
+    def __init__(self, access: AccessControl, most: int, per_address: int) -> None:
+        self._access, self._most, self._per_address = access, most, per_address
+        self._of = Counter[str]()
+
+    @classmethod
+    def of(cls, config: ServiceConfig, access: AccessControl) -> StrangerLimit | None:
+        """Limit of a service; None where nobody has a token, or where a proxy shares connections among clients."""
+        if config.tokens is None or config.behind_proxy:
+            return None
+        return cls(access, config.strangers, config.strangers_per_address)
+
+    @property
+    def open(self) -> int:
+        """Connections of strangers."""
+        return self._of.total()
+
+    def enter(self, address: str, close: Callable[[], None]) -> Stranger | None:
+        """Count a new connection; None: there are too many, and it has to be closed."""
+        if self.open >= self._most:
+            return None
+        self._of[address] += 1
+        return Stranger(self, address, close)
+
+    def leave(self, address: str) -> None:
+        """Count a connection no longer."""
+        self._of[address] -= 1
+        if not self._of[address]:
+            del self._of[address]
+
+    def exceeded(self, address: str) -> bool:
+        """Test whether an address has more connections than it may."""
+        return self._of[address] > self._per_address
+
+    def knows(self, token: bytes | None) -> bool:
+        """Test whether a token is a servo's or an operator's."""
+        return self._access.knows(token)
+
+
+class Stranger:
+    """One connection, until it shows a token or ends.
+
+    Parameters
+    ----------
+    limit : StrangerLimit
+    address : str
+    close : callable
+        Closes the connection.
+    """
+
+    def __init__(self, limit: StrangerLimit, address: str, close: Callable[[], None]) -> None:
+        self._limit, self._address, self._close = limit, address, close
+        self._counted = True
+        self._timer = asyncio.get_running_loop().call_later(_GRACE_S, self._check)
+
+    def show(self, token: bytes | None) -> None:
+        """Note the token of a request."""
+        if self._counted and self._limit.knows(token):
+            self.leave()
+
+    def leave(self) -> None:
+        """End: it is none any more, or its connection is closed."""
+        if self._counted:
+            self._counted = False
+            self._timer.cancel()
+            self._limit.leave(self._address)
+
+    def _check(self) -> None:
+        if self._limit.exceeded(self._address):
+            self._close()

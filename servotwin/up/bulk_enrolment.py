@@ -1,0 +1,216 @@
+"""Enrolment of many servos from a CSV file: all of its rows, or none."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+
+from servotwin.config.table import did_you_mean
+from servotwin.errors import InvalidInput
+from servotwin.twin_service.auth import write_private, write_tokens
+from servotwin.twin_service.twin_file import read_twin
+from servotwin.up.enrolment import (
+    CERTIFICATE,
+    CONFIG,
+    TOKEN,
+    Enrolment,
+    drive_of,
+    edge_file_text,
+    open_tokens,
+    write_folder,
+)
+
+_ALL = 20
+"""Bad rows that one message lists."""
+
+
+def _number(column: str, scale: float, unit: str, above: bool) -> Callable[[str], float]:
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = -1.0
+        if not (value > 0.0 if above else value >= 0.0) or value == float("inf"):
+            allowed = "above 0" if above else "of 0 or more"
+            raise InvalidInput(f"{column} = {text!r}: give a number {allowed}, in {unit}")
+        return value * scale
+
+    return parse
+
+
+def read_enrolments(path: Path, defaults: Enrolment) -> dict[int, Enrolment]:
+    """Read the requests in a CSV file; its first line names the columns, of which only `name` is required.
+
+    Parameters
+    ----------
+    path : Path
+        Paths in it are relative to its folder.
+    defaults : Enrolment
+        Values of columns that are absent, and of empty cells.
+
+    Returns
+    -------
+    dict of int to Enrolment
+        By the number of the row's line.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read, or some rows are not allowed: one sentence for each, with its line.
+    """
+    columns = _columns(path.parent)
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            reader = csv.reader(file, strict=True)
+            head = [cell.strip() for cell in next(reader, [])]
+            _check_head(path, head, list(columns))
+            requests, faults = dict[int, Enrolment](), dict[int, str]()
+            for row in reader:
+                if not any(cell.strip() for cell in row):
+                    continue
+                line = reader.line_num
+                with _collected(faults, line):
+                    requests[line] = _request(head, row, columns, path.parent, defaults)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InvalidInput(f"{path}: cannot be read as CSV in UTF-8 ({why})") from None
+    for line, fault in _repeated(requests):
+        faults.setdefault(line, fault)
+    _require_none(path, faults)
+    if not requests:
+        raise InvalidInput(f"{path}: has no rows; each row enrolls a servo")
+    return requests
+
+
+def enroll_all(twin_path: Path, source: Path, requests: Mapping[int, Enrolment]) -> list[Path]:
+    """Enrol all servos with the twin of a file, and return the files that were written.
+
+    Every row is checked before anything is written. The tokens become valid together, at the end; where a file cannot
+    be written, all folders are left as they were.
+
+    Parameters
+    ----------
+    twin_path, source : Path
+        The twin's file; the file that the requests are from, for messages.
+    requests : mapping of int to Enrolment
+        By line.
+
+    Raises
+    ------
+    InvalidInput
+        Some rows are not allowed: one sentence for each, with its line; or a file cannot be written.
+    """
+    twin, faults = read_twin(twin_path), dict[int, str]()
+    with open_tokens(twin) as (tokens, known):
+        texts = dict[int, str]()
+        for line, request in requests.items():
+            with _collected(faults, line):
+                texts[line] = edge_file_text(twin, request, known)
+        _require_none(source, faults)
+        with _all_or_nothing(requests.values()):
+            written, verifiers = list[Path](), dict[str, bytes]()
+            for line, request in requests.items():
+                files, verifiers[request.servo] = write_folder(twin, request, texts[line])
+                written += files
+            write_tokens(tokens, replace(known, servos={**known.servos, **verifiers}))
+    return [*written, tokens]
+
+
+_Column = Callable[[str], object]
+
+
+def _columns(folder: Path) -> dict[str, tuple[str, _Column]]:
+    """Field of a request, and parser, for each column."""
+    return {
+        "name": ("servo", str),
+        "edge": ("folder", lambda text: folder / text),
+        "role": ("role", str),
+        "sample_rate_hz": ("sample_rate", _number("sample_rate_hz", 1.0, "Hz", above=True)),
+        "drive": ("drive", lambda text: drive_of(folder / text)),
+        "url": ("url", str),
+        "noise_um": ("noise", _number("noise_um", 1e-6, "um rms", above=False)),
+        "ca": ("ca", lambda text: folder / text),
+    }
+
+
+def _check_head(path: Path, head: list[str], columns: list[str]) -> None:
+    allowed = f"the first line names the columns: {', '.join(columns)}"
+    for name in head:
+        if name not in columns:
+            raise InvalidInput(f"{path}: line 1: column {name!r} is not known{did_you_mean(name, columns)}; {allowed}")
+    if len(set(head)) < len(head) or "name" not in head:
+        raise InvalidInput(f"{path}: line 1: column 'name' is missing, or a column is named twice; {allowed}")
+
+
+def _request(
+    head: list[str], row: list[str], columns: Mapping[str, tuple[str, _Column]], folder: Path, defaults: Enrolment
+) -> Enrolment:
+    if len(row) != len(head):
+        raise InvalidInput(f"has {len(row)} cells; line 1 names {len(head)} columns")
+    cells = {name: cell.strip() for name, cell in zip(head, row, strict=True) if cell.strip()}
+    if "name" not in cells:
+        raise InvalidInput("has no name")
+    values = {columns[name][0]: columns[name][1](cell) for name, cell in cells.items()}
+    return replace(defaults, **{"folder": folder / cells["name"], **values})  # type: ignore[arg-type]
+
+
+def _repeated(requests: Mapping[int, Enrolment]) -> Iterator[tuple[int, str]]:
+    """Rows whose name or folder an earlier row has."""
+    names, folders = dict[str, int](), dict[Path, int]()
+    for line, request in requests.items():
+        if (first := names.setdefault(request.servo, line)) != line:
+            yield line, f"name {request.servo!r}: line {first} has it already"
+        elif (first := folders.setdefault(request.folder.resolve(), line)) != line:
+            yield line, f"edge {request.folder}: line {first} has that folder already"
+
+
+@contextmanager
+def _collected(faults: dict[int, str], line: int) -> Iterator[None]:
+    """Note the fault of a row, and go on with the next one."""
+    try:
+        yield
+    except InvalidInput as error:
+        faults[line] = str(error)
+
+
+def _require_none(path: Path, faults: Mapping[int, str]) -> None:
+    if not faults:
+        return
+    said = [f"line {line}: {fault}" for line, fault in sorted(faults.items())]
+    more = [f"and {len(said) - _ALL} more"] if len(said) > _ALL else []
+    rows = "1 row is" if len(said) == 1 else f"{len(said)} rows are"
+    raise InvalidInput("\n".join([f"{path}: {rows} not allowed, and no servo was enrolled:", *said[:_ALL], *more]))
+
+
+@contextmanager
+def _all_or_nothing(requests: Iterable[Enrolment]) -> Iterator[None]:
+    """Leave the folders of all requests as they were where the block fails."""
+    before = {request.folder: _contents(request.folder) for request in requests}
+    try:
+        yield
+    except BaseException:
+        for folder, contents in before.items():
+            with suppress(OSError, InvalidInput):
+                _put_back(folder, contents)
+        raise
+
+
+def _contents(folder: Path) -> dict[str, bytes | None] | None:
+    """Files that an enrolment writes, as they are, None for one that is missing; None: there is no such folder."""
+    if not folder.exists():
+        return None
+    files = {name: folder / name for name in (CONFIG, TOKEN, CERTIFICATE)}
+    return {name: file.read_bytes() if file.is_file() else None for name, file in files.items()}
+
+
+def _put_back(folder: Path, contents: Mapping[str, bytes | None] | None) -> None:
+    for name in (CONFIG, TOKEN, CERTIFICATE):
+        if contents is None or contents[name] is None:
+            (folder / name).unlink(missing_ok=True)
+    if contents is None:
+        folder.rmdir()
+    elif (token := contents[TOKEN]) is not None:
+        write_private(folder / TOKEN, token.decode())

@@ -1,0 +1,52 @@
+"""What systemd is told, and that nothing of it can stop a service."""
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+from notify_socket import listening
+
+from servotwin.runtime.service_manager import ServiceManager
+
+
+def test_a_service_says_that_it_is_ready_that_it_lives_and_that_it_ends() -> None:
+    with listening() as heard:
+        manager = ServiceManager({"NOTIFY_SOCKET": str(heard.path), "WATCHDOG_USEC": "2000000"})
+        manager.ready()
+        for tenth in range(25):  # 2.5 s, in which a sign of life is due every second
+            manager.alive(100.0 + tenth / 10.0)
+        manager.stopping()
+        assert heard.received() == ["READY=1", "WATCHDOG=1", "WATCHDOG=1", "WATCHDOG=1", "STOPPING=1"]
+
+
+@pytest.mark.parametrize("environment", [{}, {"WATCHDOG_USEC": "0"}, {"WATCHDOG_USEC": "9", "WATCHDOG_PID": "1"}])
+def test_no_sign_of_life_where_none_is_asked_of_this_process(environment: dict[str, str]) -> None:
+    with listening() as heard:
+        manager = ServiceManager({"NOTIFY_SOCKET": str(heard.path), **environment})
+        manager.alive(0.0)
+        manager.stopping()
+        assert heard.received() == ["STOPPING=1"]
+
+
+def test_an_abstract_socket_is_reached() -> None:
+    name = f"servotwin-test-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+        end.bind(f"\0{name}")
+        manager = ServiceManager({"NOTIFY_SOCKET": f"@{name}"})
+        manager.ready()
+        assert end.recv(100) == b"READY=1"
+        manager.stopping()
+
+
+def test_a_full_or_missing_socket_stops_nothing(tmp_path: Path) -> None:
+    for environment in ({"NOTIFY_SOCKET": str(tmp_path / "nobody")}, {}):
+        manager = ServiceManager(environment)
+        manager.ready()
+        manager.stopping()
+    with listening() as heard:
+        manager = ServiceManager({"NOTIFY_SOCKET": str(heard.path)})
+        for _ in range(5000):  # nobody reads: its queue is full after some
+            manager.ready()
+        assert 0 < len(heard.received()) < 5000
+        manager.stopping()

@@ -1,0 +1,108 @@
+"""Connections without a valid token are bounded, in all and per address; those of edges are not."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import pytest
+from service_system import TOKEN, served, twin_file
+
+from servotwin.twin_service import strangers
+from servotwin.twin_service.http_server import HttpServer, listening_socket
+
+Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+Connect = Callable[[str], Awaitable[Stream]]
+PATIENCE = 30.0
+
+
+def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None]]) -> None:
+    """Run a coroutine function against a service behind a socket; it gets a function that connects with a token."""
+
+    async def run() -> None:
+        async with served(twin_file(folder, service)) as (system, _):
+            listener = listening_socket(system.config)
+            server = HttpServer(system.config, system.http_app(), system.polls.close, system.strangers, lambda: True)
+            server.config.lifespan = "off"
+            task = asyncio.create_task(server.serve([listener]))
+            opened: list[asyncio.StreamWriter] = []
+
+            async def connect(token: str) -> Stream:
+                reader, writer = await asyncio.open_connection(*listener.getsockname()[:2])
+                opened.append(writer)
+                head = f"Authorization: Bearer {token}\r\n" if token else ""
+                writer.write(f"GET /v1/servos/ax-1/outgoing HTTP/1.1\r\nHost: twin\r\n{head}\r\n".encode())
+                return reader, writer
+
+            try:
+                await body(connect)
+            finally:
+                for writer in opened:
+                    writer.close()
+                server.should_exit = True
+                await task
+
+    asyncio.run(run())
+
+
+async def answer(reader: asyncio.StreamReader) -> bytes:
+    """First line of an answer; empty where the connection was closed."""
+    try:
+        async with asyncio.timeout(PATIENCE):
+            return await reader.readline()
+    except ConnectionError:
+        return b""
+
+
+async def is_closed(reader: asyncio.StreamReader) -> bool:
+    try:
+        async with asyncio.timeout(PATIENCE):
+            while await reader.read(4096):
+                pass
+    except (TimeoutError, ConnectionError) as error:
+        return isinstance(error, ConnectionError)
+    return True
+
+
+def test_strangers_of_an_address_are_bounded_and_edges_are_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strangers, "_GRACE_S", 0.05)
+
+    async def body(connect: Connect) -> None:
+        edges = [await connect(TOKEN) for _ in range(8)]
+        assert [b"200" in await answer(reader) for reader, _ in edges] == [True] * 8
+        foreign = [await connect(token) for token in ("", "wrong", "", "wrong", "")]
+        for reader, _ in foreign:
+            assert b"401" in await answer(reader)
+        # The first two to be checked go; three are allowed.
+        assert [await is_closed(reader) for reader, _ in foreign[:2]] == [True, True]
+        for reader, writer in (*edges, *foreign[2:]):
+            assert not writer.is_closing()
+            assert not reader.at_eof()
+
+    serving(tmp_path, "strangers_per_address = 3", body)
+
+
+def test_strangers_are_bounded_in_all_and_their_places_become_free(tmp_path: Path) -> None:
+    async def body(connect: Connect) -> None:
+        first, second = await connect(""), await connect("")
+        assert b"401" in await answer(first[0])
+        assert b"401" in await answer(second[0])
+        assert await answer((await connect(TOKEN))[0]) == b""
+        first[1].close()
+        await first[1].wait_closed()
+        async with asyncio.timeout(PATIENCE):
+            while b"200" not in await answer((await connect(TOKEN))[0]):
+                await asyncio.sleep(0.01)
+        for _ in range(5):  # who has shown a token counts no more
+            assert b"200" in await answer((await connect(TOKEN))[0])
+
+    serving(tmp_path, "strangers = 2", body)
+
+
+def test_without_tokens_and_behind_a_proxy_nobody_is_a_stranger(tmp_path: Path) -> None:
+    async def limit(service: str, tokens: bool) -> object:
+        async with served(twin_file(tmp_path, service, tokens)) as (system, _):
+            return system.strangers
+
+    assert asyncio.run(limit("", False)) is None
+    assert asyncio.run(limit("behind_proxy = true", True)) is None
+    assert asyncio.run(limit("", True)) is not None
