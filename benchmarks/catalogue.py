@@ -94,6 +94,18 @@ def read_reference(path: Path) -> Array:
     return expected
 
 
+def two_masses(options: Options) -> Workload:
+    """One long run of a shaft with a gap, alone: no other solver here has its automaton."""
+    duration = options.wear.duration
+    return Workload(
+        "two-mass",
+        f"preset two-mass-drive, {duration:g} s, gap 0 to 0.02 rad, 5 kHz",
+        (ours.two_masses(duration),),
+        (Check("error", "/ 1 mrad", lambda q: _largest(q - ours.refined_two_masses(duration))),),
+        lambda seconds: f"{duration / seconds:,.0f} x real time",
+    )
+
+
 def w2(options: Options) -> Workload:
     """W2: an ensemble of short runs."""
     sweep, threads = options.sweep, cores()
@@ -194,6 +206,7 @@ def start(options: Options) -> Workload:
 
 WORKLOADS: dict[str, Build] = {
     "W1": w1,
+    "two-mass": two_masses,
     "W2": w2,
     "W3": w3,
     "sampled": sampled,

@@ -15,8 +15,9 @@ def bench(
     workloads: Annotated[
         list[str] | None,
         typer.Argument(
-            help="W1, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, hostile, "
-            "policies, loops, certificates, compensation, friction, tick, novelty, triage, fleet, overload, endurance."
+            help="W1, two-mass, W2, W3, sampled, decision, start (all by default); or one of estimator, windows, "
+            "hostile, policies, loops, certificates, compensation, friction, tick, novelty, triage, fleet, overload, "
+            "endurance."
         ),
     ] = None,
     json: Annotated[Path | None, typer.Option(help="Write every run into this .json file.")] = None,

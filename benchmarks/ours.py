@@ -11,6 +11,8 @@ from benchmarks.contest import Contestant
 from benchmarks.workloads import NoisyWorkload, SweepWorkload, WearWorkload
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.axis import Axis
+from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.continuous import ContinuousEngine
 from servotwin.simulation.ensemble import simulate_ensemble
@@ -96,6 +98,37 @@ def sweeping(workload: SweepWorkload, threads: int) -> Contestant:
         )
 
     return Contestant(f"{NAME}, {threads} thread{'s' * (threads > 1)}", lambda: job)
+
+
+def _two_masses(duration: float) -> Simulation:
+    """The preset two-mass-drive under its own law in continuous time, its gap growing to ten times the healthy one."""
+    return Simulation(
+        Axis.preset("two-mass-drive").replace(sample_rate=None),
+        duration,
+        reference=SquareWave(0.2, 0.2 * duration),
+        gap=SCurve(0.0, 0.02, duration),
+        sample_rate=5000.0,
+    )
+
+
+def two_masses(duration: float) -> Contestant:
+    """Two inertias on a shaft with a gap."""
+
+    def run() -> Run:
+        simulation = _two_masses(duration)
+        simulation.advance(simulation.samples - 1)
+        return simulation.run()
+
+    def remark() -> str:
+        return f"{int(run().events.state_triggered.sum())} events"
+
+    return Contestant(NAME, lambda: lambda: run().position, remark=remark)
+
+
+@cache
+def refined_two_masses(duration: float) -> Array:
+    """Its positions (N,) rad from a search for events in steps `REFINED` times shorter."""
+    return _refined(_two_masses(duration))
 
 
 @cache

@@ -11,8 +11,7 @@ from servotwin.analysis.maps.result import StabilityMap
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.analysis.tuning.tune import Specification, Tuning
 from servotwin.analysis.tuning.tune import tune as tune_system
-from servotwin.control.controller import Controller
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import AnyController, filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant.linear import LinearSystem, series
 from servotwin.plant.loop import loop_filter, notch
@@ -77,7 +76,7 @@ def tuned_system(servo: Plant) -> LinearSystem:
 def stability_map(
     servo: Plant,
     *,
-    controller: Controller | None = None,
+    controller: AnyController | None = None,
     tolerance: Sequence[float] | None = None,
     gap: Sequence[float] | None = None,
     k_dz: Sequence[float] = (1.0,),
@@ -98,7 +97,7 @@ def stability_map(
     Parameters
     ----------
     servo : Servo or Axis
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Continuous; the servo's own by default.
     tolerance, gap : sequence of float, optional
         Dead-zone half-width / (p b), b half the gap; total gap, rad.

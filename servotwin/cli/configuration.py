@@ -29,6 +29,7 @@ from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.actuator import ACTUATORS
 from servotwin.plant.axis_file import LOADS, TRANSMISSIONS, controller_keys
+from servotwin.plant.linear_law_file import linear_law
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.twin.model_registry import servo_table
@@ -76,7 +77,7 @@ _TWIN = TableSpec((TwinSettings,), "The twin.", {"estimator": _ESTIMATOR})
 _DRIVES = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in SUPERVISED.items()}
 
 
-def _controller_of(unit: str, motion: str, kind: type = Controller) -> TableSpec:
+def _controller_of(unit: str, motion: str, kind: Maker = Controller) -> TableSpec:
     """Keys of a controller in the units of an axis."""
     names = {name: shown for shown, name in controller_keys(unit, motion, kind).items()}
     return TableSpec((kind,), names=names)
@@ -104,7 +105,7 @@ _CONTROLLERS = TableSpec(
     kinds={
         # Partial, for the ratio of a cascade may be the transmission's.
         f"command {unit}, load {motion}{tagged}": replace(_controller_of(unit, motion, kind), partial=kind is Cascade)
-        for tagged, kind in (("", Controller), (', kind = "cascade"', Cascade))
+        for tagged, kind in (("", Controller), (', kind = "cascade"', Cascade), (', kind = "linear"', linear_law))
         for unit in ("V", "N m", "rad/s", "rad")
         for motion in LOADS
     },
@@ -120,6 +121,7 @@ _SHOWN_HELP = (
 _EITHER = {
     'kind = "filtered_pid"': _SHOWN,
     'kind = "cascade"': _controller_of("N m", "linear", Cascade),
+    'kind = "linear"': _controller_of("N m", "linear", linear_law),
 }
 AXIS_SHOWN = _axis(TableSpec(help=_SHOWN_HELP, kinds=_EITHER))
 """File of an axis for the reference, with one controller for all units."""

@@ -105,6 +105,9 @@ def map_(
     duration: _Duration = None,
     window: _Window = None,
     still_um: _Stillness = None,
+    still_mdeg: Annotated[
+        float | None, typer.Option(help="The same of a rotary axis, thousandths of a degree.")
+    ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers do the work: tcp://host:8786.")
@@ -131,6 +134,7 @@ def map_(
         duration=duration,
         window=window,
         still_um=still_um,
+        still_mdeg=still_mdeg,
     )
     stability_map(options, out, workers, scheduler)
 

@@ -93,7 +93,7 @@ def written_gains(gains: AnyGains, running: AnyController | None = None) -> Valu
         written: AnyController = Controller(**msgspec.structs.asdict(gains))
     else:
         if isinstance(gains, LinearGains):
-            raise InvalidInput(f"gains = {gains!r}: no table holds them, because a linear law is from Python only")
+            raise InvalidInput(f"gains = {gains!r}: no table of an edge's file holds them")
         if running is None:
             raise InvalidInput(f"gains = {gains!r}: must come with the law that they belong to")
         written = with_gains(running, gains)

@@ -97,8 +97,8 @@ def simulation_of(scenario: Scenario, plant: Plant | None = None, delay: int = 0
     return _simulation(scenario, scenario.servo if plant is None else plant, delay=delay)
 
 
-def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
-    """Make a simulation that runs on after the scenario's end and remembers `keep` samples.
+def endless(scenario: Scenario, keep: int, law: AnyController | None = None) -> UnboundedSimulation:
+    """Make a simulation that runs on after the scenario's end and remembers `keep` samples; `law` replaces its own.
 
     Raises
     ------
@@ -107,21 +107,24 @@ def endless(scenario: Scenario, keep: int) -> UnboundedSimulation:
     """
     if scenario.law.sample_rate is None:
         raise InvalidInput("controller sample_rate = None: must be a number in Hz for a machine that runs on")
-    return UnboundedSimulation(_simulation(scenario, scenario.servo, keep), scenario.reference)
+    return UnboundedSimulation(_simulation(scenario, scenario.servo, keep, law=law), scenario.reference)
 
 
-def compile_ahead(scenario: Scenario) -> None:
+def compile_ahead(scenario: Scenario, law: AnyController | None = None) -> None:
     """Compile everything that a machine of this kind runs, so that no sample waits for a compilation."""
-    rate = scenario.law.sample_rate or scenario.recording.sample_rate
+    law = scenario.law if law is None else law
+    rate = law.sample_rate or scenario.recording.sample_rate
     gap = PiecewiseCubic.zero_order_hold([0.0, 1.5 / rate], [0.01, 0.02])
-    simulate(scenario.servo, 4.0 / rate, controller=scenario.law, gap=gap, sample_rate=rate)
+    simulate(scenario.servo, 4.0 / rate, controller=law, gap=gap, sample_rate=rate)
 
 
-def _simulation(scenario: Scenario, plant: Plant, keep: int | None = None, delay: int = 0) -> Simulation:
+def _simulation(
+    scenario: Scenario, plant: Plant, keep: int | None = None, delay: int = 0, law: AnyController | None = None
+) -> Simulation:
     return Simulation(
         plant,
         scenario.duration if keep is None else FOREVER,
-        controller=scenario.start_law,
+        controller=scenario.start_law if law is None else law,
         reference=scenario.reference if keep is None else first_stretch(scenario.reference),
         gap=scenario.gap,
         tolerance=scenario.start_tolerance,

@@ -112,7 +112,8 @@ GAPS: Mapping[str, Maker] = {"constant": constant_gap, "growing": growing_gap}
 
 def gap_maker(table: Table) -> Maker:
     """Choose the kind of gap that a table describes."""
-    return constant_gap if "total_deg" in table.values or not table.values else growing_gap
+    growing = table.values.keys() & {"from_deg", "to_deg", "over_s", "begin_s"}
+    return growing_gap if growing and "total_deg" not in table.values else constant_gap
 
 
 def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:

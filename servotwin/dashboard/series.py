@@ -12,9 +12,10 @@ from servotwin.store.records import StoredEvidence
 Row = dict[str, Any]
 GAP_COLUMNS = (
     "received", "sample_time", "boot", "sequence", "kind", "status", "gap", "low", "high", "trend", "trend_std",
-    "version", "tail", "residual", "reasons",
+    "version", "tail", "residual", "reasons", "decision",
 )  # fmt: skip
-"""Columns of `gap_series`: s since the epoch, s of the edge's time, and rad; `tail` and `residual` in m or rad."""
+"""Columns of `gap_series`: s since the epoch, s of the edge's time, and rad; `tail` and `residual` in m or rad;
+`decision`: why nothing was redesigned."""
 
 
 def gap_series(windows: Iterable[WindowGap]) -> dict[str, list[Any]]:
@@ -25,8 +26,12 @@ def gap_series(windows: Iterable[WindowGap]) -> dict[str, list[Any]]:
 
 def _gap_row(each: WindowGap) -> Row:
     window = each.window
-    estimate = next((one for one in reversed(each.evidence) if one.kind != "trend"), None)
-    trend = next((one for one in reversed(each.evidence) if one.kind == "trend"), None)
+    newest = {one.kind: one for one in each.evidence}
+    estimate, trend, redesign = (
+        newest.get("estimate", newest.get("glance")),
+        newest.get("trend"),
+        newest.get("redesign"),
+    )
     failed = estimate is not None and estimate.status.startswith("failed")
     interval = None if estimate is None or failed else interval_of(estimate)
     low, high = interval or (None, None)
@@ -47,6 +52,7 @@ def _gap_row(each: WindowGap) -> Row:
         "tail": None if estimate is None else finite(estimate.tail),
         "residual": residual,
         "reasons": reasons,
+        "decision": "" if redesign is None else redesign.status,
     }
 
 

@@ -1,7 +1,8 @@
 """Replay of a recorded log in place of a machine, in the role supervise.
 
-The log is a CSV as `servotwin simulate` writes it, read line by line: time_s, reference_m, theta_m_rad, voltage_v, and
-measured_position_m or position_m. `servotwin convert LOG LOG.csv` converts logs of other kinds; it needs numpy.
+The log is a CSV as `servotwin simulate` writes it, read line by line: time_s, and of reference, position, motor's angle
+and command each one of the columns of `SIGNAL_COLUMNS`, converted to SI. `servotwin convert LOG LOG.csv` converts logs
+of other kinds; it needs numpy.
 The replay accepts and records parameters, which change nothing: the samples are those of the log.
 """
 
@@ -17,12 +18,13 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
+from servotwin.config.units import SIGNAL_COLUMNS, Unit, unit_of
 from servotwin.edge.drive import Block, DriveLost
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 
-COLUMNS = ("time_s", "reference_m", "theta_m_rad", ("measured_position_m", "position_m"), "voltage_v")
-"""Columns that are read; of two names the first one in the file counts."""
+COLUMNS = (("time_s",), *(SIGNAL_COLUMNS[name] for name in ("reference", "theta_m", "position", "voltage")))
+"""Columns that are read, by their possible names; the first one that the file has counts."""
 
 _JITTER = 0.05
 """Largest distance of a rounded time stamp from a uniform grid, in sample intervals."""
@@ -177,7 +179,7 @@ def extent(path: Path) -> Extent:
 
 
 def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
-    """Yield (time, reference, theta_m, position, voltage) of each line: s, m, rad, m, V.
+    """Yield (time, reference, theta_m, position, command) of each line: s, m or rad, rad, m or rad, the drive's unit.
 
     Raises
     ------
@@ -188,28 +190,37 @@ def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
         line, number = file.readline(), 1
         if line.startswith("#"):
             line, number = file.readline(), 2
-        places = _places(path, [name.strip() for name in line.split(",")])
+        columns = _columns(path, [name.strip() for name in line.split(",")])
         for number, line in enumerate(file, number + 1):  # noqa: B020
-            yield _numbers(path, number, line.split(","), places)
+            yield _numbers(path, number, line.split(","), columns)
     except UnicodeDecodeError as error:
         raise InvalidInput(f"log {path}: is not a text file (byte {error.start} is not UTF-8)") from None
 
 
-def _places(path: Path, names: list[str]) -> list[int]:
-    """Indices of the columns."""
-    places = []
-    for column in COLUMNS:
-        allowed = (column,) if isinstance(column, str) else column
+class _Column(NamedTuple):
+    """Place of a column in a line, and the SI value of one of its units."""
+
+    place: int
+    unit: Unit
+
+
+def _columns(path: Path, names: list[str]) -> list[_Column]:
+    """The columns that are read."""
+    chosen = []
+    for allowed in COLUMNS:
         present = next((name for name in allowed if name in names), None)
         if present is None:
             raise InvalidInput(f"log {path}: column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}")
-        places.append(names.index(present))
-    return places
+        chosen.append(present)
+    reference, position = chosen[1], chosen[3]
+    if unit_of(reference).si != unit_of(position).si:
+        raise InvalidInput(f"log {path}: columns {position} and {reference}: must both be lengths or both be angles")
+    return [_Column(names.index(name), unit_of(name)) for name in chosen]
 
 
-def _numbers(path: Path, number: int, cells: list[str], places: list[int]) -> tuple[float, ...]:
+def _numbers(path: Path, number: int, cells: list[str], columns: list[_Column]) -> tuple[float, ...]:
     try:
-        values = tuple(float(cells[place]) for place in places)
+        values = tuple(unit.to_si(float(cells[place])) for place, unit in columns)
     except (ValueError, IndexError):
         values = ()
     if not values or not all(map(isfinite, values)):

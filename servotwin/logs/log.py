@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from servotwin.config.table import did_you_mean
-from servotwin.config.units import unit_of
+from servotwin.config.units import SIGNAL_COLUMNS, unit_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
 from servotwin.logs.columns import LogColumns, SignalTable
@@ -19,16 +19,7 @@ from servotwin.plant.signals import Array
 from servotwin.runtime import files
 
 TIME = "time_s"
-# Column names of each channel, in order of preference: the measured position before the true one. The end of a name is
-# its unit, and those of one log agree.
-_POSITION_UNITS = ("m", "rad", "mm", "deg")
-COLUMNS = {
-    "position": tuple(f"{name}_{unit}" for name in ("measured_position", "position") for unit in _POSITION_UNITS),
-    "theta_m": ("theta_m_rad", "theta_m_deg"),
-    "voltage": ("voltage_v", "command_n_m", "command_rad_per_s", "command_rad"),
-    "reference": tuple(f"reference_{unit}" for unit in _POSITION_UNITS),
-}
-_COLUMN_NAMES = (TIME, *(name for names in COLUMNS.values() for name in names))
+_COLUMN_NAMES = (TIME, *(name for names in SIGNAL_COLUMNS.values() for name in names))
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +44,8 @@ class Log:
 
     def _exact_name(self, channel: str) -> str:
         """Name of a column in SI units: the measured position for one that may be either."""
-        return next(name for name in COLUMNS[channel] if unit_of(name).exact and unit_of(name).si == self.unit(channel))
+        names = ((name, unit_of(name)) for name in SIGNAL_COLUMNS[channel])
+        return next(name for name, unit in names if unit.exact and unit.si == self.unit(channel))
 
 
 def read_log(path: Path) -> Log:
@@ -80,14 +72,33 @@ def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
     InvalidInput
         The file is missing, of no known format or damaged.
     """
+    return next(_reading(path, requested, whole=True))
+
+
+def read_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+    """Read columns by name, a part of the rows at a time where the format allows it.
+
+    Raises
+    ------
+    InvalidInput
+        As `read_columns`.
+    """
+    return _reading(path, requested, whole=False)
+
+
+def _reading(path: Path, requested: Collection[str], whole: bool) -> Iterator[LogColumns]:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
     if not path.is_file():
         raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
-    FORMATS[suffix].check_installed(f"log {path}")
+    form = FORMATS[suffix]
+    form.check_installed(f"log {path}")
     try:
-        return FORMATS[suffix].read(path, requested)
+        if form.blocks is not None and not whole:
+            yield from form.blocks(path, requested)
+        else:
+            yield form.read(path, requested)
     except OSError as error:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
 
@@ -121,7 +132,8 @@ def write_log(table: SignalTable, path: Path) -> None:
 
 def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
     """Names of the columns by channel."""
-    chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in COLUMNS.items()}
+    every = SIGNAL_COLUMNS.items()
+    chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in every}
     for name, place in (("position_m", chosen["position"]), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
             hint, known = did_you_mean(name, columns.names), ", ".join(columns.names)

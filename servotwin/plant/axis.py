@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import resources
+from pathlib import Path
 from typing import Any, Unpack
 
 import numpy as np
@@ -113,7 +114,7 @@ class Axis:
             The file cannot be read, a key is missing or unknown, a value is out of its range, parts do not fit, or the
             loop is unstable.
         """
-        return cls._from_table(read_toml(path))
+        return cls._from_table(read_toml(path), Path(path).parent)
 
     @classmethod
     def loads(cls, text: str, source: str) -> Axis:
@@ -121,24 +122,14 @@ class Axis:
         return cls._from_table(parse_toml(text, source))
 
     @classmethod
-    def _from_table(cls, table: Table) -> Axis:
+    def _from_table(cls, table: Table, folder: Path = Path()) -> Axis:
         with named(table):
-            axis = cls(**read_parts(table)._asdict())
+            axis = cls(**read_parts(table, folder)._asdict())
             axis.check_loop()
             return axis
 
     def dumps(self) -> str:
-        """The axis as TOML that `from_file` reads back to an equal axis.
-
-        Raises
-        ------
-        InvalidInput
-            Its controller is a linear law.
-        """
-        if isinstance(self.controller, LinearLaw):
-            raise InvalidInput(
-                f"axis controller = {self.controller!r}: a file of an axis holds a Controller or a Cascade"
-            )
+        """The axis as TOML that `from_file` reads back to an equal axis."""
         parts = Parts(self.actuator, self.transmission, self.load, self.controller, self.sensors)
         return dumps(values_of_parts(parts))
 

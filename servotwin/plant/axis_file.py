@@ -17,6 +17,7 @@ from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, AnyContro
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
+from servotwin.plant.linear_law_file import linear_law
 from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.transmission import FREE, HELD, Transmission
@@ -131,6 +132,10 @@ def rotary_load(
 
 TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
 LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
+LINEAR_LAW = "linear"
+LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: linear_law}
+"""Controllers that the file of an axis can describe, by their key `kind`."""
+_MASSES = {LINEAR: "mass_kg", ROTARY: "inertia_kg_m2"}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
 
 
@@ -140,12 +145,12 @@ class Parts(NamedTuple):
     actuator: Actuator
     transmission: Transmission
     load: Load
-    controller: Controller | Cascade
+    controller: AnyController
     sensors: Sensors
 
 
-def read_parts(table: Table) -> Parts:
-    """Read the parts of an axis from its file's table, to the last key.
+def read_parts(table: Table, folder: Path) -> Parts:
+    """Read the parts of an axis from its file's table, to the last key; paths are relative to `folder`.
 
     Raises
     ------
@@ -162,8 +167,13 @@ def read_parts(table: Table) -> Parts:
     motion = kind_of(tables["load"], LOADS)
     if motion != _MOTIONS[kind]:
         raise tables["load"].invalid("kind", f'"{_MOTIONS[kind]}", for the transmission is a {kind}')
+    for name, own in ((_MASSES[each], _MASSES[motion]) for each in _MASSES if each != motion):
+        if name in tables["load"].values:
+            raise InvalidInput(
+                f"{table.source}: load.{name} = {tables['load'].values[name]!r}: this load is {motion}; give load.{own}"
+            )
     load: Load = read_kind(tables["load"], LOADS, Path())
-    law = _read_controller(tables["controller"], actuator.unit, motion, transmission.p)
+    law = _read_controller(tables["controller"], folder, actuator.unit, motion, transmission.p)
     encoders = table.table("sensors").renamed({_sensor_key(name, motion): name for name in _SENSOR_KEYS})
     sensors: Sensors = read(encoders, Sensors)
     encoders.done()
@@ -171,21 +181,18 @@ def read_parts(table: Table) -> Parts:
     return Parts(actuator, transmission, load, law, sensors)
 
 
-def _read_controller(table: Table, unit: str, motion: str, ratio: float) -> Controller | Cascade:
-    """Read the controller in the units of its axis; a cascade's ratio is the transmission's where it is not given."""
-    kind = kind_of(table, CONTROLLERS, FILTERED_PID)
-    controller = table.renamed(controller_keys(unit, motion, CONTROLLERS[kind]))
+def _read_controller(table: Table, folder: Path, unit: str, motion: str, ratio: float) -> AnyController:
+    """Read the controller in the units of its axis; the ratio is the transmission's where it is not given."""
+    kind = kind_of(table, LAWS, FILTERED_PID)
+    controller = table.renamed(controller_keys(unit, motion, LAWS[kind]))
     controller.known("kind")
-    law: Controller | Cascade
-    if kind == CASCADE and "travel_m_per_rad" not in controller.values:
-        law = read(controller, Cascade, ratio=ratio)
-    else:
-        law = read(controller, CONTROLLERS[kind])
+    own = {"ratio": ratio} if kind != FILTERED_PID and "travel_m_per_rad" not in controller.values else {}
+    law: AnyController = read(controller, LAWS[kind], folder, **own)
     controller.done()
     return law
 
 
-def controller_keys(unit: str, motion: str, described: type = Controller) -> Mapping[str, str]:
+def controller_keys(unit: str, motion: str, described: Maker = Controller) -> Mapping[str, str]:
     """Keys of the controller's table in the units of an axis, and those of a voltage and a position in metres.
 
     Parameters
@@ -194,8 +201,8 @@ def controller_keys(unit: str, motion: str, described: type = Controller) -> Map
         Unit of the actuator's command.
     motion : str
         Of the load.
-    described : type
-        Class of the controller.
+    described : class or function
+        Declares the controller's keys.
     """
     command, word = _COMMANDS[unit]
     position = "m" if motion == LINEAR else "rad"
@@ -208,12 +215,13 @@ def controller_keys(unit: str, motion: str, described: type = Controller) -> Map
     return names
 
 
-def file_values(
-    controller: Controller | Cascade, unit: str, motion: str, only: Collection[str] | None = None
-) -> Values:
+def file_values(controller: AnyController, unit: str, motion: str, only: Collection[str] | None = None) -> Values:
     """Keys and values of a controller, as the file of an axis has them; `only` of some attributes."""
-    shown = {name: key for key, name in controller_keys(unit, motion, type(controller)).items()}
-    return {shown.get(name, name): value for name, value in values_of(controller, only=only).items()}
+    maker: Maker = linear_law if isinstance(controller, LinearLaw) else type(controller)
+    if only is None and isinstance(controller, LinearLaw):
+        only = [item.name for item in items_of(linear_law) if item.name != "system"]
+    shown = {name: key for key, name in controller_keys(unit, motion, maker).items()}
+    return {shown.get(name, name): value for name, value in values_of(controller, maker, only).items()}
 
 
 def described_law(controller: AnyController, unit: str, motion: str) -> str:
@@ -226,7 +234,7 @@ def described_law(controller: AnyController, unit: str, motion: str) -> str:
     return f"{kind} ({', '.join(f'{key} = {value!r}' for key, value in values.items())})"
 
 
-def _keys_with_units(described: type) -> list[str]:
+def _keys_with_units(described: Maker) -> list[str]:
     """Keys of a controller whose units contain volts or metres."""
     names = [item.exact_name for item in items_of(described)]
     return [name for name in names if {"v", "m"} & set(_suffix(name).split("_"))]
@@ -245,8 +253,7 @@ def values_of_parts(axis: Parts) -> Values:
     motion = axis.load.motion
     kind = next(kind for kind, moves in _MOTIONS.items() if moves == motion)
     actuator = next(name for name, maker in ACTUATORS.items() if isinstance(axis.actuator, maker))
-    law = type(axis.controller)
-    named: Values = {} if law is Controller else {"kind": CASCADE}
+    named: Values = {} if isinstance(axis.controller, Controller) else {"kind": _kind_of_law(axis.controller)}
     controller = named | file_values(axis.controller, axis.actuator.unit, motion)
     return {
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
@@ -255,6 +262,10 @@ def values_of_parts(axis: Parts) -> Values:
         "sensors": {_sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
         "controller": controller,
     }
+
+
+def _kind_of_law(controller: AnyController) -> str:
+    return LINEAR_LAW if isinstance(controller, LinearLaw) else CASCADE
 
 
 _SENSOR_KEYS = ("position_resolution_m",)

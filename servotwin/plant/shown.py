@@ -27,6 +27,11 @@ class ShownUnit(NamedTuple):
     factor: float
     si: str
 
+    @property
+    def small(self) -> ShownUnit:
+        """The thousandth of this unit, for what is small beside a step."""
+        return ShownUnit("um" if self.name == "mm" else f"m{self.name}", 1e3 * self.factor, self.si)
+
     def si_of(self, value: float) -> float:
         """The value in m or rad."""
         return value / self.factor

@@ -55,7 +55,10 @@ class ServoFacts(NamedTuple):
 
 
 class WindowGap(NamedTuple):
-    """A window with what was found of the gap: evidence of the kinds glance, estimate and trend."""
+    """A window with what was found of the gap: evidence of the kinds glance, estimate, trend and redesign.
+
+    The body of a redesign is left out.
+    """
 
     window: StoredWindow
     evidence: tuple[StoredEvidence, ...]
@@ -114,8 +117,10 @@ def gaps(
     if before is not None:
         chosen = chosen.where(messages.c.id < before)
     selected = chosen.order_by(messages.c.id.desc()).limit(limit).cte("chosen")
-    columns = [column if bodies or column.name != "body" else sa.literal(b"").label("body") for column in _COLUMNS]
-    wanted = sa.and_(evidence.c.message == selected.c.id, evidence.c.kind.in_((*_ESTIMATES, "trend")))
+    # The body of a redesign holds its simulations: much, and not needed here.
+    body = sa.case((evidence.c.kind == "redesign", b""), else_=evidence.c.body) if bodies else sa.literal(b"")
+    columns = [body.label("body") if column.name == "body" else column for column in _COLUMNS]
+    wanted = sa.and_(evidence.c.message == selected.c.id, evidence.c.kind.in_((*_ESTIMATES, "trend", "redesign")))
     query = sa.select(*selected.c, *(column.label(f"e_{column.name}") for column in columns))
     query = query.select_from(selected.outerjoin(evidence, wanted)).order_by(selected.c.id, evidence.c.id)
     width, found = len(StoredWindow._fields), dict[StoredWindow, list[StoredEvidence]]()

@@ -294,7 +294,9 @@ def _decoded(stored: StoredMessage) -> WindowMessage:
 
 def _history(connection: sa.Connection, servo: str) -> list[float | None]:
     found = overview.gaps(connection, servo, _SPARK_WINDOWS, bodies=False)
-    return [next((one.gap for one in reversed(each.evidence) if one.kind != "trend"), None) for each in found]
+    return [
+        next((one.gap for one in reversed(each.evidence) if one.kind in ("glance", "estimate")), None) for each in found
+    ]
 
 
 def _file(asset: Asset, request: HttpRequest) -> HttpResponse:

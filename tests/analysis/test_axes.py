@@ -84,3 +84,31 @@ def test_an_axis_in_other_units_has_the_same_scales() -> None:
     )
     assert scales(slow).time == pytest.approx(factor * reference.time)
     assert scales(slow).voltage == pytest.approx(reference.voltage / factor**2)
+
+
+def test_a_map_of_a_linear_law_is_that_of_the_same_filtered_pid() -> None:
+    """With a dead zone that opens the loop, and members in motion."""
+    integral = st.LinearLaw(
+        A=((0.0,),), B=((4000.0, 0.0, -4000.0),), C=(1.0,), D=(1000.0, 0.0, -1000.0), names=("integral",),
+        holds=("integral",), integral_only=False,
+    )  # fmt: skip
+    options = {"gap": (0.1, 0.2), "k_dz": (0.0, 0.3, 1.5), "amplitude": (1e-3,), "members": 4}
+    one, other = (st.stability_map(VELOCITY, controller=law, **options) for law in (None, integral))
+    for name in ("settled", "swing", "settling"):
+        assert np.array_equal(one.grid(name), other.grid(name)), name
+    assert one.grid("effort") == pytest.approx(other.grid("effort"), rel=1e-9)
+    assert 0.0 < one.grid("settled").mean() < 1.0
+
+
+def test_a_map_of_a_cascade_agrees_with_single_runs() -> None:
+    """On a free shaft, the motor's encoder inside: the first member is the run from rest."""
+    cascade = st.Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5)
+    axis = TWO_MASS.replace(controller=cascade)
+    result = st.stability_map(
+        axis, gap=(0.02,), k_dz=(0.0, 1.0), amplitude=(0.2,), members=1, duration=12.0, window=6.0
+    )
+    assert result.columns[-1] == "effort_n_m"
+    rate = result.settings.sample_rate
+    for tolerance, swing in zip((None, 0.02), result.grid("swing").ravel(), strict=True):
+        run = st.simulate(axis, 12.0, reference=0.2, gap=0.02, tolerance=tolerance, sample_rate=rate)
+        assert swing == pytest.approx(0.5 * np.ptp(run.position[-round(6.0 * rate) - 1 :]), rel=1e-5, abs=1e-12)

@@ -78,7 +78,10 @@ def test_a_cascade_cannot_hold_an_integral_without_a_velocity_loop_nor_a_notch_b
 
 @pytest.mark.parametrize(
     ("law", "gains", "words"),
-    [(LINEAR, gains_of(LINEAR), "from Python only"), (None, gains_of(CASCADE), "with the law that they belong to")],
+    [
+        (LINEAR, gains_of(LINEAR), "no table of an edge.s"),
+        (None, gains_of(CASCADE), "with the law that they belong to"),
+    ],
 )
 def test_gains_that_no_table_holds_are_refused(law: AnyController | None, gains: AnyGains, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):

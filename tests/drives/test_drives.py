@@ -192,7 +192,7 @@ def test_wrong_roles_protocols_and_missing_machines_are_refused(tmp_path: Path) 
         assert address == f"unix:{tmp_path / 'here.sock'}"
         assert (tmp_path / "here.sock").stat().st_mode & 0o777 == 0o600
         for drive in (SimulatedSupervised(address), SimulatedSupervised(address)):
-            with pytest.raises(InvalidInput, match="role supervise in protocol 4"):
+            with pytest.raises(InvalidInput, match="role supervise in protocol 5"):
                 drive.connect()
         with closing(SimulatedControl(address, silence=0.2)) as first, closing(SimulatedControl(address, 0.2)) as other:
             first.connect()

@@ -12,7 +12,11 @@ from servotwin.drives.replay import Replay
 from servotwin.edge.drive import Block, DriveLost
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
+from servotwin.logs.columns import SignalTable
+from servotwin.logs.log import write_log
 from servotwin.messages import Setting
+from servotwin.plant.axis import Axis
+from servotwin.simulation import simulate
 
 HEAD = "time_s,position_m,voltage_v,measured_position_m,reference_m,theta_m_rad"
 
@@ -94,6 +98,32 @@ def test_parameters_are_recorded_and_change_nothing(log: Path) -> None:
         assert not drive.can_move
 
 
+@pytest.mark.parametrize("preset", ["telescope", "gantry", "stepper-stage"])
+def test_a_log_of_an_axis_comes_in_its_own_units(tmp_path: Path, preset: str) -> None:
+    """Rotary or linear, with any command: as `servotwin simulate` writes it."""
+    axis = Axis.preset(preset)
+    run = simulate(axis, 0.1, reference=1e-4, gap=1e-3, sample_rate=1000.0)
+    write_log(SignalTable(run.columns, {}), tmp_path / "run.csv")
+    with closing(Replay(tmp_path / "run.csv", speed=0.0)) as drive:
+        drive.connect()
+        seen = signals(read_all(drive))
+    written = np.array([run.reference, run.theta_m, run.measured_position, run.voltage])
+    assert seen == pytest.approx(written, rel=1e-9, abs=0.0)
+
+
+def test_degrees_and_millimetres_are_converted_and_never_mixed(log: Path) -> None:
+    text = log.read_text()
+    log.write_text(text.replace("theta_m_rad", "theta_m_deg").replace("d_position_m", "d_position_mm"))
+    with closing(Replay(log, speed=0.0)) as drive:
+        drive.connect()
+        block = drive.read(2)
+    assert block is not None
+    assert (block.theta_m[0], block.position[1]) == (np.radians(5.0), pytest.approx(9e-3))
+    log.write_text(text.replace("reference_m", "reference_deg"))
+    with pytest.raises(InvalidInput, match="measured_position_m and reference_deg: must both be lengths or both be"):
+        Replay(log).connect()
+
+
 def test_an_npz_is_converted_first(log: Path, tmp_path: Path) -> None:
     packed, again = tmp_path / "log.npz", tmp_path / "again.csv"
     convert(log, packed)
@@ -111,7 +141,7 @@ def test_an_npz_is_converted_first(log: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("theta_m_rad", "theta"), "column theta_m_rad is missing; it has time_s, position_m"),
+        (("theta_m_rad", "theta"), "column theta_m_rad or theta_m_deg is missing; it has time_s, position_m"),
         (("5.05,", "5.0512,"), r"time_s = 5\.0512 s at sample 50: must be increasing, uniformly spaced"),
         ((",302,", ",nan,"), "line 53 must hold finite numbers"),
         ((",302,", ",,"), "line 53 must hold finite numbers"),

@@ -51,6 +51,7 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
         ("inertia_kg_m2 = 0.00012", "inertia_kg_m2 = -1.0", "inertia_kg_m2 = -1.0 is not allowed; give a positive"),
         ("pitch_m_per_rad", "pitch_mm_per_rad", "transmission.pitch_m_per_rad' is missing"),
         ("mass_kg = [20.0]", "mass_kg = [20.0, 0.0]", r"load.mass_kg\[1\] = 0.0 is not allowed"),
+        ("mass_kg = ", "inertia_kg_m2 = ", r"load.inertia_kg_m2 = \[20.0\]: this load is linear; give load.mass_kg"),
         ("pitch_m_per_rad = ", "lead_mm_per_rev = 5.0\npitch_m_per_rad = ", "give only one of them"),
         (
             "friction_n = 15.0",

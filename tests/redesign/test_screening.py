@@ -58,6 +58,13 @@ def test_the_order_is_that_of_all_candidates_on_all_machines() -> None:
     assert ranked == fully_ranked(7)
 
 
+def test_a_candidate_that_is_listed_twice_is_ranked_once() -> None:
+    """The running setting is a candidate too; simulated twice on a machine it would count twice."""
+    question, every = question_and_candidates()
+    few = [every[0], every[3], every[3], every[0]]
+    assert sorted(Screening(question).ranked(few), key=every.index) == [every[0], every[3]]
+
+
 @pytest.mark.slow
 def test_the_first_candidates_cost_fewer_simulations(monkeypatch: pytest.MonkeyPatch) -> None:
     question, every = question_and_candidates()

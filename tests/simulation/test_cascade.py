@@ -237,10 +237,6 @@ def test_a_file_of_an_axis_holds_its_cascade(name: str) -> None:
             lambda: simulate(AXES["ball screw"][0], 1.0, noise=Noise(std=1e-6)),
             "noise is on the load's encoder, which the controller does not read",
         ),
-        (
-            lambda: AXES["two masses"][0].replace(controller=AXES["two masses"][0].controller.linear()).dumps(),
-            "a file of an axis holds a Controller or a Cascade",
-        ),
     ],
 )  # fmt: skip
 def test_refusals_are_one_sentence(make: object, words: str) -> None:

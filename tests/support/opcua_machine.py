@@ -15,12 +15,12 @@ import numpy as np
 from asyncua import Server, ua
 from asyncua.crypto.permission_rules import User, UserRole
 
+from servotwin.control.gains import gains_of, settable
 from servotwin.cosim.machine import compile_ahead
 from servotwin.drives.opcua import model
 from servotwin.drives.simulated.plants import SupervisedPlant
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains
 
 STARTS = {
     "Rate": (0.0, ua.VariantType.Double),
@@ -56,22 +56,24 @@ class Machine:
         self.options = options
         settings = MachineSettings.load(options["plant"])
         compile_ahead(settings.scenario)  # before it says that it is ready: a client waits for a second
-        self.plant = SupervisedPlant(settings)
+        self.plant, self.law = SupervisedPlant(settings), settings.scenario.law
+        fields = settable(type(self.law))
+        self.gains = {model.variable(name): name for name in (fields if options.get("optional", True) else fields[:4])}
         self.rings = np.zeros((4, options.get("ring", 4000)))
         self.variables: dict[str, Any] = {}
+        self.rate = settings.rate
         self.committed = 0
 
     async def offer(self, server: Server) -> None:
         place = await server.register_namespace(model.NAMESPACE)
         drive = await server.nodes.objects.add_object(place, self.options.get("node", model.OBJECT))
-        every = (*model.EVERY, *(model.OPTIONAL if self.options.get("optional", True) else ()))
-        for name in every:
+        for name in (*model.EVERY, *self.gains):
             value, kind = STARTS.get(name, (0.0, ua.VariantType.Double))
             start = self.rings[0].tolist() if name in model.SIGNALS else value
             self.variables[name] = await drive.add_variable(place, name, start, kind)
-            if name in (*model.PARAMETERS, model.COMMIT, *model.OPTIONAL):
+            if name in (*model.PARAMETERS, model.COMMIT, *self.gains):
                 await self.variables[name].set_writable()
-        await self.set("Rate", 5000.0)
+        await self.set("Rate", self.rate)
         await self.set("Block", self.plant.block)
         await self.set("Machine", os.urandom(4).hex())
 
@@ -94,12 +96,12 @@ class Machine:
         if commit == self.committed:
             return
         self.committed = commit
-        version, tolerance, with_gains, *gains = [await self.variables[name].read_value() for name in model.PARAMETERS]
-        optional = [name for name in model.OPTIONAL if name in self.variables]
-        gains += [await self.variables[name].read_value() for name in optional]
+        version, tolerance, with_gains = [await self.variables[name].read_value() for name in model.PARAMETERS]
+        gains = {name: await self.variables[each].read_value() for each, name in self.gains.items()}
         refused = ""
         try:
-            self.plant.write(version, tolerance, Gains(*gains) if with_gains else None)
+            kind = type(gains_of(self.law))
+            self.plant.write(version, tolerance, kind(**gains) if with_gains else None)
         except (InvalidInput, ValueError) as error:
             refused = str(error)
         else:
@@ -111,7 +113,7 @@ class Machine:
     async def run(self, speed: float) -> None:
         start, begin = time.monotonic(), self.plant.index
         while True:
-            due = start + (self.plant.index - begin) / (5000.0 * speed)
+            due = start + (self.plant.index - begin) / (self.rate * speed)
             await asyncio.sleep(max(0.0, due - time.monotonic()))
             if time.monotonic() - due > 0.5:  # stopped for a while: that time is given up
                 start, begin = time.monotonic(), self.plant.index

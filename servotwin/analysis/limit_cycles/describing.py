@@ -16,11 +16,12 @@ from servotwin.analysis.limit_cycles.prediction import Prediction
 from servotwin.analysis.limit_cycles.scaled import ScaledLoop, scaled_loop
 from servotwin.analysis.limit_cycles.shaft import shaft_predictions
 from servotwin.control.controller import Controller
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.basis import Play
+from servotwin.plant.law_loop import check_encoders
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
 from servotwin.plant.plants import Plant
@@ -46,7 +47,7 @@ def play_function(amplitude: float, gap: float) -> complex:
     return _play(math.acos(1.0 - gap / amplitude))
 
 
-def predictions(servo: Plant, gap: float, controller: Controller | None = None) -> tuple[Prediction, ...]:
+def predictions(servo: Plant, gap: float, controller: AnyController | None = None) -> tuple[Prediction, ...]:
     """All limit cycles that the describing function predicts for a constant gap, by frequency.
 
     Solutions lie where abs(L) >= 1 and the phase of L is between -180 and -90 deg, since N shrinks and lags by up to
@@ -58,12 +59,13 @@ def predictions(servo: Plant, gap: float, controller: Controller | None = None) 
     InvalidInput
         The screw is elastic and held in the gap (its load on the motor is no function of theta_d alone), there is
         friction or a constant force, the controller is sampled or
-        saturates, or the gap is not a number above 0.
+        saturates or, with rigid parts, is no filtered PID, or the gap is not a number above 0.
     """
-    law = filtered_pid(servo.controller) if controller is None else controller
+    law = law_of(servo.controller if controller is None else controller)
     _check(servo, law, gap)
     if servo.play is Play.FREE:
         return shaft_predictions(servo, gap, law)
+    law = filtered_pid(law)
     loop = servo.loop(law)
     solutions = [omega for low, high in _bands(loop) for omega in _solutions(loop, low, high)]
     return tuple(_prediction(servo, loop, gap, omega) for omega in solutions)
@@ -82,7 +84,8 @@ def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
     return [float(brentq(lambda w: _mismatch(loop, w), grid[i], grid[i + 1], xtol=1e-14 * grid[i])) for i in places]
 
 
-def _check(servo: Plant, law: Controller, gap: float) -> None:
+def _check(servo: Plant, law: Law, gap: float) -> None:
+    check_encoders(servo, law)
     if servo.play is Play.HELD:
         raise InvalidInput(
             "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), or a shaft that is free in "
@@ -174,7 +177,7 @@ _CREST = ("+/on", "release", 1)
 
 
 def limit_cycle_near(
-    servo: Plant, gap: float, prediction: Prediction, controller: Controller | None = None
+    servo: Plant, gap: float, prediction: Prediction, controller: AnyController | None = None
 ) -> CycleResult:
     """Find the symmetric orbit to which Newton's method converges from a prediction; the loop has no dead zone.
 
@@ -185,7 +188,7 @@ def limit_cycle_near(
         rad, total gap.
     prediction : Prediction
         From `predictions`, of the same loop.
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Continuous; the servo's own by default.
 
     Returns
@@ -193,10 +196,11 @@ def limit_cycle_near(
     CycleResult
         Status CYCLE or, when the prediction leads to no orbit, IRREGULAR with the reason.
     """
-    law = filtered_pid(servo.controller) if controller is None else controller
+    given = servo.controller if controller is None else controller
     if servo.play is Play.FREE:
         # What follows a contact of a shaft is no harmonic: the run from a larger swing leads to the orbit.
-        return limit_cycle(servo, gap, None, controller=law, step=2.0 * prediction.amplitude)
+        return limit_cycle(servo, gap, None, controller=given, step=2.0 * prediction.amplitude)
+    law = filtered_pid(given)
     # Only the scaling is used: this step is never simulated.
     loop = scaled_loop(servo, gap, None, law, step=gap * servo.p)
     start = crest(servo, loop, prediction, law) / loop.unit

@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.analysis.limit_cycles.prediction import Prediction
-from servotwin.control.controller import Controller
+from servotwin.control.laws import Law
+from servotwin.control.linear_law import LinearLaw
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.law_loop import law_matrices
 from servotwin.plant.linear import Complex
 from servotwin.plant.loop import continuous_law
 from servotwin.plant.margins import crossings
@@ -63,23 +66,23 @@ class OpenShaft:
     damping: float
 
     @staticmethod
-    def of(plant: Plant, law: Controller) -> OpenShaft:
+    def of(plant: Plant, law: Law) -> OpenShaft:
         """Part a free shaft in its gap."""
         shaft, chain, p = plant.shaft(), plant.chain(), plant.p
-        control = continuous_law(law)
+        control = _feedback(plant, law)
         motor, load = len(shaft.names), chain.A.shape[0]
-        size = motor + load + control.B.size
+        size = motor + load + control.C.size
         A, B = np.zeros((size, size)), np.zeros(size)
         own, hung, inner = slice(0, motor), slice(motor, motor + load), slice(motor + load, size)
         A[own, own], A[hung, hung], A[inner, inner] = shaft.A, chain.A_open, control.A
         position, twist = np.zeros(size), np.zeros(size)
         position[hung] = chain.C_last
         twist[motor - 1], twist[motor] = 1.0, -1.0 / p
-        measured = p * np.eye(size)[motor - 1] if plant.at_motor else position
-        command = -control.D * measured
-        command[inner] -= control.C
+        measured = np.stack([np.eye(size)[motor - 1], position])
+        command = control.D @ measured
+        command[inner] += control.C
         A[own] += np.outer(shaft.B, command)
-        A[inner] += np.outer(control.B, measured)
+        A[inner] += control.B @ measured
         B[own] = -shaft.E
         # A force on the first mass per torque at the motor; B_position is k_d over that mass.
         stiffness = float(chain.reaction_position)
@@ -98,7 +101,26 @@ class OpenShaft:
         return np.asarray((self.stiffness + 1j * omega * self.damping) * (self.twist @ self.response(omega)))
 
 
-def shaft_predictions(plant: Plant, gap: float, law: Controller) -> tuple[Prediction, ...]:
+class _Feedback(NamedTuple):
+    """x' = A x + B (y_motor, y_load), command = C x + D (y_motor, y_load)."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+
+
+def _feedback(plant: Plant, law: Law) -> _Feedback:
+    """What a continuous law makes of the two measurements."""
+    if isinstance(law, LinearLaw):
+        matrices = law_matrices(law)
+        return _Feedback(matrices.A, matrices.B[:, 1:], matrices.C, matrices.D[1:])
+    control = continuous_law(law)
+    reads = np.array([plant.p, 0.0] if plant.at_motor else [0.0, 1.0])
+    return _Feedback(control.A, np.outer(control.B, reads), -control.C, -control.D * reads)
+
+
+def shaft_predictions(plant: Plant, gap: float, law: Law) -> tuple[Prediction, ...]:
     """All limit cycles that the describing function of the dead zone predicts, by frequency."""
     parted = OpenShaft.of(plant, law)
     sizes = np.abs(np.linalg.eigvals(parted.A))

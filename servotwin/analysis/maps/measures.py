@@ -14,11 +14,15 @@ from numpy.typing import NDArray
 from servotwin.analysis.limit_cycles.scaled import characteristic_time
 from servotwin.analysis.maps.axes import Cells
 from servotwin.analysis.maps.settings import MapSettings
+from servotwin.control.controller import Controller
+from servotwin.control.laws import Law
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.ensemble import run_ensemble
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop
+from servotwin.plant.linear_zones import law_state, linear_loop
 from servotwin.simulation.continuous import controller_constants
 from servotwin.simulation.ensemble_starts import start_modes
 from servotwin.simulation.inputs import plant_forces
@@ -97,8 +101,10 @@ def trajectories(settings: MapSettings, cells: Cells, chunk: range) -> tuple[Arr
 def automaton(settings: MapSettings) -> ServoAutomaton:
     """Plant and law together, with a dead zone."""
     law = settings.law
-    friction = settings.servo.motor_friction != 0.0
-    return continuous_loop(settings.servo, law, Shape(feedforward=law.feedforward != 0.0, friction=friction))
+    shape = Shape(feedforward=law.feedforward != 0.0, friction=settings.servo.motor_friction != 0.0)
+    if isinstance(law, LinearLaw):
+        return linear_loop(settings.servo, law, shape)
+    return continuous_loop(settings.servo, law, shape)
 
 
 def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: range) -> Array:
@@ -112,7 +118,6 @@ def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: ran
     states[:, :, index("theta_d")] = angle * screw
     states[:, :, index("theta_d") + 1 : index("theta_d") + 1 + rest.size] = screw[:, :, None] * rest
     states[:, :, index("speed")] = settings.motion * draws[:, :, 1] * step * omega / servo.p
-    states[:, :, index("integral")] = settings.motion * draws[:, :, 2] * step * settings.law.Ki / omega
     for name, value in zip(("gap", "tolerance", "reference"), cells, strict=True):
         states[:, :, index(name)] = value[:, None]
     for name, constant in controller_constants(settings.law).items():
@@ -121,9 +126,24 @@ def starts(settings: MapSettings, loop: ServoAutomaton, cells: Cells, chunk: ran
     for name, force in plant_forces(servo).items():
         if name in loop.automaton.names:
             states[:, :, index(name)] = force
-    if settings.law.loop_filter_hz is not None:
-        states[:, :, index("filtered")] = states @ loop.rows["sensed"][0]
+    moved = settings.motion * draws[:, :, 2] * step / omega
+    _set_law(settings.law, loop, states, moved)
     return states
+
+
+def _set_law(law: Law, loop: ServoAutomaton, states: Array, moved: Array) -> None:
+    """Set the law's states: at rest at the measurements, its integral action away from it by `moved` (m s of error)."""
+    index = loop.automaton.index
+    sensed = states @ loop.rows["sensed"][0]
+    if isinstance(law, Controller):
+        states[:, :, index("integral")] = moved * law.Ki
+        if law.loop_filter_hz is not None:
+            states[:, :, index("filtered")] = sensed
+        return
+    # At rest with no error, and the motor at zero: proportional to the load's position.
+    resting = law.rest((law.error[1], 0.0, 1.0), dict.fromkeys(law.holds, 0.0))
+    for name, value, row in zip(law.names, resting, law.B, strict=True):
+        states[:, :, index(law_state(name))] = row[0] * moved if name in law.holds else value * sensed
 
 
 def _draws(settings: MapSettings, cell: int) -> Array:

@@ -15,10 +15,11 @@ from servotwin.analysis.maps.axes import RatioAxes, Values, axis_names, axis_val
 from servotwin.analysis.maps.measures import MEASURES, Measures
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.shown import command_unit, position_unit
 from servotwin.runtime import files
 
-_UNITS = {"error": "_m", "swing": "_m", "settling": "_s", "effort": "_v"}
-_AXIS_UNITS = {"gap": "_rad", "estimate": "_rad", "k_dz": "", "amplitude": "_m"}
+_ANGLES = ("gap", "estimate")
+_LENGTHS = ("error", "swing", "amplitude")
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,12 +47,16 @@ class StabilityMap:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the axes and of the measures, with units."""
+        """Names of the axes and of the measures, with units: m or rad, and that of the command."""
+        servo = self.settings.servo
+        command = command_unit(servo).lower().replace("/", "_per_").replace(" ", "_")
+        units = dict.fromkeys(_ANGLES, "_rad") | dict.fromkeys(_LENGTHS, f"_{position_unit(servo).si}")
+        units |= {"settling": "_s", "effort": f"_{command}"}
         if isinstance(self.settings.axes, RatioAxes):
             axes = ["tolerance_per_pb", "amplitude_per_pb"]
         else:
-            axes = [name + _AXIS_UNITS[name] for name, _ in self.axes]
-        return (*axes, *(name + _UNITS.get(name, "") for name in MEASURES))
+            axes = [name + units.get(name, "") for name, _ in self.axes]
+        return (*axes, *(name + units.get(name, "") for name in MEASURES))
 
 
 def write_numbers(stability: StabilityMap, directory: Path) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 from servotwin.analysis.limit_cycles.scaled import characteristic_time
 from servotwin.analysis.maps.axes import Axes, RatioAxes, as_lists, axis_names
 from servotwin.control.controller import Controller
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import AnyController, Law, law_of
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
@@ -37,14 +37,15 @@ class MapSettings:
     ----------
     servo : Servo or Axis
     axes : RatioAxes or PhysicalAxes
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         Continuous; the servo's own by default.
     members : int
         Initial states in each cell. The first is at rest with the screw in the middle of the gap (the paper's); all
         others have the screw anywhere in the gap, and every second of those is in motion.
     motion : float
         Extent of that motion: uniform within this many step * crossover / p of motor speed and Ki * step / crossover
-        of integral action, what an error of one step makes in one radian of the crossover. 0: all start from rest.
+        of integral action, what an error of one step makes in one radian of the crossover; of other laws each state
+        that the dead zone stops has what a reference of one step makes. 0: all start from rest.
     seed : int
         Of the initial states; each cell has a generator of its own.
     duration : float, optional
@@ -64,7 +65,7 @@ class MapSettings:
 
     servo: Plant
     axes: Axes
-    controller: Controller | None = None
+    controller: AnyController | None = None
     members: int = 16
     motion: float = 1.0
     seed: int = 0
@@ -94,9 +95,9 @@ class MapSettings:
             )
 
     @property
-    def law(self) -> Controller:
-        """The controller that runs."""
-        return filtered_pid(self.servo.controller) if self.controller is None else self.controller
+    def law(self) -> Law:
+        """The law that runs."""
+        return law_of(self.servo.controller if self.controller is None else self.controller)
 
     @property
     def run_time(self) -> float:
@@ -172,14 +173,14 @@ class MapSettings:
         return hashlib.sha256(json.dumps(self.described(), sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _check_law(law: Controller) -> None:
+def _check_law(law: Law) -> None:
     for name in ("sample_rate", "rate_limit"):
         if getattr(law, name) is not None:
             value = getattr(law, name)
             raise InvalidInput(
                 f"controller {name} = {value:g}: maps are those of the continuous law; give {name} = None"
             )
-    if law.friction_feedforward:
+    if isinstance(law, Controller) and law.friction_feedforward:
         raise InvalidInput(
             f"controller friction_feedforward = {law.friction_feedforward:g} V: maps do not simulate it; give 0"
         )

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.shown import command_unit, position_unit
 from servotwin.report import style
 from servotwin.runtime import files
 
@@ -26,7 +27,6 @@ _LABELS = {
     "gap": ("gap (deg)", math.degrees(1.0)),
     "estimate": ("estimated gap (deg)", math.degrees(1.0)),
     "k_dz": ("$k_{DZ}$", 1.0),
-    "amplitude": ("reference step (mm)", 1e3),
 }
 _RATIO_LABELS = {"tolerance": ("tolerance / (p b)", 1.0), "amplitude": ("reference step / (p b)", 1.0)}
 _DOT: Any = {"color": style.PINK, "linestyle": "", "marker": ".", "markersize": 2.5}
@@ -73,7 +73,9 @@ def draw(result: StabilityMap) -> Figure:
 
 def lines(result: StabilityMap) -> list[_PictureAxis]:
     """The axes that vary."""
-    labels = _RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else _LABELS
+    unit = position_unit(result.settings.servo)
+    labels = _LABELS | {"amplitude": (f"reference step ({unit.name})", unit.factor)}
+    labels = _RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else labels
     return [
         _PictureAxis(name, labels[name][0], np.array(values) * labels[name][1])
         for name, values in result.axes
@@ -92,7 +94,8 @@ def _unit(result: StabilityMap) -> tuple[float, str]:
     axes = result.settings.axes
     if isinstance(axes, RatioAxes):
         return 0.5 * result.settings.servo.p * axes.gap, "p b"
-    return 1e-3, "mm"
+    unit = position_unit(result.settings.servo)
+    return unit.si_of(1.0), unit.name
 
 
 def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Figure:
@@ -135,7 +138,8 @@ def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Fig
 def _effort(result: StabilityMap) -> str:
     axes = result.settings.axes
     where = f" at a gap of {math.degrees(axes.gap):g} deg" if isinstance(axes, RatioAxes) else ""
-    return f"voltage{where} (V rms)"
+    unit = command_unit(result.settings.servo)
+    return f"{'voltage' if unit == 'V' else 'command'}{where} ({unit} rms)"
 
 
 def _norm(values: Array, least: float = 0.0) -> Normalize:
@@ -209,7 +213,7 @@ def _curves(result: StabilityMap, across: _PictureAxis) -> Figure:
     axes[2, 0].plot(across.values, np.where(np.isfinite(flat["settling"]), flat["settling"], np.nan), ".-")
     axes[2, 0].set_ylabel("worst 5 %\nsettling (s)")
     axes[3, 0].plot(across.values, flat["effort"], ".-", color=style.BLUE)
-    axes[3, 0].set(ylabel="voltage\n(V rms)", xlabel=across.label)
+    axes[3, 0].set(ylabel=f"command\n({command_unit(result.settings.servo)} rms)", xlabel=across.label)
     if across.logarithmic:
         axes[3, 0].set_xscale("log")
     style.label_panels(axes[:, 0].tolist())

@@ -10,7 +10,7 @@ import numpy as np
 
 from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
-from servotwin.control.laws import filtered_pid
+from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import resolve_plant
 from servotwin.plant.shown import ShownUnit, position_unit
@@ -40,6 +40,7 @@ class MapOptions:
     duration: float | None = None
     window: float | None = None
     still_um: float | None = None
+    still_mdeg: float | None = None
 
     def settings(self) -> MapSettings:
         """Settings of the map.
@@ -50,7 +51,12 @@ class MapOptions:
             An option is outside its range, or the two kinds of axes are mixed.
         """
         servo = resolve_plant(self.servo)
-        own = filtered_pid(servo.controller)
+        own = servo.controller
+        if isinstance(own, LinearLaw) and own.discrete:
+            raise InvalidInput(
+                f"{self.servo} controller: has discrete matrices, and maps are those of the law in continuous time; "
+                "give matrices of continuous time"
+            )
         enter = own.enter if self.enter is None else self.enter
         leave = own.leave if self.leave is None else self.leave
         law = own.replace(sample_rate=None, rate_limit=None, enter=enter, leave=leave)
@@ -65,8 +71,19 @@ class MapOptions:
             seed=self.seed,
             duration=self.duration,
             window=self.window,
-            still=None if self.still_um is None else self.still_um * 1e-6,
+            still=self._still(position_unit(servo).small),
         )
+
+    def _still(self, unit: ShownUnit) -> float | None:
+        """Largest half peak-to-peak of a rest, m or rad."""
+        given = {"um": self.still_um, "mdeg": self.still_mdeg}
+        for name, value in given.items():
+            if value is not None and name != unit.name:
+                raise InvalidInput(
+                    f"--still-{name} {value:g}: {self.servo} rests in {unit.name}; give --still-{unit.name}"
+                )
+        value = given[unit.name]
+        return None if value is None else unit.si_of(value)
 
     def _axes(self, position: ShownUnit) -> Axes:
         ratios = {"--tolerance": self.tolerance, "--amplitude": self.amplitude}

@@ -12,21 +12,30 @@ from rich.table import Table
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.shown import command_unit, position_unit
 
 ROWS = 21
-HEADS = ("all settle\n% of cells", "settled\n% of runs", "error\nmm", "swing\n± mm", "settling\ns", "effort\nV rms")
 _LABELS = {
     "gap": ("gap\ndeg", math.degrees(1.0)),
     "estimate": ("estimate\ndeg", math.degrees(1.0)),
     "k_dz": ("k_DZ", 1.0),
-    "amplitude": ("step\nmm", 1e3),
 }
 _RATIO_LABELS = {"tolerance": ("tolerance\n/(p b)", 1.0), "amplitude": ("step\n/(p b)", 1.0)}
 
 
 def label(result: StabilityMap, name: str) -> tuple[str, float]:
     """An axis's name with its unit, and what its values are multiplied by to be in it."""
-    return (_RATIO_LABELS if isinstance(result.settings.axes, RatioAxes) else _LABELS)[name]
+    if isinstance(result.settings.axes, RatioAxes):
+        return _RATIO_LABELS[name]
+    unit = position_unit(result.settings.servo)
+    return (_LABELS | {"amplitude": (f"step\n{unit.name}", unit.factor)})[name]
+
+
+def heads(result: StabilityMap) -> tuple[str, ...]:
+    """Heads of the table's columns of measures, in the units of the servo."""
+    unit, command = position_unit(result.settings.servo).name, command_unit(result.settings.servo)
+    shares = "all settle\n% of cells", "settled\n% of runs"
+    return (*shares, f"error\n{unit}", f"swing\n± {unit}", "settling\ns", f"effort\n{command} rms")
 
 
 def _table_axis(result: StabilityMap) -> int:
@@ -37,7 +46,7 @@ def _table_axis(result: StabilityMap) -> int:
 
 
 def rows(result: StabilityMap) -> list[tuple[float, Array]]:
-    """One row per value of the table's axis, `ROWS` at most: the value, and the numbers in the order of `HEADS`.
+    """One row per value of the table's axis, `ROWS` at most: the value, and the numbers in the order of `heads`.
 
     Error, swing and settling time are the worst of the cells; shares and effort are means.
     """
@@ -51,18 +60,20 @@ def rows(result: StabilityMap) -> list[tuple[float, Array]]:
 def _numbers(result: StabilityMap, axis: int, place: int) -> Array:
     cells = {name: result.grid(name).take(place, axis) for name in ("settled", "error", "swing", "settling", "effort")}
     shares = 100.0 * np.mean(cells["settled"] == 1.0), 100.0 * np.mean(cells["settled"])
-    worst = 1e3 * cells["error"].max(), 1e3 * cells["swing"].max(), cells["settling"].max()
+    factor = position_unit(result.settings.servo).factor
+    worst = factor * cells["error"].max(), factor * cells["swing"].max(), cells["settling"].max()
     return np.array([*shares, *worst, np.sqrt(np.mean(cells["effort"] ** 2))])
 
 
 def sentences(result: StabilityMap) -> tuple[str, ...]:
     """Runs, definition of settled, and the shares over the whole map."""
     s, settled = result.settings, result.grid("settled")
+    unit = position_unit(s.servo).small
     slow = int(result.slow.sum())
     return (
         f"{s.count} cells with {s.members} initial states each, {s.run_time:g} s a run;"
         f" settled: half the peak-to-peak of the last {s.last_part:g} s"
-        f" below {s.stillness * 1e6:g} um{_scale(result)}.",
+        f" below {unit.factor * s.stillness:g} {unit.name}{_scale(result)}.",
         f"Every run settles in {np.mean(settled == 1.0):.1%} of the cells, none in {np.mean(settled == 0.0):.1%};"
         f" {np.mean(settled):.1%} of all runs settle.",
         f"In {slow} cells the last {s.short_part:g} s alone would call more runs settled: they rest, then move on.",
@@ -70,11 +81,13 @@ def sentences(result: StabilityMap) -> tuple[str, ...]:
 
 
 def _scale(result: StabilityMap) -> str:
-    axes, law = result.settings.axes, result.settings.law
+    axes, law, servo = result.settings.axes, result.settings.law, result.settings.servo
     if not isinstance(axes, RatioAxes):
         return ""
     at = f" at a gap of {math.degrees(axes.gap):g} deg"
-    if law.voltage_limit is not None or law.feedforward != 0.0:  # neither scales with the gap
+    # None of these scales with the gap.
+    limits = law.voltage_limit is not None or servo.command_limit is not None
+    if limits or law.feedforward or servo.motor_friction or servo.guide.friction or servo.guide.force:
         return f"{at}, for which alone this map is made"
     return f"{at}, {result.settings.stillness / (0.5 * result.settings.servo.p * axes.gap):.3g} p b at any"
 
@@ -92,7 +105,7 @@ def print_summary(result: StabilityMap, console: Console) -> None:
     """Print sentences and table."""
     for sentence in sentences(result):
         console.print(sentence, highlight=False)
-    table = Table(label(result, result.axes[_table_axis(result)][0])[0], *HEADS, box=None, pad_edge=False)
+    table = Table(label(result, result.axes[_table_axis(result)][0])[0], *heads(result), box=None, pad_edge=False)
     for value, numbers in rows(result):
         table.add_row(f"{value:.4g}", *_cells(numbers.tolist()))
     console.print(table, highlight=False)

@@ -8,17 +8,21 @@ const percent = (share) => `${brief(share * 100)} %`;
 
 export function chainTable(traces, gaps, unit) {
   const steps = traces.flatMap((trace) => trace.steps.map((step) => ({ trace, step })));
-  if (!steps.length) return element("p", { class: "soft" }, refusals(gaps) || "The twin has sent no update yet.");
+  const open = element("p", { class: "soft" }, newestDecision(gaps, steps.length > 0));
+  if (!steps.length) return open;
   const heads = ["Version", "Sent", "Window", "Gap, deg", "Setting", "Verified on", "The edge", `Error at the end, before → after (${unit.name})`];
-  return element("table", {},
+  const table = element("table", {},
     element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))),
     element("tbody", {}, steps.sort((a, b) => b.step.update.version - a.step.update.version).map(({ trace, step }) => row(trace, step, unit))));
+  return element("div", {}, open, table);
 }
 
-// Why the newest windows led to no update.
-function refusals(gaps) {
-  const reasons = gaps.windows.reasons.at(-1) ?? [];
-  return reasons.length ? `The twin has sent no update yet. The newest estimate: ${reasons.join("; ")}.` : "";
+// Why the newest window led to no update, where it did not.
+function newestDecision(gaps, some) {
+  const { reasons, decision } = gaps.windows;
+  const why = decision.at(-1) || (reasons.at(-1) ?? []).join("; ");
+  const first = some ? "" : "The twin has sent no update yet. ";
+  return why ? `${first}The newest window led to none: ${why}.` : first;
 }
 
 function row(trace, step, unit) {

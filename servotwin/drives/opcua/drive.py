@@ -15,7 +15,6 @@ from servotwin.drives.opcua.settings import OpcUaSettings
 from servotwin.edge.drive import Block, DriveLost, DriveRefused
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains
 
 _MOST_CHANGES = 8
 """Number of versions whose first sample is stored: between two polls there are never more."""
@@ -87,20 +86,17 @@ class OpcUaDrive:
     def write(self, parameters: Parameters) -> None:
         """Write all, commit, and wait for the drive's decision."""
         session = self._connected
-        if parameters.setting.law is not None:
-            raise DriveRefused(f"drive {self._settings.url}: takes the gains of a filtered PID only")
-        gains = parameters.setting.pid or Gains(0.0, 0.0, 0.0, 1.0)
-        needed = [model.INTEGRAL_ONLY] if gains.integral_only else []
-        needed += model.VELOCITY if gains.velocity_feedforward else ()
-        needed += [model.FRICTION] if gains.friction_feedforward else []
-        needed += model.NOTCH if gains.notch_hz else ()
-        for name in needed:
-            if not session.has(name):
-                raise DriveRefused(f"drive {self._settings.url}: has no variable {name}")
+        gains = parameters.setting.gains
+        values = dict(
+            zip(model.PARAMETERS, (parameters.version, parameters.setting.tolerance, gains is not None), strict=True)
+        )
+        if gains is not None:
+            if missing := [name for name in model.needed(gains) if not session.has(name)]:
+                raise DriveRefused(f"drive {self._settings.url}: has no variable {', '.join(missing)}")
+            named = {model.variable(name): value for name, value in msgspec.structs.asdict(gains).items()}
+            values |= {name: value for name, value in named.items() if session.has(name)}
         before, committed = session.read((model.COMMIT, model.DECISION[0]))
-        values = (parameters.version, parameters.setting.tolerance, parameters.setting.gains is not None)
-        written = zip((*model.PARAMETERS, *model.OPTIONAL), (*values, *msgspec.structs.astuple(gains)), strict=True)
-        session.write({name: value for name, value in written if name in model.PARAMETERS or session.has(name)})
+        session.write(values)
         commit = (max(before, committed) + 1) % 2**32
         session.write({model.COMMIT: commit})
         self._wait_for(session, commit)

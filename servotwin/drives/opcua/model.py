@@ -6,6 +6,10 @@ samples were not overwritten. The client writes the parameters first, then `Comm
 changes, accepts all or none, and reports that in `Committed` and `Refused`.
 """
 
+import msgspec
+
+from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains
+
 NAMESPACE = "urn:servotwin:drive:1"
 OBJECT = "Drive"
 
@@ -19,26 +23,31 @@ STATE = ("Machine", "Count", *SIGNALS, "Version", "Since", "Count")
 """String, the name of the machine's present run; UInt64, samples taken in it; the arrays; Int64, version in force, and
 UInt64, the first sample under it; the count again. Read in this order in one request."""
 
-GAINS = ("Kp", "Ki", "Kd", "Tf", "Enter", "Leave", "Feedforward")
-"""Double: V/m, V/(m s), V s/m, s, tolerances, tolerances, V."""
+PARAMETERS = ("NewVersion", "Tolerance", "SetGains")
+"""Int64; Double, m (rotary: rad); Boolean, whether the gains count too."""
 
-PARAMETERS = ("NewVersion", "Tolerance", "SetGains", *GAINS)
-"""Int64; Double, m; Boolean, whether the gains count too; the gains."""
 
-INTEGRAL_ONLY = "IntegralOnly"
-"""Boolean, whether the dead zone stops the integral only; a drive that lacks it cannot do that."""
+def variable(name: str) -> str:
+    """Variable of a gain: `position_gain` is PositionGain."""
+    return "".join(word[:1].upper() + word[1:] for word in name.split("_"))
 
-VELOCITY = ("VelocityFeedforward", "VelocityTime")
-"""Double: V s/m, s; a drive that lacks them has no velocity feedforward."""
 
-FRICTION = "FrictionFeedforward"
-"""Double, V; a drive that lacks it has no friction feedforward."""
+def needed(gains: AnyGains) -> list[str]:
+    """Variables without which a drive cannot run on these gains: those without a default, and those that differ from
+    it; numbers of what is switched off are not needed."""
+    fields = msgspec.structs.fields(type(gains))
+    different = [each.name for each in fields if each.required or getattr(gains, each.name) != each.default]
+    on = {name for name in different if name not in _BELONGS}
+    return [variable(each.name) for each in fields if _BELONGS.get(each.name, each.name) in on]
 
-NOTCH = ("NotchHz", "NotchDamping", "NotchDepth")
-"""Double: Hz, ratio, gain at the centre; a drive that lacks them has no notch."""
 
-OPTIONAL = (INTEGRAL_ONLY, *VELOCITY, FRICTION, *NOTCH)
-"""Gains that not every drive has."""
+_BELONGS = {"velocity_time": "velocity_feedforward", "notch_damping": "notch_hz", "notch_depth": "notch_hz"}
+"""Gains that mean nothing where another one is 0."""
+
+GAINS = tuple(
+    dict.fromkeys(variable(name) for kind in (Gains, CascadeGains, LinearGains) for name in kind.__struct_fields__)
+)
+"""Double, but for IntegralOnly, a Boolean; units as of `servotwin.messages`. A drive has those of its own law."""
 
 COMMIT = "Commit"
 """UInt32, another number each time."""

@@ -116,10 +116,10 @@ class OpcUaSession:
         place = await client.get_namespace_index(model.NAMESPACE)
         drive = await client.nodes.objects.get_child(f"{place}:{s.node}")
         self._nodes = {name: await drive.get_child(f"{place}:{name}") for name in model.EVERY}
-        for name in model.OPTIONAL:
+        for name in model.GAINS:
             with suppress(*self._missing):
                 self._nodes[name] = await drive.get_child(f"{place}:{name}")
-        for name in filter(self.has, (*model.PARAMETERS, model.COMMIT, *model.OPTIONAL)):
+        for name in filter(self.has, (*model.PARAMETERS, model.COMMIT, *model.GAINS)):
             self._types[name] = await self._nodes[name].read_data_type_as_variant_type()
 
     def _typed(self, name: str, value: Any) -> Any:

@@ -11,7 +11,7 @@ import time
 from servotwin.cosim.machine import compile_ahead
 from servotwin.drives.simulated.control import ControlServer
 from servotwin.drives.simulated.pace import Pace
-from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
+from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant, law_of_machine
 from servotwin.drives.simulated.server import (
     OnSample,
     Server,
@@ -37,7 +37,9 @@ def main(path: str, stop: StopRequest) -> None:
         The file is missing, or does not describe a machine.
     """
     settings = MachineSettings.load(path)
-    compile_ahead(settings.scenario)  # before "ready": a compilation takes seconds, and a tick would wait for it
+    compile_ahead(
+        settings.scenario, law_of_machine(settings)
+    )  # before "ready": a compilation takes seconds, and a tick would wait for it
     plant = ControlledPlant(settings) if settings.role == "control" else SupervisedPlant(settings)
     with listening(settings.address) as listener:
         pace = start_pace(settings)

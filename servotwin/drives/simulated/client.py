@@ -6,15 +6,10 @@ from array import array
 from dataclasses import dataclass
 from math import nan
 
-import msgspec
-
 from servotwin.drives.simulated import wire
 from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains
-
-_NO_GAINS = (0.0,) * len(Gains.__struct_fields__)
 
 
 @dataclass(frozen=True)
@@ -207,18 +202,16 @@ class SimulatedSupervised:
 
     def write(self, parameters: Parameters) -> None:
         """Put parameters in force from the next sample on."""
-        if parameters.setting.law is not None:
-            raise DriveRefused("the simulated machine takes the gains of a filtered PID only")
-        gains = _NO_GAINS if parameters.setting.pid is None else msgspec.structs.astuple(parameters.setting.pid)
-        numbers = parameters.setting.tolerance, *gains
-        has_gains = parameters.setting.gains is not None
-        status, count, _, _ = self._request(wire.WRITE, parameters.version, numbers, has_gains)
+        setting = parameters.setting
+        status, count, _, _ = self._request(
+            wire.WRITE, parameters.version, setting.tolerance, wire.packed_gains(setting.gains)
+        )
         if status == wire.REFUSED:
             raise DriveRefused(self._connection.receive(count).decode("utf-8", "replace"))
 
     def move(self, offset: float) -> None:
         """Add `offset` (m) to the reference from the next sample on."""
-        self._request(wire.MOVE, 0, (offset, *_NO_GAINS))
+        self._request(wire.MOVE, 0, offset)
 
     def close(self) -> None:
         """Close the connection; the machine runs on."""
@@ -228,11 +221,11 @@ class SimulatedSupervised:
         self,
         kind: int,
         number: int,
-        numbers: tuple[float, ...] = (0.0, *_NO_GAINS),
-        has_gains: bool = False,
+        length: float = 0.0,
+        gains: wire.PackedGains = wire.NO_GAINS,
         most: int = 0,
     ) -> tuple[int, int, int, int]:
-        """Send one request; return status, count, first sample and version of its reply."""
-        self._connection.send(wire.REQUEST.pack(kind, has_gains, most, number, *numbers))
+        """Send one request, with a tolerance or an offset (m) and gains; return its reply without the lag."""
+        self._connection.send(wire.REQUEST.pack(kind, gains.kind, most, number, length, *gains.numbers))
         status, count, first, version, self._lag = wire.REPLY.unpack(self._connection.receive(wire.REPLY.size))
         return status, count, first, version

@@ -12,18 +12,26 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController
 from servotwin.cosim import machine
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.messages import Gains, Setting
+from servotwin.messages import AnyGains, Setting
 from servotwin.simulation.endless import OpenLoopPlant
 
 _HISTORY = 1024
 """Samples that the plant in the role control remembers; no reader needs older ones."""
 
 CHANNELS = ("reference", "theta_m", "position", "voltage")
+
+
+def law_of_machine(settings: MachineSettings) -> AnyController:
+    """The law that the machine itself runs: in the role control one without gains, as the voltage is the client's."""
+    own = settings.scenario.law
+    return own if settings.role == "supervise" else Controller(0.0, 0.0, 0.0, 1.0, sample_rate=own.sample_rate)
 
 
 class ControlledPlant:
@@ -35,7 +43,7 @@ class ControlledPlant:
     """
 
     def __init__(self, settings: MachineSettings) -> None:
-        self._plant = OpenLoopPlant(machine.endless(settings.present, _HISTORY))
+        self._plant = OpenLoopPlant(machine.endless(settings.present, _HISTORY, law_of_machine(settings)))
         self._end, self._watchdog = settings.end, settings.watchdog * settings.rate  # both in samples
         self._voltage, self._without_voltage = 0.0, 0
         self.sample: Callable[[], tuple[float, float, float]] = self._plant.sample
@@ -136,7 +144,7 @@ class SupervisedPlant:
             count += values[-1].shape[1]
         return SampleBlock(max(first, block.first), block.version, np.hstack(values))
 
-    def write(self, version: int, tolerance: float, gains: Gains | None) -> None:
+    def write(self, version: int, tolerance: float, gains: AnyGains | None) -> None:
         """Put parameters in force from the present sample on.
 
         Raises

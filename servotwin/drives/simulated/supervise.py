@@ -21,11 +21,10 @@ class DriveRequest(NamedTuple):
     """Request of a client; `number` is a sample or a version, `tolerance` (m) also the offset of a move."""
 
     kind: int
-    with_gains: int
     most: int
     number: int
     tolerance: float
-    gains: tuple[float, ...]
+    gains: wire.PackedGains
 
 
 class SuperviseServer:
@@ -101,8 +100,7 @@ class SuperviseServer:
         """Write parameters or begin a move, or reply with the reason of the refusal."""
         try:
             if request.kind == wire.WRITE:
-                gains = wire.gains_of(request.gains) if request.with_gains else None
-                self._plant.write(request.number, request.tolerance, gains)
+                self._plant.write(request.number, request.tolerance, wire.gains_of(request.gains))
             elif request.kind == wire.MOVE:
                 self._plant.move(request.tolerance)
             else:
@@ -115,5 +113,5 @@ class SuperviseServer:
 
 
 def _decode_request(data: bytes) -> DriveRequest:
-    kind, with_gains, most, number, tolerance, *gains = wire.REQUEST.unpack(data)
-    return DriveRequest(kind, with_gains, most, number, tolerance, tuple(gains))
+    kind, gains, most, number, tolerance, *numbers = wire.REQUEST.unpack(data)
+    return DriveRequest(kind, most, number, tolerance, wire.PackedGains(gains, tuple(numbers)))

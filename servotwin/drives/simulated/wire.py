@@ -11,18 +11,19 @@ import struct
 from typing import NamedTuple
 
 from msgspec import convert
+from msgspec.structs import astuple
 
 from servotwin.errors import InvalidInput
-from servotwin.messages import Gains
+from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains
 
-MAGIC, VERSION = b"STDR", 4
+MAGIC, VERSION = b"STDR", 5
 CONTROL, SUPERVISE = 1, 2
 ROLES = {"control": CONTROL, "supervise": SUPERVISE}
 HELLO = struct.Struct("<4sHBx")  # magic, version, role
 WELCOME = struct.Struct("<4sHB x8sd")  # magic, version, role; the machine's run, rate in Hz
 SAMPLE = struct.Struct("<qdddd")  # number, reference, theta_m, position, lag in s
 VOLTAGE = struct.Struct("<d")  # V; where it is not finite the last one holds
-REQUEST = struct.Struct("<BB2xIq15d")  # kind, with gains, most; number or version; tolerance or offset, gains
+REQUEST = struct.Struct("<BB2xIq15d")  # kind, kind of gains, most; number or version; tolerance or offset, gains
 REPLY = struct.Struct("<B3xIqqd")  # kind, count; first, version, lag in s
 READ, WRITE, MOVE = 1, 2, 3
 DONE, REFUSED, OVER = 0, 1, 2
@@ -46,10 +47,43 @@ class Address(NamedTuple):
         return f"unix:{self.path}" if self.path is not None else f"{self.host}:{self.port}"
 
 
-def gains_of(numbers: tuple[float, ...]) -> Gains:
-    """Gains of the numbers of a request, which are doubles all of them."""
-    named = dict(zip(Gains.__struct_fields__, numbers, strict=True))
-    return convert({**named, "integral_only": named["integral_only"] > 0.5}, Gains)
+class PackedGains(NamedTuple):
+    """Gains in a request: their kind (0: none), and their numbers, all as doubles, with zeros behind them."""
+
+    kind: int
+    numbers: tuple[float, ...]
+
+
+_KINDS: tuple[type[AnyGains], ...] = (Gains, CascadeGains, LinearGains)
+_NUMBERS = len(Gains.__struct_fields__)
+NO_GAINS = PackedGains(0, (0.0,) * _NUMBERS)
+
+
+def packed_gains(gains: AnyGains | None) -> PackedGains:
+    """Gains of any law as a request has them."""
+    if gains is None:
+        return NO_GAINS
+    numbers = astuple(gains)
+    return PackedGains(1 + _KINDS.index(type(gains)), (*numbers, *(0.0,) * (_NUMBERS - len(numbers))))
+
+
+def gains_of(packed: PackedGains) -> AnyGains | None:
+    """Gains of a request.
+
+    Raises
+    ------
+    InvalidInput
+        Their kind is unknown.
+    msgspec.ValidationError
+        A number is out of its range.
+    """
+    if packed.kind == 0:
+        return None
+    if packed.kind > len(_KINDS):
+        raise InvalidInput(f"kind of gains {packed.kind}: is unknown; allowed are 0 (none) to {len(_KINDS)}")
+    kind = _KINDS[packed.kind - 1]
+    named = dict(zip(kind.__struct_fields__, packed.numbers, strict=False))
+    return convert({**named, "integral_only": named["integral_only"] > 0.5}, kind)
 
 
 def parse_address(text: str) -> Address:

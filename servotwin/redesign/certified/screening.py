@@ -95,7 +95,8 @@ class Screening:
         self._misses = np.zeros(self._members.count, dtype=np.int64)
 
     def ranked(self, candidates: Sequence[Design], passing: bool = False) -> Iterator[Design]:
-        """Candidates that meet the demands on the machines first, then by cost; `passing`: no others."""
+        """Candidates, each once: first those that meet the demands on the machines, by cost; `passing`: no others."""
+        candidates = list(dict.fromkeys(candidates))
         self._start(candidates)
         waiting = [(self._rank(setting, place), setting) for place, setting in enumerate(candidates)]
         while waiting:

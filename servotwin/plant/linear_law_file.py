@@ -1,0 +1,164 @@
+"""Linear law in the file of an axis: its matrices row by row, or a file with those of a system."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+
+from servotwin.config.keys import Form, key
+from servotwin.config.table import Table, did_you_mean
+from servotwin.control.linear_law import LOAD, MOTOR, LinearLaw
+from servotwin.control.matrices import Rows
+from servotwin.errors import InvalidInput
+from servotwin.plant.signals import Array
+
+_LARGEST_FILE = 1_000_000  # bytes: a law of more than 300 states has no place in a loop
+_SUFFIXES = (".npz", ".mat")
+
+
+class _System(NamedTuple):
+    """Matrices of a file, and their sample time (s) where they are discrete."""
+
+    A: Array
+    B: Array
+    C: Array
+    D: Array
+    dt: float | None
+
+
+def _rows(table: Table, name: str, given: Any, _folder: Path) -> Rows:
+    """A matrix, row by row."""
+    if not (isinstance(given, list) and all(isinstance(row, list) for row in given)):
+        raise table.invalid(name, "a list of rows, each a list of numbers")
+    numbers = [value for row in given for value in row]
+    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
+        raise table.invalid(name, "a list of rows, each a list of numbers")
+    return tuple(tuple(float(value) for value in row) for row in given)
+
+
+def _names(table: Table, name: str, given: Any, _folder: Path) -> tuple[str, ...]:
+    if not (isinstance(given, list) and all(isinstance(each, str) for each in given)):
+        raise table.invalid(name, "a list of texts")
+    return tuple(given)
+
+
+def linear_law(
+    system: Annotated[
+        Path | None,
+        key(
+            help="Instead of A, B, C and D: NAME.npz or NAME.mat with them, and dt in s where they are discrete; of "
+            "one input (the error), two (reference and the measurement that `on` names) or three."
+        ),
+    ] = None,
+    A: Annotated[
+        Rows, key(form=Form.OTHER, parse=_rows, help="States to their derivatives, n rows of n; discrete: to the next.")
+    ] = (),
+    B: Annotated[
+        Rows, key(form=Form.OTHER, parse=_rows, help="Reference, y_motor (rad) and y_load to the same: n rows of 3.")
+    ] = (),
+    C: Annotated[tuple[float, ...], key(help="States to the command, n numbers.")] = (),
+    D: Annotated[tuple[float, ...], key(help="Reference, y_motor (rad) and y_load to the command: 3 numbers.")] = (),
+    sample_rate: Annotated[
+        float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
+    ] = None,
+    discrete: Annotated[bool, key(help="The matrices belong to that rate.")] = False,
+    names: Annotated[
+        tuple[str, ...], key(form=Form.OTHER, parse=_names, help="Of the states; x1, x2 and so on where absent.")
+    ] = (),
+    on: Annotated[str, key(choices=(LOAD, MOTOR), help="Measurement of the error that the dead zone looks at.")] = LOAD,
+    ratio: Annotated[
+        float | None,
+        key("travel_m_per_rad", above=0.0, help="Travel of the load per angle of the motor; the transmission's."),
+    ] = None,
+    enter: Annotated[
+        float, key("enter_tolerances", minimum=0.0, help="Error at or below which the dead zone is entered.")
+    ] = 1.0,
+    leave: Annotated[
+        float, key("leave_tolerances", minimum=0.0, help="Error above which it is left; at least enter_tolerances.")
+    ] = 1.0,
+    holds: Annotated[tuple[str, ...], key(form=Form.OTHER, parse=_names, help="States that the dead zone stops.")] = (),
+    integral_only: Annotated[
+        bool, key(help="Inside the dead zone nothing else stops; otherwise the loop opens there.")
+    ] = True,
+    voltage_limit: Annotated[
+        float | None, key("voltage_limit_v", above=0.0, help="Largest command, either sign; no limit where absent.")
+    ] = None,
+    rate_limit: Annotated[
+        float | None,
+        key("rate_limit_v_per_s", above=0.0, help="Largest rate of change of the command; no limit where absent."),
+    ] = None,
+    windup: Annotated[
+        tuple[float, ...],
+        key(help="Back-calculation: added to the states' derivatives per command that the limits cut off; n numbers."),
+    ] = (),
+    feedforward: Annotated[float, key("feedforward_v", help="Command added at all times.")] = 0.0,
+    release_time: Annotated[
+        float,
+        key("release_time_s", above=0.0, help="Time constant with which the offset after a change of law fades."),
+    ] = 0.5,
+    gain: Annotated[float, key(above=0.0, unit="1", help="Factor on the whole law.")] = 1.0,
+    integral_share: Annotated[
+        float, key(minimum=0.0, unit="1", help="Factor on what the states in `holds` take in.")
+    ] = 1.0,
+) -> LinearLaw:
+    """Any linear law of reference, y_motor and y_load."""
+    rest: dict[str, Any] = {
+        "names": names, "enter": enter, "leave": leave, "holds": holds, "integral_only": integral_only,
+        "voltage_limit": voltage_limit, "rate_limit": rate_limit, "windup": windup, "feedforward": feedforward,
+        "release_time": release_time, "gain": gain, "integral_share": integral_share,
+    }  # fmt: skip
+    travel = 1.0 if ratio is None else ratio
+    if system is None:
+        if not D:
+            raise InvalidInput("law D: is missing; give A, B, C and D, or system with the path of a .npz or .mat")
+        return LinearLaw(A, B, C, D, sample_rate, discrete, on=on, ratio=travel, **rest)
+    if A or B or C or D or discrete:
+        raise InvalidInput(f"law system = {system}: brings A, B, C, D and dt; leave A, B, C, D and discrete out")
+    if sample_rate is not None:
+        rest["sample_rate"] = sample_rate
+    return LinearLaw.from_system(_read_system(system), on, travel, **rest)
+
+
+def _read_system(path: Path) -> _System:
+    """Read the matrices of a system.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read, or holds no such matrices.
+    """
+    if path.suffix not in _SUFFIXES:
+        raise InvalidInput(f"law system = {path}: must be a .npz or a .mat")
+    arrays = _arrays(path)
+    for name in ("A", "B", "C", "D"):
+        if name not in arrays:
+            found = ", ".join(arrays) or "nothing"
+            raise InvalidInput(f"law system = {path}: has no {name}{did_you_mean(name, arrays)}; it has {found}")
+    try:
+        A, B, C, D = (np.atleast_2d(np.asarray(arrays[name], dtype=float)) for name in "ABCD")
+        dt = float(np.asarray(arrays.get("dt", 0.0), dtype=float).item())
+    except (TypeError, ValueError):
+        raise InvalidInput(f"law system = {path}: A, B, C and D must be matrices of numbers, and dt a number") from None
+    if A.size == 0:
+        A, B, C = np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((1, 0))
+    return _System(A, B, C, D, dt or None)
+
+
+def _arrays(path: Path) -> Mapping[str, Any]:
+    try:
+        if path.stat().st_size > _LARGEST_FILE:
+            raise InvalidInput(f"law system = {path}: has more than {_LARGEST_FILE} bytes; give the matrices alone")
+        if path.suffix == ".npz":
+            with np.load(path, allow_pickle=False) as file:
+                return dict(file)
+        from scipy.io import loadmat
+
+        return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+    except OSError as error:
+        raise InvalidInput(f"law system = {path}: cannot be read ({error.strerror or error})") from None
+    except (ValueError, NotImplementedError, zipfile.BadZipFile, EOFError) as error:
+        raise InvalidInput(f"law system = {path}: is no {path.suffix} file of matrices ({error})") from None
