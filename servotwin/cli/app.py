@@ -105,6 +105,7 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "convert": study.convert,
     "identify": study.identify,
     "commission": study.commission,
+    "dataset": study.dataset,
     "edge": deployed.edge,
     "limit-cycle": design.limit_cycle,
     "tune": design.tune,

@@ -17,7 +17,7 @@ from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
-from servotwin.logs.drive_recordings import DriveColumns
+from servotwin.logs.drive_recordings import DriveColumns, DriveLog
 from servotwin.plant.axis import Axis
 from servotwin.runtime import files
 
@@ -219,6 +219,7 @@ def _remarks(found: CommissionedAxis) -> list[str]:
             f"simulated loop beside the log: position off by {100 * simulated.position_error:.2g} %, "
             f"force by {100 * simulated.force_error:.2g} %"
         )
+    lines += _shaft_lines(found)
     lines += [f"no simulation: {doubt}" for doubt in drive.doubts]
     if found.force_per_command is None:
         lines.append(
@@ -226,6 +227,72 @@ def _remarks(found: CommissionedAxis) -> list[str]:
             "--inertia of all that moves"
         )
     return [*lines, f"next experiment: {drive.advice}"]
+
+
+def _shaft_lines(found: CommissionedAxis) -> list[str]:
+    """Gap, resonance and delay between two encoders."""
+    log, shaft, split = found.logs[0], found.drive.shaft, found.drive.split
+    lines = []
+    if log.lost_motion is not None:
+        lost, unit = log.lost_motion, log.recording.unit
+        low, high = lost.interval_load
+        lines.append(f"gap at the load: {lost.gap_load:.4g} {unit} ({low:.4g} .. {high:.4g}): {lost.status.value}")
+    if shaft is None:
+        return lines
+    late = f"the load's encoder is {1e3 * shaft.delay:.3g} +- {2e3 * shaft.delay_std:.2g} ms late"
+    if not math.isfinite(shaft.resonance):
+        return [
+            *lines,
+            f"shaft: no elasticity below {shaft.highest:.3g} Hz, to which the encoders are coherent; {late}",
+        ]
+    lines.append(
+        f"shaft: resonance {shaft.resonance:.4g} +- {2.0 * shaft.resonance_std:.2g} Hz with the motor held, "
+        f"damping ratio {shaft.damping:.2g}, coherent up to {shaft.highest:.3g} Hz; {late}"
+    )
+    if split is not None:
+        load, motor = split["load_inertia"], split["motor_inertia"]
+        lines.append(
+            f"shaft: {load:.4g} +- {split.half_width('load_inertia'):.2g} behind and {motor:.4g} before it "
+            f"({_units(found)['inertia']}), stiffness {shaft.stiffness(load):.4g}, "
+            f"damping {shaft.shaft_damping(load):.4g}"
+        )
+    return lines
+
+
+def _shaft_dict(found: CommissionedAxis) -> dict[str, Any] | None:
+    shaft, split = found.drive.shaft, found.drive.split
+    if shaft is None:
+        return None
+
+    def number(value: float) -> float | None:
+        return value if math.isfinite(value) else None
+
+    load = math.nan if split is None else split["load_inertia"]
+    return {
+        "resonance_hz": number(shaft.resonance),
+        "resonance_std_hz": number(shaft.resonance_std),
+        "damping_ratio": number(shaft.damping),
+        "delay_s": shaft.delay,
+        "delay_std_s": shaft.delay_std,
+        "coherent_up_to_hz": shaft.highest,
+        "load_inertia": number(load),
+        "motor_inertia": None if split is None else split["motor_inertia"],
+        "stiffness": number(shaft.stiffness(load)),
+        "damping": number(shaft.shaft_damping(load)),
+    }
+
+
+def _gap_dict(log: DriveLog) -> dict[str, Any] | None:
+    lost = log.lost_motion
+    if lost is None:
+        return None
+    known = all(map(math.isfinite, (lost.gap_load, *lost.interval_load)))
+    return {
+        "status": lost.status.value,
+        "gap_load": lost.gap_load if known else None,
+        "interval_load": list(lost.interval_load) if known else None,
+        "unit": log.recording.unit,
+    }
 
 
 def as_dict(found: CommissionedAxis) -> dict[str, Any]:
@@ -267,6 +334,8 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
             "integral_time_s": drive.law.integral_time,
             "speed_filter_s": drive.law.speed_filter,
         },
+        "shaft": _shaft_dict(found),
+        "gap": _gap_dict(found.logs[0]),
         "force_per_command": found.force_per_command,
         "doubts": list(drive.doubts),
         "next_experiment": str(drive.advice),

@@ -14,12 +14,17 @@ from servotwin.estimation.inverse_dynamics.closed_loop import rigid_axis
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.estimation.inverse_dynamics.identify import IdentifiedDrive, identify_drive
+from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
 from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
 from servotwin.plant.sensors import LOAD, MOTOR, Sensors
+from servotwin.plant.transmission import FREE, Transmission
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
 _WIDEST = 0.99  # relative half-width that an uncertainty may have
+# Relative errors beyond the statistical ones that derivatives and a gap in the shaft brought (test_shaft).
+_SHAFT = {"m": 0.03, "k": 0.1, "c": 0.5}
 _PHASE_MARGIN = math.radians(60.0)
 _BY_NAME, _FITTED = DriveColumns(), GivenGains()
 
@@ -112,6 +117,8 @@ def commission(
     drive = identify_drive([each.recording for each in read], gains, travel, applied)
     found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
     axis = None if drive.law is None else rigid_axis(found.best, drive.law, first, travel)
+    if axis is not None and drive.shaft is not None and drive.split is not None:
+        axis = _with_shaft(axis, drive.shaft, drive.split)
     if axis is not None and feedback == LOAD:
         axis = _with_load_encoder(axis, first.load_resolution or first.resolution)
     if axis is not None and crossover is not None:
@@ -147,6 +154,16 @@ def _scaled(logs: Sequence[DriveLog], inertia: float, gains: GivenGains, applied
     )
 
 
+def _with_shaft(axis: Axis, shaft: ShaftResponse, split: ParameterFit) -> Axis:
+    """The axis with its inertia divided, on a shaft that is free in its gap."""
+    motor, load, p = split["motor_inertia"], split["load_inertia"], axis.p
+    if min(motor, load) <= 0.0:
+        return axis
+    actuator = replace(axis.actuator, J=motor * p * p)  # type: ignore[arg-type]
+    screw = Transmission(p, shaft.stiffness(load), shaft.shaft_damping(load), FREE)
+    return replace(axis, actuator=actuator, transmission=screw, load=Load((load,), motion=axis.load.motion))
+
+
 def _with_load_encoder(axis: Axis, resolution: float) -> Axis:
     law = axis.controller.replace(on=LOAD)  # type: ignore[call-arg]
     sensors = Sensors(axis.sensors.encoder_resolution, resolution, LOAD)
@@ -162,7 +179,14 @@ def _uncertainty(found: CommissionedAxis, p: float) -> Uncertainty:
     viscous = (fit.half_width("viscous") + max(widest)) / fit["viscous"] if fit["viscous"] > 0.0 else _WIDEST
     coulomb = max(fit["coulomb"], sides["coulomb_forward"], sides["coulomb_backward"]) - fit["coulomb"]
     offset, half = -fit["offset"] * p, fit.half_width("offset") * p
-    return Uncertainty(
+    shaft, known = found.drive.shaft, Uncertainty()
+    if shaft is not None and found.drive.split is not None:
+        mass = found.drive.split
+        load = _SHAFT["m"] + mass.half_width("load_inertia") / abs(mass["load_inertia"])
+        stiffness = load + _SHAFT["k"] + 4.0 * shaft.resonance_std / shaft.resonance
+        damping = load + _SHAFT["c"] + 2.0 * shaft.damping_std / shaft.damping if shaft.damping > 0.0 else _WIDEST
+        known = known.replace(m=min(load, _WIDEST), k=min(stiffness, _WIDEST), c=min(damping, _WIDEST))
+    return known.replace(
         # The inertia of a rigid axis turns with the motor: less inertia is more torque per inertia.
         k_T=min(inertia, _WIDEST),
         k_B=min(viscous, _WIDEST),

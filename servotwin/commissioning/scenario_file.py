@@ -14,6 +14,8 @@ _STEPS = (30.0, 100.0)  # amplitudes of the square wave, in gaps, that the twin'
 _WEAR = (0.1, 1.0)  # gap at the begin and at the end of the scenario, of the largest one
 _CYCLES = 3
 _LEAST_WINDOW = 500  # samples
+# Of half a period: a motor that comes to rest without overshoot touches one flank in each step, so a window holds two.
+_WINDOW, _BEFORE = 1.5, 0.95
 _TIMES = 40.0  # time constants of the loop in half a period
 
 
@@ -36,8 +38,8 @@ def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) ->
     crossovers = axis.margins().gain_crossovers
     half = _TIMES / min(each.omega for each in crossovers) if crossovers else 1.0
     rate = float(axis.controller.sample_rate or 1.0)
-    window = math.ceil(max(0.5 * half * rate, _LEAST_WINDOW)) / rate
-    half = 2.0 * window
+    # Whole samples, and whole fifths of them.
+    half = 20.0 * math.ceil(max(half * rate, _LEAST_WINDOW) / 20.0) / rate
     gaps = [math.degrees(share * largest_gap / axis.p) for share in _WEAR]
     bias = 0.5 * (known.input_bias[0] + known.input_bias[1])
     values: Values = {
@@ -47,7 +49,7 @@ def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) ->
         "reference": {"kind": "square", f"amplitude_{unit}": per * amplitude, "period_s": 2.0 * half},
         "gap": {"from_deg": gaps[0], "to_deg": gaps[1], "over_s": 2.0 * _CYCLES * half},
         "disturbances": {"input_bias_n_m": bias},
-        "recording": {"sample_rate_hz": rate, "window_s": window},
+        "recording": {"sample_rate_hz": rate, "window_s": _WINDOW * half, "pre_trigger_s": _BEFORE * half},
         "twin": {
             "policy": "certified",
             "uncertainty": {

@@ -61,7 +61,9 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     """
     settings = settings.on(servo)
     model = servo_for(servo)
-    if model is None and (settings.estimator is not None or settings.method != whitened.METHOD):
+    # A file without a table [estimator] gives the defaults of its method.
+    stated = settings.estimator not in (None, whitened.WhitenedSettings()) or settings.method != whitened.METHOD
+    if model is None and stated:
         raise InvalidInput(
             f"[twin] method = {settings.method!r} and its settings: are for axes that are held in the gap and have "
             "two masses or more; leave them out for this axis"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drive_recordings import GAINS, PARAMETERS, prescribed, simulated
+from drive_recordings import GAINS, PARAMETERS, elastic, prescribed, simulated
 from typer.testing import CliRunner
 
 import servotwin as st
@@ -137,6 +137,29 @@ def test_an_axis_file_needs_a_controller(tmp_path):
     assert result.exit_code == 2
     assert "give --reference COLUMN, or --position-gain and --velocity-gain" in result.stderr
     assert run(lone, "-o", tmp_path / "axis.toml", "--position-gain", 25, "--velocity-gain", 2400).exit_code == 0
+
+
+def test_two_encoders_give_the_shaft_and_the_gap(tmp_path):
+    recording = elastic(gap=0.01)
+    table = [
+        np.arange(recording.position.size) / recording.rate,
+        recording.position,
+        recording.force,
+        recording.reference,
+    ]
+    header = "t [s],motor [m],force [N],reference [m],load [m]"
+    log = tmp_path / "log.csv"
+    np.savetxt(log, np.column_stack([*table, recording.load]), delimiter=",", header=header, comments="", fmt="%.12g")
+    result = run(log, "-o", tmp_path / "axis.toml", "--json")
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    axis = st.Axis.from_file(tmp_path / "axis.toml")
+    assert axis.transmission.in_gap == "free"
+    assert axis.load.m[0] == pytest.approx(12.0, rel=0.03)
+    # A gap of 10 um makes it seem softer.
+    assert axis.transmission.k_d == pytest.approx(2e5, rel=0.15)
+    assert found["shaft"]["stiffness"] == pytest.approx(axis.transmission.k_d)
+    assert found["gap"]["status"]
 
 
 @pytest.mark.skipif(not EMPS.exists(), reason="the EMPS data set is not beside this checkout (shared/data)")

@@ -61,6 +61,26 @@ def recording_of(position, force, reference=None, count=1e-7, **more):
 
 
 @cache
+def elastic(stiffness=2e5, damping=60.0, gap=0.0, noise=1e-8, rate=2000.0):
+    """A simulated loop of 8 kg at the motor and 12 kg on a shaft, shaken a little; positions of both ends."""
+    p, random = 1e-3, np.random.default_rng(1)
+    axis = st.Axis(
+        st.TorqueDrive(8.0 * p * p, friction=150.0 * p * p, coulomb=12.0 * p),
+        st.Transmission(p, stiffness, damping, in_gap="free"),
+        st.Load((12.0,), (0.0,), (20.0,)),
+        st.Cascade(20.0, p, 1500.0 * p * p, on="motor", speed_filter=2e-3, sample_rate=rate),
+        st.Sensors(feedback="motor"),
+    )
+    reference = strokes(cycles=2, rate=rate)
+    reference = reference + 1e-4 * np.convolve(random.standard_normal(reference.size), np.hanning(9), "same")
+    time = np.arange(reference.size) / rate
+    held = st.Samples(tuple(time), tuple(reference))
+    run = st.simulate(axis, time[-1], reference=held, sample_rate=rate, gap=gap)
+    load = run.position + noise * random.standard_normal(time.size)
+    return recording_of(run.theta_m * p, run.voltage / p, reference, rate=rate, load=load)
+
+
+@cache
 def simulated(integral_time=None, count=1e-7, rate=RATE):
     """A simulated loop of a cascade and a drive with friction, its position counted: recording with reference."""
     p = 1e-3

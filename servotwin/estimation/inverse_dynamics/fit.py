@@ -107,9 +107,12 @@ class Rows(NamedTuple):
     places: Groups
 
 
-def rows_of(recording: DriveRecording, motion: DriveMotion, band: RegressionBand, cycle: float) -> Rows:
-    """Rows of a recording for a motion; `cycle` is the duration of one cycle of it, s."""
-    columns = np.column_stack([regressors(motion), recording.force])
+def rows_of(
+    recording: DriveRecording, motion: DriveMotion, band: RegressionBand, cycle: float, extra: Array | None = None
+) -> Rows:
+    """Rows of a recording for a motion; `cycle` is the duration of one cycle of it, s, `extra` a first regressor."""
+    first = [] if extra is None else [extra]
+    columns = np.column_stack([*first, regressors(motion), recording.force])
     rows, times = filtered_rows(columns, ~motion.resting, recording.usable, recording.rate, band)
     if len(rows) < _LEAST_ROWS:
         raise InvalidInput(

@@ -12,6 +12,7 @@ from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, 
 from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
+from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
 _FITTED = GivenGains()
 
@@ -33,6 +34,10 @@ class IdentifiedDrive:
     doubts : tuple of str
         Why there is no refinement.
     advice : NextExperiment
+    shaft : ShaftResponse or None
+        From motor to load, of the first recording; None: it has no load encoder.
+    split : ParameterFit or None
+        With the inertias before and behind the shaft; None: the recording shows no elasticity.
     """
 
     symmetric: ParameterFit
@@ -42,6 +47,8 @@ class IdentifiedDrive:
     refinement: Refinement | None
     doubts: tuple[str, ...]
     advice: NextExperiment
+    shaft: ShaftResponse | None = None
+    split: ParameterFit | None = None
 
 
 def identify_drive(
@@ -85,7 +92,9 @@ def identify_drive(
     checks.check_sense(used[0], symmetric)
     law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
     advice = next_experiment(symmetric, every, motions[0], used[0].unit)
-    return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice)
+    shaft = shaft_response(used[0])
+    split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
+    return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split)
 
 
 def _refined(

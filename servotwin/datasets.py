@@ -1,0 +1,148 @@
+"""Public measured data by name: fetched when it is asked for, checked, and kept in the user's cache; none is shipped.
+
+The standard library is enough for one file over HTTPS; a package for it (pooch) would bring three more.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import urllib.error
+import urllib.request
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from servotwin.config.table import did_you_mean
+from servotwin.errors import InvalidInput
+from servotwin.runtime.files import replace_file
+from servotwin.runtime.user_cache import VARIABLE, cache_folder
+
+_TIMEOUT = 30.0  # s, without a byte
+_SCHEMES = ("https://", "http://127.0.0.1:")
+
+
+@dataclass(frozen=True)
+class PublicDataset:
+    """A set of measured data that others publish.
+
+    Attributes
+    ----------
+    url : str
+        Of the file, or of the ZIP archive that has it.
+    file : str
+        Name of the file; in an archive that of the member, with its folders or without.
+    sha256 : str
+        Of the file.
+    largest : int
+        Bytes; a longer answer is cut off and refused.
+    source, notice : str
+        Who published it, and what one may do with it.
+    """
+
+    url: str
+    file: str
+    sha256: str
+    largest: int
+    source: str
+    notice: str
+
+
+DATASETS: Mapping[str, PublicDataset] = {
+    "emps": PublicDataset(
+        url="https://drive.google.com/uc?export=download&id=1zwoXYa9-3f8NQ0ohzmjpF7UxbNgRTHkS",
+        file="DATA_EMPS.mat",
+        sha256="6cf6814ae14618795da0101aae2bb97ff0c6351b0501b5492751b02b07facf7e",
+        largest=8_000_000,
+        source=(
+            "A. Janot, M. Gautier and M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System "
+            "Identification Benchmarks, 2019 (nonlinearbenchmark.org)"
+        ),
+        notice="published as a benchmark, no licence stated: for your own use, not to be passed on; cite the source",
+    ),
+}
+"""By name."""
+
+
+def fetch(name: str, folder: str | os.PathLike[str] | None = None) -> Path:
+    """Return the file of a public set, which is fetched once.
+
+    Parameters
+    ----------
+    name : str
+        One of `DATASETS`.
+    folder : path, optional
+        Where files are kept; by default `datasets` in servotwin's folder of the user's cache.
+
+    Raises
+    ------
+    InvalidInput
+        There is no such set, it cannot be fetched, or what came is not the published file.
+    """
+    if name not in DATASETS:
+        raise InvalidInput(
+            f"dataset {name!r} does not exist{did_you_mean(name, DATASETS)}; give one of {', '.join(DATASETS)}"
+        )
+    known = DATASETS[name]
+    path = _folder(name, folder) / known.file
+    if path.is_file() and _digest(path.read_bytes()) == known.sha256:
+        return path
+    content = _unpacked(name, known, _downloaded(name, known))
+    if _digest(content) != known.sha256:
+        raise InvalidInput(
+            f"dataset {name}: what {known.url} sent is not the published file (SHA-256 {_digest(content)[:12]}..., "
+            f"wanted {known.sha256[:12]}...); nothing was kept"
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, content)
+    except OSError as error:
+        raise InvalidInput(f"dataset {name}: {path}: cannot be written ({error.strerror})") from None
+    return path
+
+
+def _folder(name: str, folder: str | os.PathLike[str] | None) -> Path:
+    if folder is not None:
+        return Path(folder)
+    cache = cache_folder()
+    if cache is None:
+        raise InvalidInput(f"dataset {name}: there is no cache folder; give a folder, or set {VARIABLE}")
+    return cache / "datasets"
+
+
+def _downloaded(name: str, known: PublicDataset) -> bytes:
+    """The answer of the server, at most `largest` bytes."""
+    if not known.url.startswith(_SCHEMES):
+        raise InvalidInput(f"dataset {name}: {known.url}: must begin with https://")
+    try:
+        with urllib.request.urlopen(known.url, timeout=_TIMEOUT) as answer:
+            content: bytes = answer.read(known.largest + 1)
+    except (OSError, urllib.error.URLError) as error:
+        reason = getattr(error, "reason", None) or error
+        raise InvalidInput(f"dataset {name}: cannot be fetched from {known.url} ({reason})") from None
+    if len(content) > known.largest:
+        raise InvalidInput(f"dataset {name}: {known.url} sent more than {known.largest} bytes; nothing was kept")
+    return content
+
+
+def _unpacked(name: str, known: PublicDataset, content: bytes) -> bytes:
+    """The file, taken out of an archive where the answer is one."""
+    if not zipfile.is_zipfile(io.BytesIO(content)):
+        return content
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            member = next((each for each in archive.infolist() if Path(each.filename).name == known.file), None)
+            if member is None or member.file_size > known.largest:
+                raise InvalidInput(
+                    f"dataset {name}: the archive of {known.url} has no {known.file} of at most {known.largest} bytes"
+                )
+            with archive.open(member) as file:
+                return file.read(known.largest + 1)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+        raise InvalidInput(f"dataset {name}: the archive of {known.url} cannot be read ({error})") from None
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
