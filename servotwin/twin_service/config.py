@@ -174,7 +174,12 @@ class ServiceConfig:
         ),
     ] = 2000.0
     strangers: Annotated[
-        int, key(minimum=1, maximum=_MOST, help="Largest number of connections open at once that have shown no token.")
+        int,
+        key(
+            minimum=1,
+            maximum=_MOST,
+            help="Largest number of connections open at once that have shown no token and no dashboard's session.",
+        ),
     ] = 8192
     strangers_per_address: Annotated[
         int,

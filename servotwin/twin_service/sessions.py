@@ -50,7 +50,7 @@ class OperatorAccess:
         cookie = None if request.token is not None else request.cookie(COOKIE)
         if cookie is None or self._access.open:
             self._access.check_operator(request.token)
-        elif not self._valid(cookie):
+        elif not self.is_session(cookie):
             raise RequestRejected(Refusal.BAD_TOKEN, _ENDED, 401)
 
     def session_cookie(self, token: bytes) -> str:
@@ -65,7 +65,8 @@ class OperatorAccess:
         """Set-Cookie header that ends a session."""
         return self._header("", 0.0)
 
-    def _valid(self, cookie: str) -> bool:
+    def is_session(self, cookie: str) -> bool:
+        """Test whether a cookie is that of a session which has not ended."""
         match = _COOKIE.fullmatch(cookie)
         if match is None:
             return False

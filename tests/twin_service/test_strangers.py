@@ -1,11 +1,11 @@
-"""Connections without a valid token are bounded, in all and per address; those of edges are not."""
+"""Connections without a valid token or session are bounded, in all and per address; others are not."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-from service_system import TOKEN, served, twin_file
+from service_system import OPERATOR, TOKEN, served, twin_file
 
 from servotwin.twin_service import strangers
 from servotwin.twin_service.http_server import HttpServer, listening_socket
@@ -13,6 +13,8 @@ from servotwin.twin_service.http_server import HttpServer, listening_socket
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 Connect = Callable[[str], Awaitable[Stream]]
 PATIENCE = 30.0
+SESSION = "session"
+"""In place of a token: the cookie of an operator's session."""
 
 
 def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None]]) -> None:
@@ -30,6 +32,10 @@ def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None
                 reader, writer = await asyncio.open_connection(*listener.getsockname()[:2])
                 opened.append(writer)
                 head = f"Authorization: Bearer {token}\r\n" if token else ""
+                if token.endswith(SESSION):
+                    cookie = system.operators.session_cookie(OPERATOR.encode()).partition(";")[0]
+                    # A forged one has another code at its end.
+                    head = f"Cookie: a=b; {cookie if token == SESSION else cookie[:-64] + 64 * '0'}\r\n"
                 writer.write(f"GET /v1/servos/ax-1/outgoing HTTP/1.1\r\nHost: twin\r\n{head}\r\n".encode())
                 return reader, writer
 
@@ -79,6 +85,21 @@ def test_strangers_of_an_address_are_bounded_and_edges_are_not(tmp_path: Path, m
             assert not reader.at_eof()
 
     serving(tmp_path, "strangers_per_address = 3", body)
+
+
+def test_a_session_is_no_stranger_and_a_forged_one_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strangers, "_GRACE_S", 0.05)
+
+    async def body(connect: Connect) -> None:
+        known, forged = await connect(SESSION), [await connect(f"forged {SESSION}") for _ in range(2)]
+        # A session reads the fleet, not an edge's messages.
+        assert [b"401" in await answer(reader) for reader, _ in (known, *forged)] == [True] * 3
+        assert await is_closed(forged[0][0])
+        for reader, writer in (known, forged[1]):
+            assert not writer.is_closing()
+            assert not reader.at_eof()
+
+    serving(tmp_path, "strangers_per_address = 1", body)
 
 
 def test_strangers_are_bounded_in_all_and_their_places_become_free(tmp_path: Path) -> None:
