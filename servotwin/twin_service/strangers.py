@@ -23,7 +23,8 @@ class StrangerLimit:
     access : AccessControl
     operators : OperatorAccess
     most, per_address : int
-        Connections in all; and from one address, of those that are older than a grace period.
+        Connections in all, of which one address may have half; and from one address, of those that are older than a
+        grace period.
     """
 
     def __init__(self, access: AccessControl, operators: OperatorAccess, most: int, per_address: int) -> None:
@@ -43,8 +44,9 @@ class StrangerLimit:
         return self._of.total()
 
     def enter(self, address: str, close: Callable[[], None]) -> Stranger | None:
-        """Count a new connection; None: there are too many, and it has to be closed."""
-        if self.open >= self._most:
+        """Count a new connection; None: there are too many, in all or from its address, and it has to be closed."""
+        # Half of the places at most, also within the grace period: one address must not shut all others out.
+        if self.open >= self._most or self._of[address] >= max(1, self._most // 2):
             return None
         self._of[address] += 1
         return Stranger(self, address, close)

@@ -11,7 +11,7 @@ from servotwin.twin_service import strangers
 from servotwin.twin_service.http_server import HttpServer, listening_socket
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
-Connect = Callable[[str], Awaitable[Stream]]
+Connect = Callable[..., Awaitable[Stream]]
 PATIENCE = 30.0
 SESSION = "session"
 """In place of a token: the cookie of an operator's session."""
@@ -28,8 +28,8 @@ def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None
             task = asyncio.create_task(server.serve([listener]))
             opened: list[asyncio.StreamWriter] = []
 
-            async def connect(token: str) -> Stream:
-                reader, writer = await asyncio.open_connection(*listener.getsockname()[:2])
+            async def connect(token: str, source: str = "127.0.0.1") -> Stream:
+                reader, writer = await asyncio.open_connection(*listener.getsockname()[:2], local_addr=(source, 0))
                 opened.append(writer)
                 head = f"Authorization: Bearer {token}\r\n" if token else ""
                 if token.endswith(SESSION):
@@ -102,12 +102,17 @@ def test_a_session_is_no_stranger_and_a_forged_one_is(tmp_path: Path, monkeypatc
     serving(tmp_path, "strangers_per_address = 1", body)
 
 
-def test_strangers_are_bounded_in_all_and_their_places_become_free(tmp_path: Path) -> None:
+def test_strangers_are_bounded_in_all_and_one_address_has_half_of_the_places(tmp_path: Path) -> None:
     async def body(connect: Connect) -> None:
         first, second = await connect(""), await connect("")
         assert b"401" in await answer(first[0])
         assert b"401" in await answer(second[0])
         assert await answer((await connect(TOKEN))[0]) == b""
+        assert b"200" in await answer((await connect(TOKEN, "127.0.0.2"))[0])
+        others = [await connect("", source) for source in ("127.0.0.2", "127.0.0.3")]
+        for reader, _ in others:
+            assert b"401" in await answer(reader)
+        assert await answer((await connect(TOKEN, "127.0.0.4"))[0]) == b""
         first[1].close()
         await first[1].wait_closed()
         async with asyncio.timeout(PATIENCE):
@@ -116,7 +121,7 @@ def test_strangers_are_bounded_in_all_and_their_places_become_free(tmp_path: Pat
         for _ in range(5):  # who has shown a token counts no more
             assert b"200" in await answer((await connect(TOKEN))[0])
 
-    serving(tmp_path, "strangers = 2", body)
+    serving(tmp_path, "strangers = 4", body)
 
 
 def test_without_tokens_and_behind_a_proxy_nobody_is_a_stranger(tmp_path: Path) -> None:
