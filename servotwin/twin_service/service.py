@@ -33,6 +33,7 @@ from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.http_server import BodyReader
+from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
@@ -43,6 +44,7 @@ from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.strangers import StrangerLimit
 from servotwin.twin_service.twin_file import TwinFile
+from servotwin.twin_service.what_if_process import WhatIfProcess
 from servotwin.twin_service.worker import WorkerPool
 
 log = logging.getLogger(__name__)
@@ -131,6 +133,7 @@ class TwinService:
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)
         self.feed = FleetFeed(self._reader, self.executor, presence, config.watchers, self._shared)
+        self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
             handler = MqttRequestHandler(
@@ -146,7 +149,8 @@ class TwinService:
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
         operator = OperatorApi(self.operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
         dashboard = DashboardApi(self.operators, self.store, self.executor, self._reader, self.feed)
-        routes = [*edge.routes(), *operator.routes(), *dashboard.routes()]
+        what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
+        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
@@ -161,6 +165,7 @@ class TwinService:
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self.feed.run())
+        self._spawn(self.what_if.run())
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -189,6 +194,7 @@ class TwinService:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.what_if.stop()
         await self.pool.stop()
         await asyncio.to_thread(self.commits.close)
         with suppress(StoreUnavailable):

@@ -5,7 +5,8 @@ import * as api from "./api.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, stamp, statusText, travelText } from "./format.js";
-import { chainTable, eventList, simulated } from "./updates.js";
+import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
+import { WhatIfPanel } from "./what_if.js";
 
 const REFRESH_MS = 1500, EVERY = 20000;
 const scaled = (values, factor) => values.map((value) => (value === null ? null : value * factor));
@@ -65,6 +66,7 @@ export class MachinePage {
       this.plots.push(new TimePlot(place, options));
       return this.plots.at(-1);
     };
+    this.whatIf = new WhatIfPanel(name, () => this.start());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", {},
@@ -80,6 +82,7 @@ export class MachinePage {
           element("div", {}, element("h3", {}, "Hysteresis"),
             element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
             this.loop))),
+      panel("What if", this.whatIf.tools, ...this.whatIf.content),
       panel("Did it help?", [],
         legend(["blue", "of each window"], ["orange", "version applied"]),
         element("div", { class: "two" }, places.tail, places.residual)),
@@ -91,6 +94,13 @@ export class MachinePage {
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
     this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
     this.makePlots(plot, places);
+    this.plots.push(...this.whatIf.plots);
+  }
+
+  // Where a trial on the model begins: at what is known of the machine.
+  start() {
+    const row = this.live.rows.get(this.name) ?? {};
+    return { gap: row.gap, limit: row.gap_limit, setting: settingInForce(this.updates, this.happened, row.version_in_force) };
   }
 
   makePlots(plot, places) {
