@@ -152,11 +152,17 @@ def audit(
     limit: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of windows.")] = 20,
     changes: Annotated[bool, typer.Option("--changes", help="Only windows that led to more than an estimate.")] = False,
     json: Annotated[bool, typer.Option("--json", help="One JSON array of the windows instead of lines.")] = False,
+    page: Annotated[
+        Path | None, typer.Option(help="Write a report to mail instead: an HTML file with pictures inside.")
+    ] = None,
 ) -> None:
     """Show the evidence chain of a servo: window, estimate, version, receipt, effect."""
-    from servotwin.cli.audit import Source
+    from servotwin.cli.audit import Source, write_report
     from servotwin.cli.audit import audit as run
 
+    if page is not None:
+        write_report(servo, Source(config, url, token, ca), page)
+        return
     run(servo, Source(config, url, token, ca), limit, changes, json)
 
 

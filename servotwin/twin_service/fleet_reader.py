@@ -61,12 +61,13 @@ class FleetReader:
     Parameters
     ----------
     store : Store
-    presence : EdgePresence
+    presence : callable
+        Tell whether an edge is connected, as `EdgePresence` does.
     wall : callable
         s since the epoch.
     """
 
-    def __init__(self, store: Store, presence: EdgePresence, wall: Callable[[], float]) -> None:
+    def __init__(self, store: Store, presence: Callable[[str], bool | None], wall: Callable[[], float]) -> None:
         self._store, self._presence, self._wall = store, presence, wall
         self._contexts: dict[str, str] = {}
 
@@ -79,6 +80,10 @@ class FleetReader:
             return FleetPage(rows, position, self._wall())
 
         return self._store.reading(read)
+
+    def now(self) -> float:
+        """Present time, s since the epoch."""
+        return self._wall()
 
     def position(self) -> StorePosition:
         """Present position of the store."""

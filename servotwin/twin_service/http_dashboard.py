@@ -9,15 +9,14 @@ from typing import Any
 import msgspec
 import sqlalchemy as sa
 
-from servotwin.dashboard.assets import INDEX, SECURITY, Asset, assets
-from servotwin.dashboard.machine_facts import UNKNOWN, machine_facts
-from servotwin.dashboard.series import fallbacks, gap_series, table_csv, versions
+from servotwin.dashboard.assets import INDEX, REPORT_SECURITY, SECURITY, Asset, assets
+from servotwin.dashboard.series import machine_series, table_csv
 from servotwin.dashboard.window_view import MAX_POINTS, channel_series, sample_range, window_columns
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal, WindowMessage, decode
 from servotwin.messages.checks import InvalidMessage
 from servotwin.messages.codec import decompress
-from servotwin.store import overview, queries
+from servotwin.store import overview
 from servotwin.store.records import StoredMessage
 from servotwin.store.store import Store
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
@@ -41,6 +40,7 @@ from servotwin.twin_service.openapi import (
     operation,
     parameter,
 )
+from servotwin.twin_service.reports import report_of
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 
@@ -48,7 +48,6 @@ _NAME = re.compile(NAME_PATTERN)
 _LOGIN_BYTES, _LOGIN_S = 4096, 10.0
 _SPARK_SERVOS, _SPARK_WINDOWS = 64, 48
 """Servos in one request for short histories, and windows of each."""
-_DECISIONS = 500
 
 
 class Login(msgspec.Struct):
@@ -157,7 +156,14 @@ class DashboardApi:
             errors=QUERY_ERRORS,
         )
         channels_csv = operation("Every sample of a window", {200: ("CSV.", CSV)}, window, errors=QUERY_ERRORS)
+        report = operation(
+            "Report of a machine, to mail",
+            {200: ("One HTML file that needs no other.", HTML)},
+            (SERVO,),
+            errors=QUERY_ERRORS,
+        )
         return [
+            HttpRoute("GET", SERVO_PATH + "/report.html", self._get_report, report),
             HttpRoute("GET", SERVO_PATH + "/gaps", self._get_gaps, gaps),
             HttpRoute("GET", SERVO_PATH + "/gaps.csv", self._get_gaps_csv, gaps_csv),
             HttpRoute("GET", WINDOW_PATH + "/channels", self._get_channels, channels),
@@ -231,23 +237,15 @@ class DashboardApi:
         return servo, limit_of(request), request.integer("before", 0) or None
 
     def _gaps(self, servo: str, limit: int, before: int | None) -> dict[str, Any]:
-        """Series of a servo, what was decided, and facts of its model."""
+        return self._store.reading(lambda connection: machine_series(connection, servo, limit, before))
 
-        def read(connection: sa.Connection) -> dict[str, Any]:
-            found = overview.gaps(connection, servo, limit, before)
-            decided = overview.decisions(connection, servo, _DECISIONS)
-            key = next((one.context for each in reversed(found) for one in each.evidence if one.context), "")
-            context = queries.contexts(connection, [key]).get(key)
-            return {
-                "servo": servo,
-                "first": found[0].window.id if found else None,
-                "windows": gap_series(found),
-                "versions": versions(decided),
-                "fallbacks": fallbacks(decided),
-                "machine": UNKNOWN if context is None else machine_facts(context),
-            }
-
-        return self._store.reading(read)
+    async def _get_report(self, request: HttpRequest) -> HttpResponse:
+        servo = admitted_servo(self._operators, request)
+        text = await store_query(self._executor, partial(report_of, self._store, self._reader, servo))
+        if text is None:
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} has never sent a message")
+        attachment = {"content-disposition": f'attachment; filename="{servo}.html"'}
+        return HttpResponse(200, text.encode(), HTML, {**REPORT_SECURITY, **attachment, "cache-control": "no-store"})
 
     async def _get_channels(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)

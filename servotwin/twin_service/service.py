@@ -154,7 +154,7 @@ class TwinService:
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
-        return HttpApp(routes, self.metrics, self._lifespan)
+        return HttpApp(routes, self.metrics, self._lifespan, own_names=self.tokens is None)
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""

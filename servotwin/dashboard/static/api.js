@@ -66,6 +66,7 @@ export const windowPath = (name, boot, sequence) => `${servo(name)}/windows/${en
 export const histories = (names) => request(`/v1/fleet/histories?servos=${names.map(encodeURIComponent).join(",")}`);
 export const gaps = (name, limit = 400) => request(`${servo(name)}/gaps?limit=${limit}`);
 export const gapsFile = (name) => `${servo(name)}/gaps.csv?limit=1000`;
+export const reportFile = (name) => `${servo(name)}/report.html`;
 export const updates = (name, limit = 20) => request(`${servo(name)}/audit?updates=1&limit=${limit}`);
 export const events = (name, limit = 50) => request(`${servo(name)}/events?limit=${limit}`);
 export const channels = (name, boot, sequence, points) => request(`${windowPath(name, boot, sequence)}/channels?points=${points}`);
