@@ -195,6 +195,13 @@ class ServiceConfig:
     watchers: Annotated[
         int, key(minimum=0, maximum=_MOST, help="Largest number of dashboards that watch the fleet at once.")
     ] = 100
+    machine_metrics: Annotated[
+        bool,
+        key(
+            help="Serve gap, interval, wear, version and link of each machine for Prometheus at /metrics/machines, to "
+            "operators' tokens only."
+        ),
+    ] = False
     queue: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of messages that wait for their commit.")
     ] = 2000

@@ -14,6 +14,7 @@ from servotwin.store.store import Store
 
 _CONTEXTS = 1000
 """Texts of contexts in memory."""
+_PAGE = 1000
 _GRACE_S = 5.0
 """s between two polls of an edge that counts as connected."""
 
@@ -80,6 +81,13 @@ class FleetReader:
             return FleetPage(rows, position, self._wall())
 
         return self._store.reading(read)
+
+    def all(self) -> list[FleetRow]:
+        """Rows of all servos, by name."""
+        rows: list[FleetRow] = []
+        while page := self.page(rows[-1].servo if rows else "", _PAGE).rows:
+            rows += page
+        return rows
 
     def now(self) -> float:
         """Present time, s since the epoch."""

@@ -10,12 +10,14 @@ import msgspec
 import sqlalchemy as sa
 
 from servotwin.dashboard.assets import INDEX, REPORT_SECURITY, SECURITY, Asset, assets
+from servotwin.dashboard.machine_metrics import machine_metrics
 from servotwin.dashboard.series import machine_series, table_csv
 from servotwin.dashboard.window_view import MAX_POINTS, channel_series, sample_range, window_columns
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal, WindowMessage, decode
 from servotwin.messages.checks import InvalidMessage
 from servotwin.messages.codec import decompress
+from servotwin.runtime.prometheus import CONTENT_TYPE
 from servotwin.store import overview
 from servotwin.store.records import StoredMessage
 from servotwin.store.store import Store
@@ -37,6 +39,7 @@ from servotwin.twin_service.openapi import (
     SECONDS,
     SEQUENCE,
     SERVO,
+    TEXT,
     operation,
     parameter,
 )
@@ -64,11 +67,20 @@ class DashboardApi:
     operators : OperatorAccess
     store, executor : Store, StoreExecutor
     reader, feed : FleetReader, FleetFeed
+    machine_metrics : bool
+        Serve metrics of each machine.
     """
 
     def __init__(
-        self, operators: OperatorAccess, store: Store, executor: StoreExecutor, reader: FleetReader, feed: FleetFeed
+        self,
+        operators: OperatorAccess,
+        store: Store,
+        executor: StoreExecutor,
+        reader: FleetReader,
+        feed: FleetFeed,
+        machine_metrics: bool = False,
     ) -> None:
+        self._machine_metrics = machine_metrics
         self._operators, self._store, self._executor = operators, store, executor
         self._reader, self._feed = reader, feed
         self._bodies = BodyReader(_LOGIN_BYTES, _LOGIN_S)
@@ -112,6 +124,11 @@ class DashboardApi:
             (parameter("after", {"type": "string"}, "Only names after this one."), limit),
             errors=QUERY_ERRORS,
         )
+        metrics = operation(
+            "Metrics of each machine for Prometheus, where machine_metrics is set",
+            {200: ("Text format 0.0.4.", TEXT)},
+            errors=QUERY_ERRORS,
+        )
         events = operation(
             "Changes of the fleet as server-sent events: rows, reload, trouble, ended",
             {200: ("Events without end; the id of each is the position after it.", EVENTS)},
@@ -129,6 +146,7 @@ class DashboardApi:
         )
         return [
             HttpRoute("GET", "/v1/fleet", self._get_fleet, fleet),
+            *([HttpRoute("GET", "/metrics/machines", self._get_metrics, metrics)] if self._machine_metrics else []),
             HttpRoute("GET", "/v1/fleet/events", self._get_events, events),
             HttpRoute("GET", "/v1/fleet/histories", self._get_histories, histories),
         ]
@@ -204,6 +222,11 @@ class DashboardApi:
         after = request.argument("after") or ""
         page = await store_query(self._executor, partial(self._reader.page, after, limit_of(request)))
         return _fresh({"rows": page.rows, "position": page.position.text, "now": page.now})
+
+    async def _get_metrics(self, request: HttpRequest) -> HttpResponse:
+        self._operators.check(request)
+        text = await store_query(self._executor, lambda: machine_metrics(self._reader.all()))
+        return HttpResponse(200, text.encode(), CONTENT_TYPE)
 
     async def _get_events(self, request: HttpRequest) -> HttpStream:
         self._operators.check(request)

@@ -148,7 +148,9 @@ class TwinService:
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
         operator = OperatorApi(self.operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
-        dashboard = DashboardApi(self.operators, self.store, self.executor, self._reader, self.feed)
+        dashboard = DashboardApi(
+            self.operators, self.store, self.executor, self._reader, self.feed, self.config.machine_metrics
+        )
         what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
         routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes()]
         if self.config.lockstep:

@@ -292,3 +292,23 @@ def test_with_tokens_a_twin_answers_under_any_name(tmp_path):
         assert (await client.get("/v1/fleet", headers=headers)).status_code == 200
 
     with_service(tmp_path, body)
+
+
+def test_metrics_of_machines_are_served_where_they_are_asked_for(tmp_path):
+    async def body(system, client):
+        await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
+        assert (await client.get("/metrics/machines")).status_code == 401
+        text = (await client.get("/metrics/machines", headers=bearer(OPERATOR))).text
+        assert 'servotwin_machine_last_message_seconds{servo="ax-1"} 5\n' in text
+        assert 'servotwin_machine_connected{servo="ax-1"} 0\n' in text
+        assert "servotwin_machine_gap_radians{" not in text
+        assert "ax-1" not in (await client.get("/metrics")).text
+
+    with_service(tmp_path, body, "machine_metrics = true")
+
+
+def test_metrics_of_machines_are_off_by_default(tmp_path):
+    async def body(_system, client):
+        assert (await client.get("/metrics/machines", headers=bearer(OPERATOR))).status_code == 404
+
+    with_service(tmp_path, body)
