@@ -113,10 +113,10 @@ def _end_last_line(path: Path) -> None:
 
 
 def _batches() -> dict[str, Batch]:
-    from benchmarks import shelf
+    from benchmarks import logs, shelf
     from benchmarks.policies import loops
 
-    return {loops.NAME: loops.BATCH, **shelf.BATCHES}
+    return {loops.NAME: loops.BATCH, logs.NAME: logs.BATCH, **shelf.BATCHES}
 
 
 def main(arguments: Sequence[str]) -> None:

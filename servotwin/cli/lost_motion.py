@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,10 +16,15 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN
+from servotwin.estimation.kinematic.growth import GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
+from servotwin.estimation.kinematic.wind_up import with_machine
 from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
+from servotwin.plant.plants import resolve_plant
 
+_DATED = 3e8  # s since 1970: smaller times are no dates
 _PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
 
 
@@ -27,7 +33,14 @@ def describes_its_machine(path: Path) -> bool:
     return isinstance(read_columns(path, ()).metadata.get("servo"), str)
 
 
-def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool, page: Path | None = None) -> None:
+def show(
+    logs: Sequence[Path],
+    columns: RecordingColumns,
+    as_json: bool,
+    page: Path | None = None,
+    axis: str | None = None,
+    dates: str | None = None,
+) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
     Raises
@@ -40,23 +53,84 @@ def show(logs: Sequence[Path], columns: RecordingColumns, as_json: bool, page: P
         from servotwin.cli.lost_motion_page import check_page, write_page
 
         check_page(page)
+    machine = None if axis is None else resolve_plant(axis)
+    given = dates_of(dates, len(logs))
     answers = []
     for path in logs:
-        with console.status(f"{path.name}"):
-            log = read_recording(path, columns)
-            answers.append((log, estimate_lost_motion(log.recording)))
+        with console.status(path.name) as status:
+            log = read_recording(path, columns, partial(_tell, status, path.name))
+            status.update(f"{path.name}: models")
+            found = estimate_lost_motion(log.recording)
+            if machine is not None:
+                status.update(f"{path.name}: wind-up of {axis}")
+                found = with_machine(log.recording, found, machine)
+            answers.append((log, found))
     if page is not None:
         log, found = answers[-1]
         said = Text.from_markup(_headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
         write_page(page, log, found, said)
+    stamps = [_date(log, day) for (log, _), day in zip(answers, given, strict=True)]
+    grown = _growth(answers, stamps)
     if as_json:
-        rows = [as_dict(log, found) for log, found in answers]
+        rows = [as_dict(log, found) | {"date": _iso(at)} for (log, found), at in zip(answers, stamps, strict=True)]
+        if grown is not None:
+            low, high = grown.interval
+            rows[-1] |= {"growth_per_year_load": grown.per_year, "growth_interval_load": [low, high]}
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))
         return
     for log, found in answers:
         _print(console, log, found)
     for before, after in pairwise(answers):
         console.print(_change(before, after), highlight=False)
+    if grown is not None:
+        low, high = grown.interval
+        unit = answers[-1][0].recording.load_unit
+        console.print(
+            f"wear from {_iso(min(stamps))[:10]} to {_iso(max(stamps))[:10]}: {grown.per_year:+.4g} {unit} per year "
+            f"(95 %: {low:+.4g} .. {high:+.4g})",
+            highlight=False,
+        )
+
+
+def dates_of(text: str | None, logs: int) -> list[float | None]:
+    """Dates with commas between them as seconds since 1970, one for each log; None: from the log or its file.
+
+    Raises
+    ------
+    InvalidInput
+        No date, or another number of them than of logs.
+    """
+    if text is None:
+        return [None] * logs
+    days = text.split(",")
+    try:
+        found = [float(np.datetime64(day.strip(), "s").astype(np.int64)) for day in days]
+    except ValueError:
+        raise InvalidInput(f"--dates {text!r}: give dates such as 2026-03-01, with commas between them") from None
+    if len(found) != logs:
+        raise InvalidInput(f"--dates {text!r}: has {len(found)} dates for {logs} logs; give one for each")
+    return list(found)
+
+
+def _date(log: RecordedLog, given: float | None) -> float:
+    """Seconds since 1970: as given, of the log's first time stamp if it is a date, or of its file."""
+    if given is not None:
+        return given
+    first = float(log.recording.time[0])
+    return first if first > _DATED else Path(log.recording.source.removeprefix("log ")).stat().st_mtime
+
+
+def _iso(date: float) -> str:
+    return str(np.datetime64(round(date), "s"))
+
+
+def _growth(answers: Sequence[tuple[RecordedLog, LostMotion]], dates: Sequence[float]) -> GapGrowth | None:
+    gaps = [found.gap_load for _, found in answers]
+    return growth(dates, gaps, [_half(found) / NORMAL_95 for _, found in answers])
+
+
+def _tell(status: Any, name: str, samples: int) -> None:
+    status.update(f"{name}: {samples:,} samples read")
 
 
 def as_dict(log: RecordedLog, found: LostMotion) -> dict[str, Any]:
@@ -123,6 +197,8 @@ def _print(console: Console, log: RecordedLog, found: LostMotion) -> None:
 def _headline(found: LostMotion, unit: str, motor_unit: str) -> str:
     low, high = found.interval_load
     color = "green" if found.ok else "yellow"
+    if found.interval_motor == NOTHING_KNOWN or math.isnan(found.gap_motor):
+        return f"no gap is known: [{color}]{found.status.value}[/]"
     if math.isinf(found.interval_motor[1]):
         return f"gap > {found.gap_motor:.4g} {motor_unit} at the motor: [{color}]{found.status.value}[/]"
     return (

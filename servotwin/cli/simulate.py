@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
@@ -11,6 +12,7 @@ import servotwin as st
 from servotwin.cosim import Loop
 from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import check_output, read_log, write_log
+from servotwin.logs.recordings import RecordingColumns, read_recording
 
 
 def record(scenario: Path, output: Path, console: Console | None = None) -> Path:
@@ -55,6 +57,24 @@ def convert(log: Path, output: Path) -> Path:
     check_output(output)
     write_log(read_log(log).table(), output)
     return output
+
+
+def convert_recording(log: Path, output: Path, columns: RecordingColumns) -> Mapping[str, int]:
+    """Write the cleaned samples of a foreign log, and return the number of its defects, in words.
+
+    Raises
+    ------
+    InvalidInput
+        The log is not one, or the output cannot be written.
+    """
+    check_output(output)
+    read = read_recording(log, columns)
+    made = read.recording
+    table = {"time_s": made.time, f"motor [{made.motor_unit}]": made.motor, f"load [{made.load_unit}]": made.load}
+    if made.command is not None:
+        table["command"] = made.command
+    write_log(SignalTable(table, {}), output)
+    return read.found
 
 
 def recording(loop: Loop, scenario_text: str) -> SignalTable:

@@ -47,13 +47,25 @@ def simulate(
 
 
 def convert(
-    log: Annotated[Path, typer.Argument(help="A .csv, .npz or .parquet with time_s, position_m, theta_m_rad ...")],
+    log: Annotated[Path, typer.Argument(help="A log with time_s, position_m, theta_m_rad ..., or any with --motor.")],
     output: Annotated[Path, typer.Argument(help="run.csv, which an edge can replay, run.npz or run.parquet.")],
+    motor: Annotated[str | None, typer.Option(help="Of another log: column of the motor's position.")] = None,
+    load: Annotated[str | None, typer.Option(help="Column of the load's position.")] = None,
+    command: Annotated[str | None, typer.Option(help="Column of the motor's command.")] = None,
+    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
+    rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
 ) -> None:
-    """Convert a recorded log to another format."""
+    """Convert a recorded log to another format; with --motor and --load any log, cleaned of what is damaged."""
     from servotwin.cli.simulate import convert as run
+    from servotwin.cli.simulate import convert_recording
+    from servotwin.logs.recordings import RecordingColumns
 
-    run(log, output)
+    columns = RecordingColumns(motor, load, command, time, rate)
+    if columns == RecordingColumns():
+        run(log, output)
+        return
+    for defect, count in convert_recording(log, output, columns).items():
+        print(f"{count} {defect}")
 
 
 def identify(
@@ -70,6 +82,13 @@ def identify(
     page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
     servo: Annotated[
         str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
+    ] = None,
+    axis: Annotated[
+        str | None,
+        typer.Option(help="With --motor and --load: an axis's file or preset, whose wind-up by friction is no gap."),
+    ] = None,
+    dates: Annotated[
+        str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their own, or their files'.")
     ] = None,
     start: Annotated[
         float | None, typer.Option(help="Start of a single window, s, instead of a window at each step.")
@@ -108,13 +127,14 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
-    if columns != RecordingColumns() or (servo is None and not describes_its_machine(logs[0])):
+    without_model = columns != RecordingColumns() or axis is not None or dates is not None
+    if without_model or (servo is None and not describes_its_machine(logs[0])):
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(
                 "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
                 "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
             )
-        show_lost_motion(logs, columns, json, page)
+        show_lost_motion(logs, columns, json, page, axis, dates)
         return
     if len(logs) > 1 or page is not None:
         raise InvalidInput(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import LogColumns, SignalTable, parsed
+
+_ROWS = 500_000  # read at a time
 
 
 def read_npz(path: Path, requested: Collection[str]) -> LogColumns:
@@ -41,9 +43,24 @@ def read_parquet(path: Path, requested: Collection[str]) -> LogColumns:
         table = parquet.read_table(path, columns=[name for name in requested if name in schema.names])
         columns = {name: table[name].to_numpy() for name in table.column_names}
     except pyarrow.ArrowException as error:
-        raise InvalidInput(f"log {path}: is not a parquet file of numbers ({str(error).splitlines()[0]})") from None
+        raise _not_numbers(path, error) from None
     noted = {key.decode(): value.decode() for key, value in (schema.metadata or {}).items() if key != b"ARROW:schema"}
     return LogColumns(columns, schema.names, {key: _number(value) for key, value in noted.items()})
+
+
+def parquet_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+    """Read columns by name, a part of the rows at a time."""
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        with parquet.ParquetFile(path) as file:
+            names = file.schema_arrow.names
+            for batch in file.iter_batches(_ROWS, columns=[name for name in requested if name in names]):
+                columns = {name: batch[name].to_numpy(zero_copy_only=False) for name in batch.schema.names}
+                yield LogColumns(columns, names, {})
+    except pyarrow.ArrowException as error:
+        raise _not_numbers(path, error) from None
 
 
 def write_parquet(table: SignalTable, path: Path) -> None:
@@ -53,6 +70,10 @@ def write_parquet(table: SignalTable, path: Path) -> None:
 
     described = {key: value if isinstance(value, str) else json.dumps(value) for key, value in table.metadata.items()}
     parquet.write_table(pyarrow.table(dict(table.columns)).replace_schema_metadata(described), path)
+
+
+def _not_numbers(path: Path, error: Exception) -> InvalidInput:
+    return InvalidInput(f"log {path}: is not a parquet file of numbers ({str(error).splitlines()[0]})")
 
 
 def _number(text: str) -> Any:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
 
 _Mask = np.ndarray[Any, np.dtype[np.bool_]]
@@ -14,6 +15,7 @@ _Mask = np.ndarray[Any, np.dtype[np.bool_]]
 _STALE = 50.0  # times the usual interval: a first sample so far before the others is an old one
 _DROPOUT = 5.0  # times the usual interval
 _SPIKE = 20.0  # times the usual step between samples, there and back
+_FASTEST, _UNSURE = 0.99, 0.35  # quantile of the steps, and turns: beyond, half a turn more is not told from one less
 _WRAPS = 3  # jumps of about one turn that make an angle a wrapped one
 
 
@@ -35,7 +37,7 @@ class Cleaned(NamedTuple):
     found: Mapping[str, int]
 
 
-def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float]) -> Cleaned:
+def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float], first: bool = True) -> Cleaned:
     """Leave out samples that are damaged, repeated, stale or out of order; unwrap angles; count all of it.
 
     Parameters
@@ -46,6 +48,8 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
         (n,) arrays by name.
     turns : mapping
         Full turn of the channels that are angles, in their units.
+    first : bool
+        The log begins here: a first sample long before the others is an old one.
     """
     found: dict[str, int] = {}
     names = list(channels)
@@ -58,7 +62,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             table = table[kept]
 
     keep(np.isfinite(table.sum(axis=1)), "without a number in some column")
-    if len(table) > 2:
+    if first and len(table) > 2:
         intervals = np.diff(table[:, 0])
         usual = float(np.median(np.abs(intervals)))
         stale = int(intervals[0] > _STALE * usual) if usual > 0.0 else 0
@@ -74,6 +78,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
         if name in turns:
             table[:, place], count = _unwrapped(table[:, place], turns[name])
             if count:
+                _check_followed(name, table[:, place], turns[name])
                 found[f"turns of {name} that were unwrapped"] = count
     for place, name in enumerate(names, 1):
         keep(~_spikes(table[:, place]), f"spikes of {name}")
@@ -91,6 +96,16 @@ def _unwrapped(angle: Array, turn: float) -> tuple[Array, int]:
     if not within or np.sum(jumps) < 1 or (np.sum(jumps) < _WRAPS and float(np.ptp(angle)) < 0.95 * turn):
         return angle, 0
     return np.unwrap(angle, period=turn), int(np.sum(jumps))
+
+
+def _check_followed(name: str, angle: Array, turn: float) -> None:
+    """Refuse an angle that moves so far from sample to sample that its turns cannot be counted."""
+    step = float(np.quantile(np.abs(np.diff(angle)), _FASTEST))
+    if step > _UNSURE * turn:
+        raise InvalidInput(
+            f"the {name}'s angle wraps, and moves by up to {step / turn:.2f} turns from one sample to the next: its "
+            "turns cannot be counted; record it unwrapped, or with more samples"
+        )
 
 
 def _spikes(values: Array) -> _Mask:

@@ -15,7 +15,7 @@ from servotwin.errors import InvalidInput
 from servotwin.logs.columns import LogColumns, SignalTable, parsed
 from servotwin.plant.signals import Array
 
-_ROWS = 50_000  # read or written at a time
+_ROWS = 100_000  # read or written at a time
 _SAMPLE = 65536  # bytes from which the encoding is guessed
 _LOOKED_AT = 40  # lines from which the layout is guessed
 _METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
@@ -51,10 +51,20 @@ class _Layout(NamedTuple):
 
 
 def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
-    """Read the requested columns; a cell that is no number becomes NaN, and the first of each column is described.
+    """Read the requested columns whole, as `csv_blocks` reads them in parts."""
+    blocks = list(csv_blocks(path, requested))
+    first = blocks[0]
+    values = {name: np.concatenate([each.values[name] for each in blocks]) for name in first.values}
+    damaged = {name: text for each in reversed(blocks) for name, text in each.damaged.items()}
+    return LogColumns(values, first.names, first.metadata, damaged)
 
-    The metadata are JSON in the first row of a last column "metadata", so that other programs read the table as it is.
-    In files of earlier versions they are a first line that begins with #.
+
+def csv_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+    """Read the requested columns in blocks of rows, at least one; a cell that is no number becomes NaN.
+
+    Each block describes the first such cell of each column. The metadata are JSON in the first row of a last column
+    "metadata", so that other programs read the table as it is. In files of earlier versions they are a first line that
+    begins with #.
     """
     layout = _layout(path)
     wanted = [name for name in layout.names if name in requested]
@@ -70,10 +80,13 @@ def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
                 f"called {', '.join(layout.names[:8])}"
             )
         if not wanted:
-            return LogColumns({}, layout.names, metadata)
-        values, damaged = _values(file, layout, [layout.names.index(name) for name in wanted])
-    found = dict(zip(wanted, values.T, strict=True))
-    return LogColumns(found, layout.names, metadata, {wanted[place]: text for place, text in damaged.items()})
+            yield LogColumns({}, layout.names, metadata)
+            return
+        places = [layout.names.index(name) for name in wanted]
+        blocks = (_values(lines, layout, places, number) for number, lines in _blocks(file, layout.first + 1))
+        for values, damaged in blocks:
+            texts = {wanted[place]: text for place, text in damaged.items()}
+            yield LogColumns(dict(zip(wanted, values.T, strict=True)), layout.names, metadata, texts)
 
 
 def _layout(path: Path) -> _Layout:
@@ -163,31 +176,32 @@ def _number(cell: str, comma: bool) -> float | None:
     return None
 
 
-def _values(file: IO[str], layout: _Layout, places: Sequence[int]) -> tuple[Array, dict[int, str]]:
+def _values(
+    lines: Sequence[str], layout: _Layout, places: Sequence[int], line_number: int
+) -> tuple[Array, dict[int, str]]:
     """(n, c) numbers, and in words the first cell of each column that is none."""
-    blocks: list[Array] = []
-    damaged: dict[int, str] = {}
-    for line_number, lines in _blocks(file, layout.first + 1):
-        text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
-        try:
-            block = np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None)
-        except ValueError:
-            block = _patiently(lines, layout, places, line_number, damaged)
-        blocks.append(block)
-    return (np.concatenate(blocks) if blocks else np.empty((0, len(places)))), damaged
+    if not lines:
+        return np.empty((0, len(places))), {}
+    text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
+    try:
+        return np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None), {}
+    except ValueError:
+        return _patiently(lines, layout, places, line_number)
 
 
 def _blocks(file: IO[str], line_number: int) -> Iterator[tuple[int, list[str]]]:
-    while lines := list(islice(file, _ROWS)):
-        kept = [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
-        if kept:
-            yield line_number, kept
+    """Lines with numbers and the number of the first, at least one block."""
+    lines = list(islice(file, _ROWS))
+    yield line_number, [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
+    while lines:
         line_number += len(lines)
+        lines = list(islice(file, _ROWS))
+        if lines:
+            yield line_number, [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
 
 
-def _patiently(
-    lines: Sequence[str], layout: _Layout, places: Sequence[int], line: int, damaged: dict[int, str]
-) -> Array:
+def _patiently(lines: Sequence[str], layout: _Layout, places: Sequence[int], line: int) -> tuple[Array, dict[int, str]]:
+    damaged: dict[int, str] = {}
     result = np.full((len(lines), len(places)), np.nan)
     for row, text in enumerate(lines):
         cells = _cells(text, layout.separator)
@@ -198,7 +212,7 @@ def _patiently(
                 damaged.setdefault(column, f"line {line + row}: {cell[:30]!r}")
             else:
                 result[row, column] = number
-    return result
+    return result, damaged
 
 
 def _first_metadata(path: Path, layout: _Layout) -> Mapping[str, Any]:

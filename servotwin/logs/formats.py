@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.binary_files import read_npz, read_parquet, write_npz, write_parquet
+from servotwin.logs.binary_files import parquet_blocks, read_npz, read_parquet, write_npz, write_parquet
 from servotwin.logs.columns import LogColumns, SignalTable
-from servotwin.logs.csv_file import read_csv, write_csv
+from servotwin.logs.csv_file import csv_blocks, read_csv, write_csv
 from servotwin.logs.epics_file import looks_like_epics, read_epics
 from servotwin.logs.hdf5_file import read_hdf5
 from servotwin.logs.matlab_file import read_matlab
@@ -27,12 +27,15 @@ class LogFormat(NamedTuple):
         (table, path) -> None; None: the format is only read.
     library, extra : str
         Module that must be installed, and the extra of servotwin that installs it; empty: none.
+    blocks : callable or None
+        As `read`, a part of the rows at a time; None: the format is read whole.
     """
 
     read: Callable[[Path, Collection[str]], LogColumns]
     write: Callable[[SignalTable, Path], None] | None = None
     library: str = ""
     extra: str = ""
+    blocks: Callable[[Path, Collection[str]], Iterator[LogColumns]] | None = None
 
     def check_installed(self, file: str) -> None:
         """Raise InvalidInput where the format's library is missing; `file` is the file in words."""
@@ -43,21 +46,29 @@ class LogFormat(NamedTuple):
             )
 
 
-def _read_text(path: Path, requested: Collection[str]) -> LogColumns:
-    """Read text of any kind: lines of EPICS, or a table."""
+def _is_epics(path: Path) -> bool:
     with path.open(encoding="utf-8", errors="replace") as file:
         lines = [line for _, line in zip(range(20), file, strict=False)]
-    return (read_epics if sum(map(looks_like_epics, lines)) > len(lines) // 2 else read_csv)(path, requested)
+    return sum(map(looks_like_epics, lines)) > len(lines) // 2
+
+
+def _read_text(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read text of any kind: lines of EPICS, or a table."""
+    return (read_epics if _is_epics(path) else read_csv)(path, requested)
+
+
+def _text_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+    return iter([read_epics(path, requested)]) if _is_epics(path) else csv_blocks(path, requested)
 
 
 _HDF5 = LogFormat(read_hdf5, library="h5py", extra="hdf5")
 FORMATS: Mapping[str, LogFormat] = {
-    ".csv": LogFormat(read_csv, write_csv),
+    ".csv": LogFormat(read_csv, write_csv, blocks=csv_blocks),
     ".npz": LogFormat(read_npz, write_npz),
-    ".parquet": LogFormat(read_parquet, write_parquet, library="pyarrow", extra="parquet"),
-    ".txt": LogFormat(_read_text),
-    ".tsv": LogFormat(read_csv),
-    ".dat": LogFormat(_read_text),
+    ".parquet": LogFormat(read_parquet, write_parquet, library="pyarrow", extra="parquet", blocks=parquet_blocks),
+    ".txt": LogFormat(_read_text, blocks=_text_blocks),
+    ".tsv": LogFormat(read_csv, blocks=csv_blocks),
+    ".dat": LogFormat(_read_text, blocks=_text_blocks),
     ".mat": LogFormat(read_matlab),
     ".h5": _HDF5,
     ".hdf5": _HDF5,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -72,14 +72,33 @@ def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
     InvalidInput
         The file is missing, of no known format or damaged.
     """
+    return next(_reading(path, requested, whole=True))
+
+
+def read_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+    """Read columns by name, a part of the rows at a time where the format allows it.
+
+    Raises
+    ------
+    InvalidInput
+        As `read_columns`.
+    """
+    return _reading(path, requested, whole=False)
+
+
+def _reading(path: Path, requested: Collection[str], whole: bool) -> Iterator[LogColumns]:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
     if not path.is_file():
         raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
-    FORMATS[suffix].check_installed(f"log {path}")
+    form = FORMATS[suffix]
+    form.check_installed(f"log {path}")
     try:
-        return FORMATS[suffix].read(path, requested)
+        if form.blocks is not None and not whole:
+            yield from form.blocks(path, requested)
+        else:
+            yield form.read(path, requested)
     except OSError as error:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror or error})") from None
 

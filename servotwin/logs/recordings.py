@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +12,15 @@ import numpy as np
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.logs.cleaning import Cleaned, cleaned
+from servotwin.estimation.kinematic.strokes import resolution
+from servotwin.logs.cleaning import Cleaned
 from servotwin.logs.columns import LogColumns
-from servotwin.logs.log import read_columns
+from servotwin.logs.gathering import THINNED, Gathering
+from servotwin.logs.log import read_blocks, read_columns
 from servotwin.plant.signals import Array
 
 _LEAST = 100  # samples
+_BLOCK = 1_000_000  # samples that are cleaned at a time
 _MOST_LOST = 0.5  # of the samples: beyond, the log is not what it seems
 # A number in brackets is a row of a matrix.
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
@@ -77,8 +80,10 @@ class RecordedLog:
     found: Mapping[str, int]
 
 
-def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
-    """Read, find the columns and clean.
+def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], object] = int) -> RecordedLog:
+    """Read, find the columns and clean; a log of millions of samples is thinned while it is read.
+
+    `told` is called with the number of samples read so far.
 
     Raises
     ------
@@ -88,16 +93,28 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
     """
     names = tuple(read_columns(path, ()).names)
     chosen = _chosen(path, names, wanted)
-    columns = read_columns(path, tuple(chosen.values()))
-    arrays = _arrays(path, chosen, columns)
-    size = len(arrays["motor"])
     units = {part: named_unit(name) for part, name in chosen.items()}
     motor_unit = wanted.motor_unit or units["motor"] or "motor unit"
     load_unit = wanted.load_unit or units["load"] or "load unit"
-    time = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size)
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
-    clean = cleaned(time, arrays, turns)
-    _check_left(path, clean, size, columns)
+    gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
+    for columns in read_blocks(path, tuple(chosen.values())):
+        damaged = {**columns.damaged, **damaged}
+        arrays = _arrays(path, chosen, columns)
+        size, before = len(arrays["motor"]), gathering.samples
+        times = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size, before)
+        for begin in range(0, len(times), _BLOCK):
+            part = {name: values[begin : begin + _BLOCK] for name, values in arrays.items()}
+            # Thinned samples lie further apart: counts are those of the first block.
+            counts = counts or {name: resolution(values[np.isfinite(values)]) for name, values in part.items()}
+            try:
+                gathering.add(times[begin : begin + _BLOCK], part)
+            except InvalidInput as error:
+                raise InvalidInput(f"log {path}: {error}") from None
+            told(gathering.samples)
+    clean = gathering.cleaned()
+    _check_left(path, clean, gathering.samples, damaged)
+    thinned = THINNED in clean.found
     recording = EncoderRecording(
         time=clean.time,
         motor=clean.channels["motor"],
@@ -106,8 +123,10 @@ def read_recording(path: Path, wanted: RecordingColumns) -> RecordedLog:
         motor_unit=motor_unit,
         load_unit=load_unit,
         source=f"log {path}",
+        motor_count=counts["motor"] if thinned else None,
+        load_count=counts["load"] if thinned else None,
     )
-    return RecordedLog(recording, chosen, size, clean.found)
+    return RecordedLog(recording, chosen, gathering.samples, clean.found)
 
 
 def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
@@ -123,12 +142,12 @@ def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[
     return arrays
 
 
-def _check_left(path: Path, clean: Cleaned, size: int, columns: LogColumns) -> None:
+def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]) -> None:
     left = clean.time.size
-    if left >= max(_LEAST, _MOST_LOST * size):
+    if left >= max(_LEAST, _MOST_LOST * (size - clean.found.get(THINNED, 0))):
         return
     what = "; ".join(f"{count} {defect}" for defect, count in clean.found.items()) or "the log is short"
-    first = next(iter(columns.damaged.items()), None)
+    first = next(iter(damaged.items()), None)
     where = f"; column {first[0]!r}, {first[1]}" if first else ""
     raise InvalidInput(
         f"log {path}: {left} of {size} samples can be used, of at least {_LEAST} and half of all ({what}{where})"
@@ -150,6 +169,8 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
                 f"log {path}: no column is called like the {part}'s position; give --{part} COLUMN, one of "
                 f"{', '.join(names) or 'none'}"
             )
+    if result["motor"] == result["load"]:
+        raise InvalidInput(f"log {path}: --motor and --load are both {result['motor']!r}: give two columns")
     return result
 
 
@@ -191,8 +212,8 @@ def _ending(name: str) -> str:
     return next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
 
 
-def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size: int) -> Array:
-    """Times in s, of a column or by the rate.
+def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size: int, before: int = 0) -> Array:
+    """Times in s, of a column or by the rate; `before` samples after the first.
 
     Raises
     ------
@@ -205,7 +226,7 @@ def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size
         return time * _SECONDS.get(unit.lower(), 1.0)
     if rate is None or not (np.isfinite(rate) and rate > 0.0):
         raise InvalidInput(f"log {path}: no column is called like a time; give --time COLUMN, or --rate in Hz above 0")
-    return np.arange(size) / rate
+    return np.arange(before, before + size) / rate
 
 
 def numbers_of(path: Path, name: str, columns: LogColumns) -> Array:

@@ -32,6 +32,7 @@ def test_delays_count_for_a_sampled_law() -> None:
     assert peaks[0] < peaks[1]
 
 
+@pytest.mark.slow
 def test_rows_are_shown_and_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     some = {"gap of 10 deg": questions(SERVO)["gap of 10 deg"]}
     monkeypatch.setattr(certificates, "questions", lambda _servo: some)

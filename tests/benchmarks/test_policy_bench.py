@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,8 +24,9 @@ from benchmarks.policies.worn import HALF_PERIOD, RATE, STEPS, worn_machines
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
+from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.simulation import simulate
@@ -32,6 +34,15 @@ from servotwin.simulation import simulate
 MODEL = Servo.preset("paper")
 KNOWN = Uncertainty(input_bias=(-0.1, 0.1))
 CALM = Design(MODEL.controller.replace(Ki=0.0))
+
+
+FEW = Demands(machines=40, screened=4, conditions=4, beyond=Beyond(machines=8), settled=0.9)
+
+
+@pytest.fixture
+def few_machines(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Settings are verified on few machines."""
+    monkeypatch.setattr("benchmarks.policies.contenders.CertifiedPolicy", partial(CertifiedPolicy, demands=FEW))
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -60,6 +71,7 @@ def test_scores_are_those_of_the_closed_form() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_machines")
 def test_the_certified_policy_learns_the_bias_that_a_constant_keeps() -> None:
     machine = max(machines(MODEL, KNOWN, "bias", 10, 1), key=lambda m: abs(m.input_bias))
     learnt = run_machine(machine, "bias", MODEL, contender("certified", MODEL, KNOWN))
@@ -88,6 +100,7 @@ def test_no_constant_is_dropped_for_its_name() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("few_machines")
 def test_the_table_and_its_document(monkeypatch: pytest.MonkeyPatch) -> None:
     """The best of every tenth constant: how many are tried does not matter here."""
     few = dict(list(constants(MODEL, KNOWN).items())[::10])

@@ -6,6 +6,7 @@ import math
 from dataclasses import replace
 
 import pytest
+from exploration import extent
 
 from benchmarks.shelf import SHELF, certified_machines, judged, measured, shelf_machines
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -27,11 +28,13 @@ def test_every_preset_has_a_duty_and_machines_near_it() -> None:
         assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
 
 
+@pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize("name", ESTIMATED)
 def test_a_preset_s_twin_finds_its_gap(name: str) -> None:
-    """Three steps of a machine that is not quite its model, worn to five times its healthy gap."""
+    """Two steps of a machine that is not quite its model, worn to five times its healthy gap."""
     (machine,) = shelf_machines(name, 1, 20261123)
-    found = measured(replace(machine, worn=(5.0, 5.0), steps=3))
+    found = measured(replace(machine, worn=(5.0, 5.0), steps=extent(2, 3)))
     accepted = found["estimates"]
     assert "ok" in found["statuses"], found["reasons"]
     assert all(each["near"] and each["inside"] for each in accepted), accepted

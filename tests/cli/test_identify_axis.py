@@ -19,7 +19,7 @@ DRIVE, GAP = st.Axis.preset("two-mass-drive"), math.radians(1.0)
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of a rotary axis as it is recorded, and as another maker writes it: degrees, no metadata."""
     folder = tmp_path_factory.mktemp("logs")
-    run = st.simulate(DRIVE, 4.0, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=2000.0)
+    run = st.simulate(DRIVE, 4.0, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=1000.0)
     write_log(SignalTable(run.columns, {"servo": DRIVE.dumps()}), folder / "own.npz")
     names = {"time_s": "time_s", "position_deg": "measured_position_rad", "theta_m_deg": "theta_m_rad"}
     names |= {"reference_deg": "reference_rad", "command_n_m": "command_n_m"}
@@ -33,6 +33,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "servo"), [("own", None), ("foreign", "two-mass-drive")])
 def test_a_log_of_a_rotary_axis_shows_its_gap(logs: Path, name: str, servo: str | None) -> None:
     found = identify(IdentifyOptions(logs / f"{name}.npz", servo, start=0.0, duration=3.9))

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from exploration import extent
 
 from benchmarks.axis_windows import SCREW, SHAFT, screw_case, shaft_case, tally
 from servotwin.control.controller import Controller
@@ -95,6 +96,7 @@ def test_a_stiffness_and_an_inertia_that_are_off_stay_inside_the_interval() -> N
     assert estimate.interval[0] < 0.03 < estimate.interval[1]
 
 
+@pytest.mark.slow
 def test_the_same_machine_in_other_units_has_the_same_estimate() -> None:
     """Ten times as slow, a hundred times as heavy, geared a hundred to one: gap and spread scale with the ratio."""
     slow, mass, ratio = 10.0, 100.0, 0.01
@@ -114,20 +116,24 @@ def test_the_same_machine_in_other_units_has_the_same_estimate() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize("kind", SHAFT)
 def test_random_drives_are_estimated_within_their_intervals(kind: str) -> None:
-    result = tally(shaft_case, kind, 6, 3)
+    count = extent(2, 12)
+    result = tally(shaft_case, kind, count, 3)
     assert result.false == result.bounds_above == 0, result
-    assert len(result.errors) >= 3, result
+    assert len(result.errors) >= count // 2, result
     assert result.inside == len(result.errors), result
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 @pytest.mark.parametrize("kind", SCREW)
 def test_random_tables_are_estimated_within_their_intervals(kind: str) -> None:
-    result = tally(screw_case, kind, 30, 3)
+    count = extent(10, 60)
+    result = tally(screw_case, kind, count, 3)
     assert result.false == result.bounds_above == 0, result
-    assert len(result.errors) >= 18, result
+    assert len(result.errors) >= 0.6 * count, result
     assert result.inside >= len(result.errors) - 1, result
 
 
@@ -153,6 +159,7 @@ def test_one_flank_gives_a_lower_bound() -> None:
     assert math.isinf(estimate.interval[1])
 
 
+@pytest.mark.slow
 def test_a_load_that_does_not_follow_the_model_is_refused() -> None:
     window = recorded(TWO_MASS, 0.03)
     slack = window.position + 0.02 * np.sin(7.0 * window.time)
@@ -193,6 +200,7 @@ def test_windows_and_settings_that_do_not_fit_are_refused() -> None:
     assert "position is constant" in still.reasons[0]
 
 
+@pytest.mark.slow
 def test_a_gap_that_may_grow_within_the_window_widens_the_interval_only() -> None:
     """By the standard deviation of a place anywhere in the window, 1/sqrt(12) of its growth; the halves bound that."""
     window = recorded(TWO_MASS, 0.03, 1e-4)
@@ -206,11 +214,12 @@ def test_a_gap_that_may_grow_within_the_window_widens_the_interval_only() -> Non
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_a_search_that_was_led_astray_begins_anew():
     # Each was accepted with a wrong gap (6.4, 4.1 and 69 um) when the first minima alone were followed.
     screw = Axis.preset("ball-screw")
     machine, metre = screw.scaled({"k": 0.985, "c": 0.977}), 1.0 / screw.p
-    for gap in (8.5e-6, 38e-6, 43e-6):
+    for gap in (8.5e-6, 38e-6, 43e-6)[: extent(1, 3)]:
         run = simulate(
             machine, 2.3, reference=SquareWave(7e-4, 4.0), gap=gap * metre, sample_rate=2000.0, input_bias=0.004
         )

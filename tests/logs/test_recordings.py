@@ -236,3 +236,42 @@ def test_the_change_between_two_logs(tmp_path, made):
     assert result.exit_code == 0, result.output
     assert "change: +0.001" in result.output
     assert "more than chance explains" in result.output
+
+
+def test_a_foreign_log_is_converted_without_its_defects(tmp_path, made):
+    values = rows(made)
+    values[100, 2] = np.nan
+    path = csv(tmp_path / "log.csv", values, "t,qa,qb\ns,rad,um", ";")
+    options = ["--motor", "qa", "--load", "qb"]
+    result = CliRunner().invoke(app, ["convert", str(path), str(tmp_path / "clean.npz"), *options])
+    assert result.exit_code == 0, result.output
+    assert "1 without a number in some column" in result.output
+    log = read_recording(tmp_path / "clean.npz", RecordingColumns())
+    assert (log.recording.motor_unit, log.recording.load_unit) == ("rad", "um")
+    assert not log.found
+    assert np.allclose(log.recording.motor, np.delete(made.motor, 100), atol=1e-8)
+
+
+def test_one_column_for_both_positions_is_refused(tmp_path, made):
+    path = csv(tmp_path / "log.csv", rows(made))
+    with pytest.raises(InvalidInput, match="are both 'motor_rad': give two columns"):
+        read_recording(path, RecordingColumns(motor="motor_rad", load="motor_rad"))
+
+
+def test_wear_over_three_logs_in_calendar_time(tmp_path):
+    logs = []
+    for month, gap in (("01", 0.05), ("04", 0.055), ("07", 0.06)):
+        one = recording(gap=gap, ratio=RATIO, seconds=8.0, rate=200.0)
+        # Time stamps since 1970 are dates.
+        begin = np.datetime64(f"2026-{month}-01", "s").astype(float)
+        logs.append(csv(tmp_path / f"{month}.csv", rows(one)))
+        lines = [f"{begin + t:.3f},{m:.9g},{x:.9g}" for t, m, x in rows(one)]
+        logs[-1].write_text("\n".join(["time_s,motor_rad,load_rad", *lines]))
+    result = CliRunner().invoke(app, ["identify", *map(str, logs), "--json"])
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert [each["date"][:10] for each in found] == ["2026-01-01", "2026-04-01", "2026-07-01"]
+    assert found[-1]["growth_per_year_load"] == pytest.approx(0.01 * RATIO * 365.25 / 181, rel=0.05)
+    wrong = CliRunner().invoke(app, ["identify", *map(str, logs), "--dates", "2026-01-01"])
+    assert wrong.exit_code == 2
+    assert "has 1 dates for 3 logs" in wrong.stderr

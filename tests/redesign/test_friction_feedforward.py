@@ -56,6 +56,7 @@ def test_candidates_feed_forward_the_friction_that_acts_on_every_machine() -> No
     assert pushes(KNOWN, replace(DEMANDS, friction_limit=0.02)) == [0.0, 0.02]
 
 
+@pytest.mark.slow
 def test_known_friction_is_fed_forward_and_moves_cost_less() -> None:
     """Simulated beside the certificate, on a machine of the range that moves to and fro."""
     without, fed = (certify(SERVO, KNOWN, replace(DEMANDS, friction_feedforward=push)) for push in (False, True))

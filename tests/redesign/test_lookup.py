@@ -72,6 +72,7 @@ def evidence(degrees=10.0, bias=0.05, noise=0.0, std=0.02, **changes) -> Evidenc
 
 
 @pytest.mark.slow
+@examples(15)
 @given(st.floats(0.0, 60.0), st.floats(0.0, 60.0), st.floats(0.5, 100.0))
 def test_every_interval_lies_in_a_cell_at_most_four_times_as_wide(one: float, other: float, finest: float) -> None:
     stated, grid = (2.0 * DEG, 62.0 * DEG), Grid(finest * DEG)
@@ -290,7 +291,7 @@ def test_an_interrupted_table_is_continued(file: Path, tmp_path: Path, monkeypat
 
     def counted(policy, grid, key):
         looked_at.append(key)
-        return certify_cell(policy, grid, key)
+        return table().cells[key]
 
     monkeypatch.setattr("servotwin.redesign.certified.lookup_file.certify_cell", counted)
     assert load(built(path), POLICY) == table()

@@ -138,6 +138,7 @@ def test_margin_has_no_map_for_a_limited_voltage():
         policy_of(PAPER.replace(voltage_limit=24.0), TwinSettings(policy="margin"))
 
 
+@pytest.mark.slow
 def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_path):
     scenario = load(tmp_path, "")
     verified = certified_policy(scenario.model, scenario.twin).fallback()

@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from exploration import extent
 from random_sampled import DEGREE, SampledCase, largest_difference, random_case
 
 from servotwin.hybrid.lifted import COARSE, level_stride
@@ -26,7 +27,8 @@ def share_of_ticks(engine: LiftedEngine) -> float:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 300, 50))
+@pytest.mark.exploration
+@pytest.mark.parametrize("first", range(0, extent(150, 600), 50))
 def test_random_loops_are_those_of_the_ticks(first: int) -> None:
     """Same events, switching ticks to the bit, states to 1e-9 of their range."""
     for seed in range(first, first + 50):

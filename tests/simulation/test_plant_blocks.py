@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from exploration import extent
 from random_sampled import DEGREE, SampledCase, largest_difference, random_case
 
 from servotwin.control import law
@@ -39,7 +40,8 @@ def both(case: SampledCase, std: float, seed: int) -> tuple[SampledEngine, Plant
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", range(0, 300, 50))
+@pytest.mark.exploration
+@pytest.mark.parametrize("first", range(0, extent(150, 600), 50))
 def test_random_loops_in_noise_are_those_of_the_ticks(first: int) -> None:
     """Same events, dead zone to the tick, states to 1e-8 of their range, measurements too."""
     for seed in range(first, first + 50):

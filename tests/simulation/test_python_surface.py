@@ -63,7 +63,7 @@ RIGHT = (
 def test_mypy_finds_misspelt_keywords_and_wrong_types(tmp_path):
     lines = ["import servotwin as st", 'servo = st.Servo.preset("paper")', *WRONG, *RIGHT]
     (tmp_path / "snippet.py").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    command = [sys.executable, "-m", "mypy", "--strict", "--config-file", str(ROOT / "pyproject.toml")]
+    command = [sys.executable, "-m", "mypy", "--config-file", str(ROOT / "pyproject.toml")]
     done = subprocess.run(
         [*command, "--no-error-summary", str(tmp_path / "snippet.py")], cwd=ROOT, capture_output=True, text=True
     )

@@ -49,7 +49,7 @@ class FrictionOracle:
                 guard.direction = 1.0
             later = times[(times > time + 1e-13)]
             found = solve_ivp(
-                self._rate,
+                self._flow(y.size),
                 (time, times[-1]),
                 y,
                 "DOP853",
@@ -61,7 +61,8 @@ class FrictionOracle:
             )
             fired = [k for k, at in enumerate(found.t_events) if at.size]
             time = found.t_events[fired[0]][0] if fired else times[-1]
-            rows += [found.sol(t) for t in later if t <= time]
+            if (due := later[later <= time]).size:
+                rows += list(found.sol(due).T)
             y = found.sol(time)
             if fired:
                 name, _, act = guards[fired[0]]
@@ -100,6 +101,12 @@ class FrictionOracle:
         driven = self.error(y) if self.tolerance is None or self.zone != 0 else 0.0
         rate[-2], rate[-1] = driven, (driven - y[-1]) / law.Tf
         return rate
+
+    def _flow(self, size: int) -> Callable[[float, Array], Array]:
+        """Rates of the present mode, which are affine, as a matrix and a vector: they cost a tenth."""
+        constant = self._rate(0.0, np.zeros(size))
+        matrix = np.array([self._rate(0.0, unit) - constant for unit in np.eye(size)]).T
+        return lambda _t, y: matrix @ y + constant
 
     def _guards(self) -> list[tuple[str, Callable[[float, Array], float], Callable[[float, Array], None]]]:
         return [*self._of_motion(), *self._of_flank(), *self._of_zone()]

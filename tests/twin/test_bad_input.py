@@ -6,16 +6,19 @@ import numpy as np
 import pytest
 from twin_messages import message_of, window_message
 
+from servotwin.config.table import parse_toml
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.window import Window
 from servotwin.messages import Setting
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
+from servotwin.twin.estimating import estimator_of
 from servotwin.twin.evidence import GapEstimateRecord, RedesignRecord, rows
 from servotwin.twin.model import TwinModel
-from servotwin.twin.settings import TwinSettings
+from servotwin.twin.settings import TwinSettings, read_twin_settings
 from servotwin.twin.step import WindowArrival, step
 
 MODEL = Servo.preset("paper")
@@ -173,3 +176,13 @@ def test_a_new_screw_without_a_gap_is_followed_from_its_second_window_and_said()
     assert seen.gaps() == pytest.approx([10.0] * 4 + [0.0] * 3, abs=0.05)
     assert "the gap has jumped from 10 to" in seen.alarms[5]
     assert [redesign.setting is None for redesign in seen.redesigns[4:6]] == [True, False]
+
+
+@pytest.mark.parametrize("name", ["two-mass-drive", "ball-screw"])
+def test_a_file_that_states_no_estimator_suits_a_free_shaft(name):
+    axis = Axis.preset(name)
+    stated = read_twin_settings(parse_toml('policy = "paper"\n', "twin.toml"), plant=axis)
+    assert estimator_of(axis, stated) is not None
+    other = parse_toml('policy = "paper"\n[estimator]\nlargest_std_deg = 0.2\n', "twin.toml")
+    with pytest.raises(InvalidInput, match="leave them out for this axis"):
+        estimator_of(axis, read_twin_settings(other, plant=axis))

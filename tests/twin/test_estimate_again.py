@@ -199,6 +199,7 @@ def test_a_context_that_describes_no_model_is_refused(change):
         replay(window, body, json.dumps({**parts_of(context), **change}))
 
 
+@pytest.mark.slow
 @given(st.dictionaries(st.text(max_size=20), st.text(max_size=20), max_size=4))
 def test_no_context_makes_it_fail_otherwise(parts):
     with pytest.raises(InvalidInput):

@@ -12,6 +12,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TwinSettings
 
@@ -74,7 +75,9 @@ def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
 
 @pytest.mark.slow
 def test_where_nothing_is_proved_nothing_is_known_of_the_start():
-    settings = TwinSettings(uncertainty=TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0)))
+    wide = TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0))
+    few = Demands(machines=40, screened=2, conditions=4, scales=(0.5,), beyond=Beyond(machines=4), settled=0.9)
+    settings = TwinSettings(uncertainty=wide, demands=few)
     assert ServoModel("axis", Servo.preset("paper"), settings).first_setting is None
 
 

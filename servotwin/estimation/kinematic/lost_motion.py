@@ -12,13 +12,24 @@ from scipy.stats import t as student
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
+from servotwin.estimation.kinematic.breaks import check_one_machine
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
 from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
 from servotwin.estimation.kinematic.profile import least_gap
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.estimation.kinematic.regression import LAG, RATIO, Regression, columns, products, regression, solved
-from servotwin.estimation.kinematic.strokes import play_and_side, resolution, strokes_of
+from servotwin.estimation.kinematic.regression import (
+    INERTIA,
+    LAG,
+    RATIO,
+    Regression,
+    Solution,
+    columns,
+    products,
+    regression,
+    solved,
+)
+from servotwin.estimation.kinematic.strokes import Strokes, counts_of, play_and_side, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
@@ -27,6 +38,9 @@ _FINE = 17  # of each finer one
 _ROUNDS = 4
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
+_SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
+_SKEW = 2.0  # samples between two channels that are nothing unusual
+_ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
 _CHANCE = 0.025  # on either side of a 95 % interval
 
 
@@ -123,20 +137,22 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     Raises
     ------
     InvalidInput
-        The motor or the load does not move, or the motor never reverses.
+        The motor or the load does not move, the motor never reverses, or the load jumps against it.
     """
-    least = _least_motion(recording.motor)
+    motor_count, load_count = counts_of(recording)
+    least = _least_motion(recording.motor, motor_count)
     strokes = strokes_of(recording, least)
     _check(recording, least, strokes.reversals)
-    if float(np.ptp(recording.load)) <= _least_motion(recording.load):
+    if float(np.ptp(recording.load)) <= _least_motion(recording.load, load_count):
         return _bound(recording)
     prepared = regression(recording, strokes, 0)
     coarse = _coarse(prepared, least)
     # Until the gap has been taken up once nobody knows where the load is within it.
     first = _settled(recording, 1.1 * coarse)
     if first is None:
-        return _bound(recording)
+        return _no_gap()
     prepared = regression(recording, strokes, first)
+    check_one_machine(recording, prepared, coarse)
     prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
     grid, tensor = _tensor(prepared, coarse, least)
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
@@ -148,11 +164,16 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     return replace(found, curves=_curves(recording, prepared, best.model, found, grid, rms))
 
 
-def _least_motion(values: Array) -> float:
+def _least_motion(values: Array, count: float) -> float:
     """Motion that is more than an encoder's counts and noise."""
     second = np.diff(values, 2)
     noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6.0)
-    return max(_COUNTS * resolution(values), 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(values)))
+    return max(_COUNTS * count, 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(values)))
+
+
+def strokes_in(recording: EncoderRecording) -> Strokes:
+    """Cut at the reversals that are more than the encoder's counts and noise."""
+    return strokes_of(recording, _least_motion(recording.motor, counts_of(recording)[0]))
 
 
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
@@ -234,15 +255,13 @@ def _curves(
     gap = found.gap_motor if math.isfinite(found.gap_motor) else 0.0
     values, _ = columns(prepared._replace(lag=found.lag), gap)
     places = model.places(prepared)
-    fit = solved(values @ values.T, places).coefficients
+    fit = solved(values @ values.T, places)
     load, rows = values[0], prepared.rows
-    # What is neither ratio nor gap, such as an offset, is taken off: the rest is the motor's lead.
-    others = fit @ values[places] - fit[0] * values[1]
     return FittedCurves(
         time=recording.time[rows],
         load=load,
-        lead=recording.motor[rows] - (load - others) / fit[0],
-        residual=load - fit @ values[places],
+        lead=recording.motor[rows] - _follower(values, fit, places),
+        residual=load - fit.coefficients @ values[places],
         gaps=grid,
         rms=rms,
     )
@@ -252,7 +271,7 @@ def _travel(prepared: Regression) -> Array:
     """Way of the motor from one row to the next, its counts and noise left out, relative to the mean."""
     motor = prepared.recording.motor
     side = np.zeros(motor.size, dtype=np.int8)
-    smooth = play_and_side(motor, 2.0 * resolution(motor), side)[prepared.rows]
+    smooth = play_and_side(motor, 2.0 * counts_of(prepared.recording)[0], side)[prepared.rows]
     way = np.abs(np.diff(smooth, prepend=smooth[0]))
     return way / max(float(way.mean()), np.finfo(float).tiny)
 
@@ -272,11 +291,12 @@ def _answer(
     places = best.model.places(prepared)
     fit = solved(values @ values.T, places)
     residual, ratio = values[0] - fit.coefficients @ values[places], float(fit.coefficients[0])
-    quantisation = float(np.hypot(resolution(recording.motor), resolution(recording.load) / abs(ratio))) / math.sqrt(
-        12.0
-    )
+    motor_count, load_count = counts_of(recording)
+    quantisation = math.hypot(motor_count, load_count / abs(ratio)) / math.sqrt(12.0)
     quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
-    half = quantile * math.hypot(spread.std, 0.25 * quantisation)
+    left = structured(prepared, residual) / abs(ratio)
+    # Counts and what the model leaves are the same in every cycle: the bootstrap does not see that they shift the gap.
+    half = quantile * math.hypot(spread.std, quantisation, _SHIFT * left, _SHIFT * (by_travel - gap))
     judged = verdict(
         KinematicFit(
             gap=gap,
@@ -285,8 +305,10 @@ def _answer(
             spread=spread,
             half=half,
             quantisation=quantisation,
-            left=structured(prepared, residual) / abs(ratio),
+            left=left,
             better_than_none=best.rms < comparisons[-1].rms,
+            lead=_lead(prepared, best),
+            reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),
         ),
         recording.motor_unit,
     )
@@ -307,6 +329,17 @@ def _answer(
     )
 
 
+def _lead(prepared: Regression, best: ModelScore) -> float:
+    usual = float(np.median(np.diff(prepared.recording.time)))
+    return -prepared.lag if INERTIA in best.model.used and prepared.lag < -_SKEW * usual else 0.0
+
+
+def _follower(values: Array, fit: Solution, places: list[int]) -> Array:
+    """The load's position in the motor's unit, without what is neither ratio nor gap, such as an offset."""
+    others = fit.coefficients[1:] @ values[places[1:]]
+    return (values[0] - others) / fit.coefficients[0]
+
+
 def _with_lag(prepared: Regression, best: ModelScore) -> Regression:
     """The design with the lag moved from its column, which is right to first order, into the time."""
     places = best.model.places(prepared)
@@ -316,6 +349,14 @@ def _with_lag(prepared: Regression, best: ModelScore) -> Regression:
         fit = solved(values @ values.T, places)
         prepared = prepared._replace(lag=prepared.lag + float(fit.coefficients[lag] / fit.coefficients[0]))
     return prepared
+
+
+def _no_gap() -> LostMotion:
+    reason = (
+        "the best fit is a gap as large as the motor's way: the load does not follow the motor through a gap; check "
+        "that both columns are of one axis, and that the log is fast enough for its motion"
+    )
+    return LostMotion(np.nan, np.inf, NOTHING_KNOWN, np.nan, 0.0, GapStatus.UNIDENTIFIABLE, (reason,))
 
 
 def _bound(recording: EncoderRecording) -> LostMotion:

@@ -22,6 +22,8 @@ class EncoderRecording:
     motor_unit, load_unit : str
     source : str
         Where it is from, for messages.
+    motor_count, load_count : float or None
+        One count of each encoder; None: what the samples show.
     """
 
     time: Array
@@ -31,3 +33,5 @@ class EncoderRecording:
     motor_unit: str = "rad"
     load_unit: str = "rad"
     source: str = "recording"
+    motor_count: float | None = None
+    load_count: float | None = None

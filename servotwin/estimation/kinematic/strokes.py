@@ -63,6 +63,13 @@ def resolution(values: Array) -> float:
     return float(np.quantile(steps, 0.01)) if steps.size else 0.0
 
 
+def counts_of(recording: EncoderRecording) -> tuple[float, float]:
+    """One count of the motor's encoder and of the load's."""
+    given = ((recording.motor_count, recording.motor), (recording.load_count, recording.load))
+    motor, load = (resolution(values) if count is None else count for count, values in given)
+    return motor, load
+
+
 def strokes_of(recording: EncoderRecording, least: float) -> Strokes:
     """Cut at reversals of the motor by more than `least` (the motor's unit)."""
     side = np.zeros(recording.motor.size, dtype=np.int8)

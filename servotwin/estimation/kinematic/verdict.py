@@ -41,6 +41,10 @@ class KinematicFit(NamedTuple):
         What the model leaves of the load's motion, noise aside.
     better_than_none : bool
         Unseen strokes are predicted better with a gap than without.
+    reach : float
+        From the least to the largest lead of the motor over the load: no gap that the load takes up is larger.
+    lead : float
+        s, by which a load that winds up by its acceleration would be ahead of the motor, beyond two samples; or 0.
     """
 
     gap: float
@@ -51,6 +55,8 @@ class KinematicFit(NamedTuple):
     quantisation: float
     left: float
     better_than_none: bool
+    reach: float
+    lead: float
 
 
 class KinematicVerdict(NamedTuple):
@@ -80,7 +86,10 @@ def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
     if not reasons:
         return KinematicVerdict(GapStatus.OK, (max(low, 0.0), high))
     ends = (low, high, fit.by_travel - fit.half, fit.by_travel + fit.half, *fit.simpler.values())
-    return KinematicVerdict(GapStatus.MODEL_MISMATCH, (max(min(ends), 0.0), max(ends)), reasons)
+    wide = _DISAGREE * fit.left
+    return KinematicVerdict(
+        GapStatus.MODEL_MISMATCH, (max(min(ends) - wide, 0.0), max(max(ends) + wide, fit.reach)), reasons
+    )
 
 
 def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
@@ -91,8 +100,15 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
             f"the gap is {fit.gap:.4g} {unit} if every moment counts alike and {fit.by_travel:.4g} {unit} if the "
             "motor's way does: the model leaves out something that is not noise"
         )
-    if fit.left > max(_LEFT * fit.gap, _COUNTS * fit.quantisation, fit.half):
+    if fit.left > max(_LEFT * fit.gap, fit.quantisation):
         reasons.append(f"the load deviates from the model by {fit.left:.3g} {unit} (rms, at the motor), noise aside")
+    if fit.gap - fit.half > fit.reach:
+        reasons.append(
+            f"the motor is never further ahead of the load than {fit.reach:.4g} {unit}, less than the gap of "
+            f"{fit.gap:.4g} {unit} that the model finds: the load swings"
+        )
+    if fit.lead > 0.0:
+        reasons.append(f"the load would be {1e3 * fit.lead:.3g} ms ahead of the motor: it swings")
     for name, gap in fit.simpler.items():
         # What a swinging load does at a reversal is no proof of a gap, nor against one; a lag shows at other speeds.
         if (reasons or name != LAG) and abs(gap - fit.gap) > fit.half + 2.0 * fit.quantisation:

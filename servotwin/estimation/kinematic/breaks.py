@@ -1,0 +1,76 @@
+"""Breaks in a recording: a slipped encoder, or two machines in one log."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.regression import OFFSET, RATIO, Regression, columns, solved
+from servotwin.plant.signals import Array
+
+_EXPLAINED = 0.8  # of what the model leaves, by one step
+_STEP = 0.5  # of the gap, at least
+_RATIO = 0.03  # between the halves of a recording
+_TRAVEL = 10.0  # gaps, from which on the ratio is known
+
+
+class ResidualStep(NamedTuple):
+    """The step that explains a residual best.
+
+    Attributes
+    ----------
+    row : int
+        First one behind it.
+    size : float
+    explained : float
+        Share of the variance.
+    """
+
+    row: int
+    size: float
+    explained: float
+
+
+def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: float) -> None:
+    """Refuse a recording in which the load jumps against the motor, or moves by another ratio in its second half.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    values, _ = columns(prepared, gap)
+    used = [prepared.names.index(RATIO), prepared.names.index(OFFSET)]
+    halves = [solved(part @ part.T, used).coefficients[0] for part in np.array_split(values, 2, axis=1)]
+    reach, unit = float(np.ptp(recording.motor)), recording.load_unit
+    known = min(float(np.ptp(part[1])) for part in np.array_split(values, 2, axis=1)) > max(_TRAVEL * gap, 0.1 * reach)
+    if known and abs(halves[1] / halves[0] - 1.0) > _RATIO:
+        raise InvalidInput(
+            f"{recording.source}: the load moves by {halves[0]:.4g} {unit} per {recording.motor_unit} in its first "
+            f"half and by {halves[1]:.4g} in its second: two machines or units in one log, or turns lost in a pause; "
+            "give each part by itself"
+        )
+    fit = solved(values @ values.T, used)
+    step = largest_step(values[0] - fit.coefficients @ values[used])
+    least = _STEP * gap * abs(float(fit.coefficients[0]))
+    if step.explained > _EXPLAINED and abs(step.size) > least:
+        time = recording.time[prepared.rows[step.row]]
+        raise InvalidInput(
+            f"{recording.source}: from {time:.4g} s on the load is {step.size:+.4g} {unit} off where the motor moved "
+            "it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were joined; give each part "
+            "by itself"
+        )
+
+
+def largest_step(residual: Array) -> ResidualStep:
+    """Find the step with which a residual (k,) is explained best."""
+    size, total = residual.size, residual - residual.mean()
+    before = np.arange(1, size)
+    sums = np.cumsum(total)[:-1]
+    gain = sums**2 * (1.0 / before + 1.0 / (size - before))
+    row = int(np.argmax(gain)) + 1
+    scale = float(total @ total)
+    jump = float(total[row:].mean() - total[:row].mean())
+    return ResidualStep(row, jump, float(gain[row - 1]) / scale if scale else 0.0)

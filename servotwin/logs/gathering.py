@@ -1,0 +1,86 @@
+"""Samples of a log that come in blocks: cleaned, joined and, where there are millions, thinned to what strokes need."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+
+import numpy as np
+
+from servotwin.logs.cleaning import Cleaned, cleaned
+from servotwin.plant.signals import Array
+
+MOST = 1_500_000
+"""Samples that are held; a longer log is thinned."""
+_GROUP = 6  # samples, of which the first, and the lowest and the highest of the motor stay
+THINNED = "left out of a long log, turning points kept"
+
+
+class Gathering:
+    """Cleaned samples so far.
+
+    Parameters
+    ----------
+    turns : mapping
+        As `cleaned` takes them.
+    most : int
+        Samples to hold.
+    """
+
+    def __init__(self, turns: Mapping[str, float], most: int = MOST) -> None:
+        self._turns, self._most = turns, most
+        self._parts: list[Array] = []
+        self._names: tuple[str, ...] = ()
+        self._last: Array | None = None
+        self._found: Counter[str] = Counter()
+        self._thinnings = 0
+        self.samples = 0
+
+    def add(self, time: Array, channels: Mapping[str, Array]) -> None:
+        """Add the next block: (n,) times in s and (n,) arrays by name, of which the first is the motor."""
+        self.samples += len(time)
+        self._names = tuple(channels)
+        part = cleaned(time, channels, self._turns, first=self._last is None)
+        self._found.update(part.found)
+        table = self._after_last(np.column_stack([part.time, *part.channels.values()]))
+        if not len(table):
+            return
+        self._last = table[-1].copy()
+        for _ in range(self._thinnings):
+            table = self._thin(table)
+        self._parts.append(table)
+        while sum(map(len, self._parts)) > self._most:
+            self._parts = [self._thin(np.concatenate(self._parts))]
+            self._thinnings += 1
+
+    def cleaned(self) -> Cleaned:
+        """All samples so far."""
+        empty = np.empty((0, 1 + len(self._names)))
+        table = np.concatenate([empty, *self._parts])
+        return Cleaned(table[:, 0], dict(zip(self._names, table[:, 1:].T, strict=True)), dict(self._found))
+
+    def _after_last(self, table: Array) -> Array:
+        """The block behind the one before: later samples only, and angles in the turn in which they go on."""
+        if self._last is None or not len(table):
+            return table
+        later = table[:, 0] > self._last[0]
+        if not later.all():
+            self._found["earlier than the sample before"] += int(np.sum(~later))
+            table = table[later]
+        for place, name in enumerate(self._names, 1):
+            if name in self._turns and len(table):
+                turn = self._turns[name]
+                table[:, place] += turn * np.round((self._last[place] - table[0, place]) / turn)
+        return table
+
+    def _thin(self, table: Array) -> Array:
+        whole = len(table) // _GROUP * _GROUP
+        groups = table[:whole, 1].reshape(-1, _GROUP)
+        kept = np.zeros(groups.shape, dtype=np.bool_)
+        kept[:, 0] = True
+        rows = np.arange(len(groups))
+        kept[rows, groups.argmin(axis=1)] = True
+        kept[rows, groups.argmax(axis=1)] = True
+        chosen = np.concatenate([np.flatnonzero(kept.ravel()), np.arange(whole, len(table))])
+        self._found[THINNED] += len(table) - len(chosen)
+        return table[chosen]
