@@ -40,11 +40,16 @@ class TwinAction(StrEnum):
     """Action of `servotwin twin` instead of serving."""
 
     CHECK = "check"
+    ALARM = "test-alarm"
 
 
 def twin(
     action: Annotated[
-        TwinAction | None, typer.Argument(help="check: check the whole store, also while the twin runs, and end.")
+        TwinAction | None,
+        typer.Argument(
+            help="check: check the whole store, also while the twin runs, and end. "
+            "test-alarm: post a test to the webhook of [service.webhook], and end."
+        ),
     ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
     port: Annotated[
@@ -56,6 +61,11 @@ def twin(
         from servotwin.cli.check import check_store
 
         check_store(config)
+        return
+    if action is TwinAction.ALARM:
+        from servotwin.cli.alarm_test import post_test_alarm
+
+        post_test_alarm(config)
         return
     from servotwin.twin_service.command import run
 

@@ -21,6 +21,7 @@ from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
+from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
@@ -110,11 +111,14 @@ class TwinService:
         )
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
+        self.webhook: AlarmWebhook | None = None
+        if config.webhook is not None:
+            self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
         self.dispatcher = Dispatcher(
             store=store,
             executor=self.executor,
             pool=self.pool,
-            commit=self.watch.commit,
+            commit=self.watch.commit if self.webhook is None else announced(self.watch.commit, self.webhook),
             notify=self.polls.notify,
             metrics=self.metrics,
             clocks=self.clocks,
@@ -168,6 +172,8 @@ class TwinService:
         self._spawn(self._refresh_tokens())
         self._spawn(self.feed.run())
         self._spawn(self.what_if.run())
+        if self.webhook is not None:
+            self._spawn(self.webhook.run())
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
