@@ -113,7 +113,8 @@ class AlarmPost(msgspec.Struct, frozen=True):
 def alarm_post(servo: str, kind: str, sentence: str, now: float, version: int | None = None) -> AlarmPost:
     """Compose a post; `now`: s since the epoch."""
     time = datetime.fromtimestamp(now, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-    return AlarmPost(f"{servo}: {kind}: {sentence}", servo, kind, sentence, time, version)
+    words = sentence if sentence.startswith(kind) else f"{kind}: {sentence}"
+    return AlarmPost(f"{servo}: {words}", servo, kind, sentence, time, version)
 
 
 def send_post(config: WebhookConfig, post: AlarmPost) -> int:

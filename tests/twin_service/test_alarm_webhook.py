@@ -2,21 +2,27 @@
 
 import asyncio
 import json
+import sys
 import threading
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
+import httpx
+import msgspec
 import pytest
-from service_system import twin_file
+from service_system import bearer, place, twin_file, window
 
 from servotwin.cli.alarm_test import post_test_alarm
 from servotwin.errors import InvalidInput
+from servotwin.messages import encode
 from servotwin.store.records import EvidenceRecord, WorkResult
+from servotwin.store.store import open_store
 from servotwin.twin_service import alarm_webhook
 from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
 from servotwin.twin_service.monitoring import Metrics
-from servotwin.twin_service.twin_file import service_of
+from servotwin.twin_service.service import TwinService
+from servotwin.twin_service.twin_file import read_twin, service_of
 from servotwin.twin_service.webhook import (
     WebhookAway,
     WebhookConfig,
@@ -24,7 +30,9 @@ from servotwin.twin_service.webhook import (
     alarm_post,
     send_post,
 )
+from servotwin.twin_service.worker import WorkerPool
 
+WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
 POST = alarm_post("ax-1", "alarm", "the gap grows faster than is assumed", 0.0)
 
 
@@ -236,3 +244,27 @@ def test_a_result_that_is_void_announces_nothing(monkeypatch):
         assert webhook.waiting == 1
 
     asyncio.run(body())
+
+
+def test_what_a_twin_could_not_process_is_posted(tmp_path):
+    async def body(url):
+        twin = read_twin(with_webhook(tmp_path, url))
+        store = open_store(twin.service.store)
+        system = TwinService(twin, store, pool=WorkerPool(1, twin.start, 30.0, WORKER))
+        app = system.http_app()
+        try:
+            async with app.lifespan(), httpx.AsyncClient(transport=httpx.ASGITransport(app)) as client:
+                sent = msgspec.structs.replace(window(0), reason="raise")
+                await client.put(f"http://twin{place(sent)}", content=encode(sent), headers=bearer())
+                async with asyncio.timeout(60.0):
+                    while not system.metrics.webhook.values["taken",]:
+                        await asyncio.sleep(0.02)
+        finally:
+            store.close()
+
+    with receiver(200) as (url, received):
+        asyncio.run(body(url))
+    [(_, secret, post)] = received
+    assert secret == "Bearer s3cret"
+    assert (post["servo"], post["kind"]) == ("ax-1", "failed")
+    assert post["text"] == "ax-1: failed: given up"
