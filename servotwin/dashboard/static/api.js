@@ -32,7 +32,7 @@ export async function request(path, options = {}) {
   }
   if (!response.ok) {
     const said = await detail(response);
-    throw new ApiError(WORDS[response.status] || said || `The twin answers with status ${response.status}.`, response.status);
+    throw new ApiError((options.detailed && said) || WORDS[response.status] || said || `The twin answers with status ${response.status}.`, response.status);
   }
   if (response.status === 204) return null;
   try {
@@ -71,4 +71,4 @@ export const updates = (name, limit = 20) => request(`${servo(name)}/audit?updat
 export const events = (name, limit = 50) => request(`${servo(name)}/events?limit=${limit}`);
 export const channels = (name, boot, sequence, points) => request(`${windowPath(name, boot, sequence)}/channels?points=${points}`);
 export const whatIf = (name, asked) =>
-  request(`${servo(name)}/what-if`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(asked), signal: AbortSignal.timeout(60000) });
+  request(`${servo(name)}/what-if`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(asked), signal: AbortSignal.timeout(60000), detailed: true });

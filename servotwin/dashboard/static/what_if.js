@@ -5,6 +5,7 @@ import { legend, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { brief, DEG, positionUnit } from "./format.js";
 
+const PACE_MS = 60; // below the rate that the twin allows an operator
 const STEPS = 400, WIDEST = 3, FACTOR = 4;
 // Gains that have a slider, with the unit of each: U command, X travel.
 const GAINS = {
@@ -54,7 +55,9 @@ export class WhatIfPanel {
     try {
       do {
         this.again = false;
+        const paced = new Promise((resolve) => setTimeout(resolve, PACE_MS));
         this.show(await api.whatIf(this.name, this.asked));
+        await paced;
       } while (this.again);
     } catch (error) {
       if (!this.first) setText(this.note, "Nothing was simulated.");
