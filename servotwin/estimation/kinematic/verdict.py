@@ -97,8 +97,8 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
     reasons = []
     if abs(fit.by_travel - fit.gap) > _DISAGREE * math.hypot(fit.spread.std_of_difference, fit.quantisation):
         reasons.append(
-            f"the gap is {fit.gap:.4g} {unit} if every moment counts alike and {fit.by_travel:.4g} {unit} if the "
-            "motor's way does: the model leaves out something that is not noise"
+            f"the lost motion is {fit.gap:.4g} {unit} if every moment counts alike and {fit.by_travel:.4g} {unit} "
+            "if the motor's way does: the model leaves out something that is not noise"
         )
     if fit.left > max(_LEFT * fit.gap, fit.quantisation):
         reasons.append(f"the load deviates from the model by {fit.left:.3g} {unit} (rms, at the motor), noise aside")
