@@ -78,7 +78,8 @@ def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
         )
         return KinematicVerdict(GapStatus.MODEL_MISMATCH, NOTHING_KNOWN, (reason,))
     if none:
-        high = max(high, 3.0 * fit.left, *(gap + fit.half for gap in fit.simpler.values()))
+        # A load that hunts spoils the fit; no gap that it takes up is larger than the largest lead.
+        high = max(high, 3.0 * fit.left, fit.reach, *(gap + fit.half for gap in fit.simpler.values()))
         return KinematicVerdict(
             GapStatus.UNIDENTIFIABLE, (0.0, high), (f"no gap can be told from none: at most {high:.3g} {unit}",)
         )
