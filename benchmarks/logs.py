@@ -24,7 +24,7 @@ from benchmarks.log_files import WRITERS, damaged
 from benchmarks.shelf import SHELF
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
-from servotwin.estimation.kinematic.wind_up import wind_up, with_machine
+from servotwin.estimation.kinematic.wind_up import gap_of_machine, gap_within, wind_up
 from servotwin.logs.recordings import read_recording
 from servotwin.plant.axis import Axis
 from servotwin.plant.shown import position_unit
@@ -159,17 +159,19 @@ def measured(case: LogCase) -> dict[str, Any]:
         columns = WRITERS[case.file](path, table)
         try:
             recording = read_recording(path, columns).recording
-            answer = estimate_lost_motion(recording)
+            lost = estimate_lost_motion(recording)
         except InvalidInput as error:
             return found | {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
     unit = position_unit(case.plant).si
-    known = with_machine(replace(recording, load_unit=unit), answer, Axis.preset(case.name))
+    answer = gap_within(lost, None)
+    known = gap_of_machine(replace(recording, load_unit=unit), lost, Axis.preset(case.name))
     return found | {
         "axis": {"status": known.status.value, "interval": _numbers(known.interval_motor)},
         "status": answer.status.value,
         "reasons": list(answer.reasons),
-        "model": answer.model,
-        "estimate": answer.gap_motor if math.isfinite(answer.gap_motor) else None,
+        "model": lost.model,
+        "lost_motion": lost.at_motor if math.isfinite(lost.at_motor) else None,
+        "lost_motion_interval": _numbers(lost.interval_motor),
         "interval": _numbers(answer.interval_motor),
     }
 
@@ -196,8 +198,8 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     result = Table(title="logs: gaps of two encoders", title_justify="left", box=None)
     result.add_column("preset")
     for heading in (
-        *("logs", "ok", "ok: lost\nmotion in", "gap to lost\nmotion in", "ok:\ngap in", "doubtful", "lost\nmotion in"),
-        *("refused", "axis known:\nok", "ok:\ngap in"),
+        *("logs", "lost\nmotion", "in its\ninterval", "or gap to\nlost motion", "gap in\ninterval"),
+        *("doubtful", "lost\nmotion in", "gap in", "refused", "ok without\nan axis", "with an\naxis", "gap in"),
     ):
         result.add_column(heading, justify="right")
     for name in (*SHELF, ""):
@@ -213,19 +215,20 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
 
 
 def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
-    accepted = [each for each in rows if each["status"] == "ok"]
+    accepted = [each for each in rows if each["status"] == "lost motion"]
     known = [each for each in rows if each.get("axis", {}).get("status") == "ok"]
-    doubtful = [each for each in rows if each["status"] not in ("ok", "refused") and each["interval"] != [None, None]]
-    doubtful = [each for each in doubtful if each["interval"][0] is not None]
+    doubtful = [each for each in rows if each["status"] not in ("ok", "lost motion", "refused")]
     return (
         len(rows),
         len(accepted),
-        sum(inside(each["interval"], each["lost"]) for each in accepted),
-        sum(inside(each["interval"], each["gap"], each["lost"]) for each in accepted),
+        sum(inside(each["lost_motion_interval"], each["lost"]) for each in accepted),
+        sum(inside(each["lost_motion_interval"], each["gap"], each["lost"]) for each in accepted),
         sum(inside(each["interval"], each["gap"]) for each in accepted),
         len(doubtful),
-        sum(inside(each["interval"], each["lost"]) for each in doubtful),
-        len(rows) - len(accepted) - len(doubtful),
+        sum(inside(each["lost_motion_interval"], each["lost"]) for each in doubtful),
+        sum(inside(each["interval"], each["gap"]) for each in doubtful),
+        sum(each["status"] == "refused" for each in rows),
+        sum(each["status"] == "ok" for each in rows),
         len(known),
         sum(inside(each["axis"]["interval"], each["gap"]) for each in known),
     )

@@ -60,7 +60,10 @@ DATASETS: Mapping[str, PublicDataset] = {
             "A. Janot, M. Gautier and M. Brunot, Data set and reference models of EMPS, Workshop on Nonlinear System "
             "Identification Benchmarks, 2019 (nonlinearbenchmark.org)"
         ),
-        notice="published as a benchmark, no licence stated: for your own use, not to be passed on; cite the source",
+        notice=(
+            "published as a benchmark, no licence stated: for your own use, not to be passed on; cite the source. The "
+            "address is the one that public code names; it was never tried here. The checksum is that of our copy"
+        ),
     ),
 }
 """By name."""

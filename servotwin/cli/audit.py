@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as jsons
 import ssl
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from http.client import HTTPException
@@ -19,11 +20,14 @@ from servotwin.cli.audit_report import SERVOS, JsonObject, lines_of, servo_line
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear, is_encrypted
+from servotwin.runtime import files
 from servotwin.store.records import ServoSummary
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import read_secret
 from servotwin.twin_service.command import open_existing_store
+from servotwin.twin_service.fleet_reader import FleetReader
 from servotwin.twin_service.http_operator import MAX_ROWS, evidence_as_json, trace_as_json
+from servotwin.twin_service.reports import report_of
 from servotwin.twin_service.twin_file import service_of
 
 _TIMEOUT_S = 30.0
@@ -89,6 +93,28 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
         return
     for line in lines_of(*evidence, changes=changes):
         print(line)
+
+
+def write_report(servo: str, source: Source, to: Path) -> None:
+    """Write the report of a machine: one HTML file that needs no other.
+
+    Raises
+    ------
+    InvalidInput
+        The servo is unknown, the source cannot be read, or the file not written.
+    """
+    if source.url is None:
+        store = open_existing_store(service_of(source.config))
+        try:
+            known_servo(store, servo)
+            text = report_of(store, FleetReader(store, lambda _: None, time.time), servo) or ""
+        finally:
+            store.close()
+    else:
+        text = _client(source)(f"/v1/servos/{quote(servo, safe='')}/report.html").decode()
+    with files.atomic_output(to) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(f"servotwin audit: wrote {to}")
 
 
 def servos(source: Source, json: bool) -> None:
@@ -164,6 +190,19 @@ def _since(oldest: float) -> float:
 
 def _json_client(source: Source) -> Callable[[str], Any]:
     """Return a function that requests JSON from the service; raises InvalidInput."""
+    get = _client(source)
+
+    def get_json(path: str) -> Any:
+        try:
+            return jsons.loads(get(path))
+        except ValueError as error:
+            raise InvalidInput(f"{source.url}: cannot be reached ({error})") from None
+
+    return get_json
+
+
+def _client(source: Source) -> Callable[[str], bytes]:
+    """Return a function that requests from the service; raises InvalidInput."""
     url, headers = str(source.url).rstrip("/"), {}
     if not _is_address(url):
         raise InvalidInput(f"url {url!r}: give the URL of a twin, such as https://twin:8765")
@@ -175,16 +214,17 @@ def _json_client(source: Source) -> Callable[[str], Any]:
     handler = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
     opener = build_opener(_NoRedirect, handler)
 
-    def get_json(path: str) -> Any:
+    def get(path: str) -> bytes:
         try:
             with opener.open(Request(url + path, headers=headers), timeout=_TIMEOUT_S) as response:
-                return jsons.load(response)
+                body: bytes = response.read()
+                return body
         except HTTPError as error:
             raise InvalidInput(f"{url}: {_refusal(error)}") from None
         except (URLError, HTTPException, OSError, ValueError) as error:
             raise InvalidInput(f"{url}: cannot be reached ({getattr(error, 'reason', error)})") from None
 
-    return get_json
+    return get
 
 
 def _is_address(url: str) -> bool:

@@ -17,6 +17,7 @@ from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
+from servotwin.estimation.kinematic.wind_up import gap_within
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog
 from servotwin.plant.axis import Axis
 from servotwin.runtime import files
@@ -236,7 +237,10 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
     if log.lost_motion is not None:
         lost, unit = log.lost_motion, log.recording.unit
         low, high = lost.interval_load
-        lines.append(f"gap at the load: {lost.gap_load:.4g} {unit} ({low:.4g} .. {high:.4g}): {lost.status.value}")
+        lines.append(
+            f"lost motion at the load: {lost.at_load:.4g} {unit} ({low:.4g} .. {high:.4g}): {lost.status.value}; "
+            "it is the gap and the wind-up by friction together"
+        )
     if shaft is None:
         return lines
     late = f"the load's encoder is {1e3 * shaft.delay:.3g} +- {2e3 * shaft.delay_std:.2g} ms late"
@@ -283,14 +287,16 @@ def _shaft_dict(found: CommissionedAxis) -> dict[str, Any] | None:
 
 
 def _gap_dict(log: DriveLog) -> dict[str, Any] | None:
-    lost = log.lost_motion
-    if lost is None:
+    if log.lost_motion is None:
         return None
-    known = all(map(math.isfinite, (lost.gap_load, *lost.interval_load)))
+    found = gap_within(log.lost_motion, None)
+    lost = found.lost
+    known = all(map(math.isfinite, (lost.at_load, *lost.interval_load)))
     return {
-        "status": lost.status.value,
-        "gap_load": lost.gap_load if known else None,
-        "interval_load": list(lost.interval_load) if known else None,
+        "status": found.status.value,
+        "lost_motion_load": lost.at_load if known else None,
+        "lost_motion_interval_load": list(lost.interval_load) if known else None,
+        "interval_load": list(found.interval_load) if known else None,
         "unit": log.recording.unit,
     }
 

@@ -35,6 +35,7 @@ from servotwin.plant.servo import Servo
 from servotwin.twin.model_registry import servo_table
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin_service.config import ServiceConfig, mqtt_table, store_password_table
+from servotwin.twin_service.webhook import webhook_table
 
 HEAD = """# Configuration reference
 
@@ -183,7 +184,10 @@ FILES = {
                 "service": TableSpec(
                     (ServiceConfig, store_password_table),
                     "The service.",
-                    {"mqtt": TableSpec((mqtt_table,), "Broker over which edges may reach the service as well.")},
+                    {
+                        "mqtt": TableSpec((mqtt_table,), "Broker over which edges may reach the service as well."),
+                        "webhook": TableSpec((webhook_table,), "Address to which each alarm is posted as JSON."),
+                    },
                 ),
                 "models": TableSpec(
                     help="Any number of models, each in a table with its name.",

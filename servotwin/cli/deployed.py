@@ -40,11 +40,16 @@ class TwinAction(StrEnum):
     """Action of `servotwin twin` instead of serving."""
 
     CHECK = "check"
+    ALARM = "test-alarm"
 
 
 def twin(
     action: Annotated[
-        TwinAction | None, typer.Argument(help="check: check the whole store, also while the twin runs, and end.")
+        TwinAction | None,
+        typer.Argument(
+            help="check: check the whole store, also while the twin runs, and end. "
+            "test-alarm: post a test to the webhook of [service.webhook], and end."
+        ),
     ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
     port: Annotated[
@@ -56,6 +61,11 @@ def twin(
         from servotwin.cli.check import check_store
 
         check_store(config)
+        return
+    if action is TwinAction.ALARM:
+        from servotwin.cli.alarm_test import post_test_alarm
+
+        post_test_alarm(config)
         return
     from servotwin.twin_service.command import run
 
@@ -152,11 +162,17 @@ def audit(
     limit: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of windows.")] = 20,
     changes: Annotated[bool, typer.Option("--changes", help="Only windows that led to more than an estimate.")] = False,
     json: Annotated[bool, typer.Option("--json", help="One JSON array of the windows instead of lines.")] = False,
+    page: Annotated[
+        Path | None, typer.Option(help="Write a report to mail instead: an HTML file with pictures inside.")
+    ] = None,
 ) -> None:
     """Show the evidence chain of a servo: window, estimate, version, receipt, effect."""
-    from servotwin.cli.audit import Source
+    from servotwin.cli.audit import Source, write_report
     from servotwin.cli.audit import audit as run
 
+    if page is not None:
+        write_report(servo, Source(config, url, token, ca), page)
+        return
     run(servo, Source(config, url, token, ca), limit, changes, json)
 
 

@@ -16,14 +16,15 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN
+from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
-from servotwin.estimation.kinematic.wind_up import with_machine
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within
 from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
 from servotwin.plant.plants import resolve_plant
 
+_Answer = tuple[RecordedLog, TransmissionGap]
 _DATED = 3e8  # s since 1970: smaller times are no dates
 _PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
 
@@ -40,14 +41,17 @@ def show(
     page: Path | None = None,
     axis: str | None = None,
     dates: str | None = None,
+    stiff: bool = False,
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
     Raises
     ------
     InvalidInput
-        As `read_recording` and `estimate_lost_motion`.
+        As `read_recording` and `estimate_lost_motion`; or both a machine and a stiff one are given.
     """
+    if stiff and axis is not None:
+        raise InvalidInput(f"--stiff and --axis {axis}: give one of the two; the axis says how stiff it is")
     console = Console(stderr=as_json)
     if page is not None:
         from servotwin.cli.lost_motion_page import check_page, write_page
@@ -60,14 +64,13 @@ def show(
         with console.status(path.name) as status:
             log = read_recording(path, columns, partial(_tell, status, path.name))
             status.update(f"{path.name}: models")
-            found = estimate_lost_motion(log.recording)
-            if machine is not None:
-                status.update(f"{path.name}: wind-up of {axis}")
-                found = with_machine(log.recording, found, machine)
+            lost = estimate_lost_motion(log.recording)
+            known = 0.0 if stiff else None
+            found = gap_within(lost, known) if machine is None else gap_of_machine(log.recording, lost, machine)
             answers.append((log, found))
     if page is not None:
         log, found = answers[-1]
-        said = Text.from_markup(_headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
+        said = Text.from_markup(headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
         write_page(page, log, found, said)
     stamps = [_date(log, day) for (log, _), day in zip(answers, given, strict=True)]
     grown = _growth(answers, stamps)
@@ -75,7 +78,11 @@ def show(
         rows = [as_dict(log, found) | {"date": _iso(at)} for (log, found), at in zip(answers, stamps, strict=True)]
         if grown is not None:
             low, high = grown.interval
-            rows[-1] |= {"growth_per_year_load": grown.per_year, "growth_interval_load": [low, high]}
+            rows[-1] |= {
+                "growth_of": _compared(answers),
+                "growth_per_year_load": grown.per_year,
+                "growth_interval_load": [low, high],
+            }
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))
         return
     for log, found in answers:
@@ -86,8 +93,8 @@ def show(
         low, high = grown.interval
         unit = answers[-1][0].recording.load_unit
         console.print(
-            f"wear from {_iso(min(stamps))[:10]} to {_iso(max(stamps))[:10]}: {grown.per_year:+.4g} {unit} per year "
-            f"(95 %: {low:+.4g} .. {high:+.4g})",
+            f"wear from {_iso(min(stamps))[:10]} to {_iso(max(stamps))[:10]}: {_compared(answers)} "
+            f"{grown.per_year:+.4g} {unit} per year (95 %: {low:+.4g} .. {high:+.4g})",
             highlight=False,
         )
 
@@ -124,23 +131,34 @@ def _iso(date: float) -> str:
     return str(np.datetime64(round(date), "s"))
 
 
-def _growth(answers: Sequence[tuple[RecordedLog, LostMotion]], dates: Sequence[float]) -> GapGrowth | None:
-    gaps = [found.gap_load for _, found in answers]
-    return growth(dates, gaps, [_half(found) / NORMAL_95 for _, found in answers])
+def _growth(answers: Sequence[_Answer], dates: Sequence[float]) -> GapGrowth | None:
+    values = [_value(found, _compared(answers)) for _, found in answers]
+    return growth(dates, [value for value, _ in values], [_half(interval) / NORMAL_95 for _, interval in values])
+
+
+def _compared(answers: Sequence[_Answer]) -> str:
+    """Name of the quantity that all logs show: the gap, or else the lost motion."""
+    return "gap" if all(found.ok for _, found in answers) else "lost motion"
+
+
+def _value(found: TransmissionGap, name: str) -> tuple[float, Interval]:
+    """Gap or lost motion at the load, and its 95 % interval."""
+    lost = found.lost
+    return (found.gap_load, found.interval_load) if name == "gap" else (lost.at_load, lost.interval_load)
 
 
 def _tell(status: Any, name: str, samples: int) -> None:
     status.update(f"{name}: {samples:,} samples read")
 
 
-def as_dict(log: RecordedLog, found: LostMotion) -> dict[str, Any]:
+def as_dict(log: RecordedLog, found: TransmissionGap) -> dict[str, Any]:
     """Make the JSON object: gaps in the units of the recording, null where there is no number."""
-    recording = log.recording
+    recording, lost = log.recording, found.lost
     return {
         "log": recording.source.removeprefix("log "),
         "status": found.status.value,
         "reasons": list(found.reasons),
-        "model_kind": found.model,
+        "model_kind": lost.model,
         "gap_load": _number(found.gap_load),
         "std_load": _number(found.std_load),
         "interval_load": [_number(end) for end in found.interval_load],
@@ -149,16 +167,24 @@ def as_dict(log: RecordedLog, found: LostMotion) -> dict[str, Any]:
         "std_motor": _number(found.std_motor),
         "interval_motor": [_number(end) for end in found.interval_motor],
         "unit_motor": recording.motor_unit,
-        "ratio": _number(found.ratio),
-        "lag_s": _number(found.lag),
-        "cyclic_periods_motor": list(found.cycles),
-        "rms_load": _number(found.rms),
+        "lost_motion_load": _number(lost.at_load),
+        "lost_motion_interval_load": [_number(end) for end in lost.interval_load],
+        "lost_motion_motor": _number(lost.at_motor),
+        "lost_motion_interval_motor": [_number(end) for end in lost.interval_motor],
+        "ratio": _number(lost.ratio),
+        "lag_s": _number(lost.lag),
+        "cyclic_periods_motor": list(lost.cycles),
+        "rms_load": _number(lost.rms),
         "models": [
-            {"model_kind": each.model.name, "gap_motor": _number(each.gap), "rms_out_of_sample_load": _number(each.rms)}
-            for each in found.comparisons
+            {
+                "model_kind": each.model.name,
+                "lost_motion_motor": _number(each.gap),
+                "rms_out_of_sample_load": _number(each.rms),
+            }
+            for each in lost.comparisons
         ],
         "segments": [
-            {"time_s": each.time, "position_load": each.position, "gap_motor": each.gap} for each in found.local
+            {"time_s": each.time, "position_load": each.position, "lost_motion_motor": each.gap} for each in lost.local
         ],
         "samples": log.samples,
         "defects": dict(log.found),
@@ -169,46 +195,53 @@ def _number(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _print(console: Console, log: RecordedLog, found: LostMotion) -> None:
-    recording, unit = log.recording, log.recording.load_unit
+def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
+    lost, recording, unit = found.lost, log.recording, log.recording.load_unit
     span = float(recording.time[-1] - recording.time[0])
     parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
     name = recording.source.removeprefix("log ")
     console.print(f"{name}: {recording.time.size} samples in {span:.4g} s ({parts})", markup=False)
     for defect, count in log.found.items():
         console.print(f"  {count} {defect}", style="dim", highlight=False)
-    console.print(_headline(found, unit, recording.motor_unit), highlight=False)
+    console.print(headline(found, unit, recording.motor_unit), highlight=False)
     for reason in found.reasons:
         console.print(f"  {reason}", style="yellow", highlight=False)
-    if not found.comparisons:
+    if not lost.comparisons:
         return
-    cyclic = "".join(f", cyclic error every {period:.4g} {recording.motor_unit}" for period in found.cycles)
-    shown = cyclic if "cyclic" in found.model else ""
+    cyclic = "".join(f", cyclic error every {period:.4g} {recording.motor_unit}" for period in lost.cycles)
+    shown = cyclic if "cyclic" in lost.model else ""
     console.print(
-        f"model: {found.model}; {abs(found.ratio):.6g} {unit} per {recording.motor_unit}, "
-        f"lag {1e3 * found.lag:.3g} ms{shown}, rms left {found.rms:.3g} {unit}",
+        f"model: {lost.model}; {abs(lost.ratio):.6g} {unit} per {recording.motor_unit}, "
+        f"lag {1e3 * lost.lag:.3g} ms{shown}, rms left {lost.rms:.3g} {unit}",
         highlight=False,
     )
-    console.print(_models(found, unit), highlight=False)
-    if len(found.local) > 1:
-        console.print(_local(found, unit), highlight=False)
+    console.print(_models(lost, unit), highlight=False)
+    if len(lost.local) > 1:
+        console.print(_local(lost, unit), highlight=False)
 
 
-def _headline(found: LostMotion, unit: str, motor_unit: str) -> str:
+def headline(found: TransmissionGap, unit: str, motor_unit: str) -> str:
+    """Say in one line what is known, and its status, in the markup of rich."""
+    lost, status = found.lost, f"[{'green' if found.ok else 'yellow'}]{found.status.value}[/]"
+    if lost.interval_motor == NOTHING_KNOWN:
+        return f"no gap is known: {status}"
+    if math.isinf(lost.interval_motor[1]):
+        return f"lost motion > {lost.at_motor:.4g} {motor_unit} at the motor: {status}"
+    if math.isnan(found.gap_motor):
+        (low, high), most = lost.interval_load, found.interval_load[1]
+        return (
+            f"lost motion {lost.at_load:.4g} {unit} at the load, {lost.at_motor:.4g} {motor_unit} at the motor "
+            f"(95 %: {low:.4g} .. {high:.4g} {unit}), gap at most {most:.4g} {unit}: {status}"
+        )
     low, high = found.interval_load
-    color = "green" if found.ok else "yellow"
-    if found.interval_motor == NOTHING_KNOWN or math.isnan(found.gap_motor):
-        return f"no gap is known: [{color}]{found.status.value}[/]"
-    if math.isinf(found.interval_motor[1]):
-        return f"gap > {found.gap_motor:.4g} {motor_unit} at the motor: [{color}]{found.status.value}[/]"
     return (
         f"gap {found.gap_load:.4g} {unit} at the load, {found.gap_motor:.4g} {motor_unit} at the motor "
-        f"(95 %: {low:.4g} .. {high:.4g} {unit}): [{color}]{found.status.value}[/]"
+        f"(95 %: {low:.4g} .. {high:.4g} {unit}): {status}"
     )
 
 
 def _models(found: LostMotion, unit: str) -> Table:
-    table = Table("model", f"gap, {unit}", f"error on unseen strokes, {unit}", box=None, pad_edge=False)
+    table = Table("model", f"lost motion, {unit}", f"error on unseen strokes, {unit}", box=None, pad_edge=False)
     for each in found.comparisons:
         name = f"[bold]{each.model.name}[/]" if each.model.name == found.model else each.model.name
         table.add_row(name, f"{each.gap * abs(found.ratio):.4g}", f"{each.rms:.4g}")
@@ -216,9 +249,10 @@ def _models(found: LostMotion, unit: str) -> Table:
 
 
 def _local(found: LostMotion, unit: str) -> Table:
-    """Median gap of parts of the travel and of the time."""
+    """Median lost motion of parts of the travel and of the time."""
     gaps = np.array([each.gap for each in found.local]) * abs(found.ratio)
-    table = Table(f"position, {unit}", f"gap, {unit}", "reversals", "time, s", f"gap, {unit}", "reversals", box=None)
+    lost = f"lost motion, {unit}"
+    table = Table(f"position, {unit}", lost, "reversals", "time, s", lost, "reversals", box=None)
     places, times = (
         _binned(np.array([getattr(each, key) for each in found.local]), gaps) for key in ("position", "time")
     )
@@ -238,22 +272,24 @@ def _binned(keys: Any, gaps: Any) -> list[tuple[str, str, str]]:
     return rows
 
 
-def _change(before: tuple[RecordedLog, LostMotion], after: tuple[RecordedLog, LostMotion]) -> str:
-    """The difference of two logs' gaps, and if it is more than their uncertainty."""
+def _change(before: _Answer, after: _Answer) -> str:
+    """The difference of two logs' gaps, or lost motions, and if it is more than their uncertainty."""
     (first, old), (second, new) = before, after
-    if not (math.isfinite(old.std_load) and math.isfinite(new.std_load)):
-        return "no change can be told: a gap of the two logs is only bounded"
+    if not (math.isfinite(old.lost.std_load) and math.isfinite(new.lost.std_load)):
+        return "no change can be told: the lost motion of the two logs is only bounded"
     if first.recording.load_unit != second.recording.load_unit:
         raise InvalidInput(
             f"{second.recording.source}: its load is in {second.recording.load_unit}, that of {first.recording.source} "
             f"in {first.recording.load_unit}: give --load-unit"
         )
-    change, std = new.gap_load - old.gap_load, math.hypot(_half(old), _half(new)) / 1.96
+    name = _compared((before, after))
+    (one, its), (other, of_it) = _value(old, name), _value(new, name)
+    change, std = other - one, math.hypot(_half(its), _half(of_it)) / NORMAL_95
     times = abs(change) / std if std else math.inf
-    said = "more than chance explains" if times > 1.96 else "no more than chance explains"
-    return f"change: {change:+.4g} {second.recording.load_unit} ({times:.1f} standard deviations: {said})"
+    said = "more than chance explains" if times > NORMAL_95 else "no more than chance explains"
+    return f"change of the {name}: {change:+.4g} {second.recording.load_unit} ({times:.1f} standard deviations: {said})"
 
 
-def _half(found: LostMotion) -> float:
-    low, high = found.interval_load
+def _half(interval: Interval) -> float:
+    low, high = interval
     return 0.5 * (high - low)

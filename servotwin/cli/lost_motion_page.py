@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from servotwin.estimation.kinematic.lost_motion import LostMotion
+from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.recordings import RecordedLog
 from servotwin.report import page, style
 from servotwin.runtime import files
@@ -27,7 +27,7 @@ def check_page(path: Path) -> None:
     files.check_file(path, _SUFFIXES)
 
 
-def write_page(path: Path, log: RecordedLog, found: LostMotion, headline: str) -> None:
+def write_page(path: Path, log: RecordedLog, found: TransmissionGap, headline: str) -> None:
     """Write the picture (.png, .svg) or the page with it (.html), whole or not at all."""
     figure = picture(log, found)
     with files.atomic_output(path) as temporary:
@@ -37,9 +37,10 @@ def write_page(path: Path, log: RecordedLog, found: LostMotion, headline: str) -
             figure.savefig(temporary, format=path.suffix[1:], dpi=150)
 
 
-def picture(log: RecordedLog, found: LostMotion) -> Any:
+def picture(log: RecordedLog, found: TransmissionGap) -> Any:
     """Figure of four panels: hysteresis loop, gap of each reversal, what the model leaves, error over the gap."""
-    recording, curves, scale = log.recording, found.curves, abs(found.ratio)
+    recording, lost, scale = log.recording, found.lost, abs(found.lost.ratio)
+    curves = lost.curves
     unit = recording.load_unit
     with style.look():
         figure = style.sheet(9.0, 6.4)
@@ -49,26 +50,26 @@ def picture(log: RecordedLog, found: LostMotion) -> Any:
         if curves is not None:
             loop.plot(curves.load, curves.lead * scale, ".", markersize=1.2, color=style.GREY, rasterized=True)
             for side in (-0.5, 0.5):
-                loop.axhline(side * found.gap_load, color=style.BLUE)
+                loop.axhline(side * lost.at_load, color=style.BLUE)
             style.trace(left, curves.time, curves.residual, style.GREY)
             profile.plot(curves.gaps * scale, curves.rms, color=style.BLUE)
-        low, high = found.interval_load
+        low, high = lost.interval_load
         if np.isfinite(high):
             profile.axvspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0)
             local.axhspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0, label="95 % interval")
-        local.plot([each.position for each in found.local], [each.gap * scale for each in found.local], "o",
+        local.plot([each.position for each in lost.local], [each.gap * scale for each in lost.local], "o",
                    markersize=3.0, color=style.BLUE)  # fmt: skip
         loop.set(xlabel=f"Load position ({unit})", ylabel=f"Motor's lead, at the load ({unit})")
-        local.set(xlabel=f"Load position ({unit})", ylabel=f"Gap of each reversal ({unit})", ylim=(0.0, None))
+        local.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion of each reversal ({unit})", ylim=(0.0, None))
         left.set(xlabel="Time (s)", ylabel=f"Left by the model ({unit})")
-        profile.set(xlabel=f"Gap ({unit})", ylabel=f"rms error of the model ({unit})", ylim=(0.0, None))
+        profile.set(xlabel=f"Lost motion ({unit})", ylabel=f"rms error of the model ({unit})", ylim=(0.0, None))
     return figure
 
 
-def _html(log: RecordedLog, found: LostMotion, headline: str, vector: bytes) -> str:
-    unit, scale = log.recording.load_unit, abs(found.ratio)
+def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes) -> str:
+    unit, scale = log.recording.load_unit, abs(found.lost.ratio)
     defects = [[str(count), defect] for defect, count in log.found.items()]
-    models = [[each.model.name, f"{each.gap * scale:.4g}", f"{each.rms:.4g}"] for each in found.comparisons]
+    models = [[each.model.name, f"{each.gap * scale:.4g}", f"{each.rms:.4g}"] for each in found.lost.comparisons]
     body = [
         f"<h1>Gap of {escape(log.recording.source.removeprefix('log '))}</h1>",
         f"<p>{escape(headline)}</p>",
@@ -76,12 +77,12 @@ def _html(log: RecordedLog, found: LostMotion, headline: str, vector: bytes) -> 
         page.figure(
             vector,
             "Lost motion.",
-            "(a) By how much the motor leads the load, lag included, and half the gap on either side. (b) The gap that "
-            "each reversal shows. (c) What the model leaves of the load's position. (d) The model's error for other "
-            "gaps; shaded: 95 % interval.",
+            "(a) By how much the motor leads the load, lag included, and half the lost motion on either side. "
+            "(b) The lost motion of each reversal. (c) What the model leaves of the load's position. (d) The model's "
+            "error for other lost motions; shaded: 95 % interval.",
         ),
         "<h2>Models</h2>",
-        page.table(["model", f"gap, {unit}", f"error on unseen strokes, {unit}"], models),
+        page.table(["model", f"lost motion, {unit}", f"error on unseen strokes, {unit}"], models),
     ]
     if defects:
         body += ["<h2>Defects of the log</h2>", page.table(["number", "what"], defects)]

@@ -87,6 +87,10 @@ def identify(
         str | None,
         typer.Option(help="With --motor and --load: an axis's file or preset, whose wind-up by friction is no gap."),
     ] = None,
+    stiff: Annotated[
+        bool,
+        typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
+    ] = False,
     dates: Annotated[
         str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their own, or their files'.")
     ] = None,
@@ -127,14 +131,14 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
-    without_model = columns != RecordingColumns() or axis is not None or dates is not None
+    without_model = columns != RecordingColumns() or axis is not None or stiff or dates is not None
     if without_model or (servo is None and not describes_its_machine(logs[0])):
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(
                 "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
                 "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
             )
-        show_lost_motion(logs, columns, json, page, axis, dates)
+        show_lost_motion(logs, columns, json, page, axis, dates, stiff)
         return
     if len(logs) > 1 or page is not None:
         raise InvalidInput(
@@ -234,9 +238,9 @@ def dataset(
     """Fetch a public set of measured data, once, and print the path of its file."""
     from servotwin.datasets import DATASETS, fetch
 
-    path = fetch(name, folder)
-    typer.echo(f"{name}: {DATASETS[name].source}; {DATASETS[name].notice}", err=True)
-    print(path)
+    if name in DATASETS:
+        typer.echo(f"{name}: {DATASETS[name].source}; {DATASETS[name].notice}", err=True)
+    print(fetch(name, folder))
 
 
 def bench(context: typer.Context) -> None:

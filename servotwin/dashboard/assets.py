@@ -20,6 +20,12 @@ SECURITY = {
     "cross-origin-resource-policy": "same-origin",
 }
 """Headers of every file: no script but the page's own files, nothing from elsewhere, in no frame."""
+REPORT_SECURITY = {
+    "content-security-policy": "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+}
+"""Headers of a report, whose style is inside it."""
 _TYPES = {
     ".html": "text/html; charset=utf-8",
     ".css": "text/css; charset=utf-8",

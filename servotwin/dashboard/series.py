@@ -5,17 +5,39 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+import sqlalchemy as sa
+
 from servotwin.dashboard.evidence_body import body_of, finite, interval_of
+from servotwin.dashboard.machine_facts import UNKNOWN, machine_facts
+from servotwin.store import overview, queries
 from servotwin.store.overview import WindowGap
 from servotwin.store.records import StoredEvidence
 
 Row = dict[str, Any]
+_DECISIONS = 500
+"""Updates, receipts and fallbacks, of each kind, that a series has at most."""
 GAP_COLUMNS = (
     "received", "sample_time", "boot", "sequence", "kind", "status", "gap", "low", "high", "trend", "trend_std",
     "version", "tail", "residual", "reasons", "decision",
 )  # fmt: skip
 """Columns of `gap_series`: s since the epoch, s of the edge's time, and rad; `tail` and `residual` in m or rad;
 `decision`: why nothing was redesigned."""
+
+
+def machine_series(connection: sa.Connection, servo: str, limit: int, before: int | None = None) -> Row:
+    """Read the gaps of a servo's newest windows (or of those before an id), what was decided, and its model's facts."""
+    found = overview.gaps(connection, servo, limit, before)
+    decided = overview.decisions(connection, servo, _DECISIONS)
+    key = next((one.context for each in reversed(found) for one in each.evidence if one.context), "")
+    context = queries.contexts(connection, [key]).get(key)
+    return {
+        "servo": servo,
+        "first": found[0].window.id if found else None,
+        "windows": gap_series(found),
+        "versions": versions(decided),
+        "fallbacks": fallbacks(decided),
+        "machine": UNKNOWN if context is None else machine_facts(context),
+    }
 
 
 def gap_series(windows: Iterable[WindowGap]) -> dict[str, list[Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from array import array
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from servotwin.errors import InvalidInput
@@ -35,7 +36,7 @@ def sample_range(window: WindowMessage, begin: float | None, end: float | None) 
     return SampleRange(first, last)
 
 
-def envelope_indices(values: array[float], columns: int) -> list[int]:
+def envelope_indices(values: Sequence[float], columns: int) -> list[int]:
     """Indices of the least and the greatest sample of each column, in order, and of the first and last; all of few."""
     count = len(values)
     if count <= 4 * columns:

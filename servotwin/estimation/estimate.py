@@ -20,6 +20,7 @@ class GapStatus(StrEnum):
     LOWER_BOUND = "lower bound"
     UNIDENTIFIABLE = "unidentifiable"
     MODEL_MISMATCH = "model mismatch"
+    LOST_MOTION = "lost motion"  # known, and with it the largest gap: friction may wind up all of it
 
 
 @dataclass(frozen=True)

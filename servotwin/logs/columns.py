@@ -22,12 +22,15 @@ class LogColumns(NamedTuple):
     metadata : mapping
     damaged : mapping
         The first cell of a column that is no number, in words.
+    ends_within_line : bool
+        A text without the end of its last line, as a file has that was cut off.
     """
 
     values: Mapping[str, Any]
     names: Sequence[str]
     metadata: Mapping[str, Any]
     damaged: Mapping[str, str] = {}
+    ends_within_line: bool = False
 
 
 @dataclass(frozen=True, eq=False)

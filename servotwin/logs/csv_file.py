@@ -56,7 +56,7 @@ def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
     first = blocks[0]
     values = {name: np.concatenate([each.values[name] for each in blocks]) for name in first.values}
     damaged = {name: text for each in reversed(blocks) for name, text in each.damaged.items()}
-    return LogColumns(values, first.names, first.metadata, damaged)
+    return LogColumns(values, first.names, first.metadata, damaged, blocks[-1].ends_within_line)
 
 
 def csv_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
@@ -83,10 +83,11 @@ def csv_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
             yield LogColumns({}, layout.names, metadata)
             return
         places = [layout.names.index(name) for name in wanted]
-        blocks = (_values(lines, layout, places, number) for number, lines in _blocks(file, layout.first + 1))
-        for values, damaged in blocks:
+        for number, lines in _blocks(file, layout.first + 1):
+            values, damaged = _values(lines, layout, places, number)
             texts = {wanted[place]: text for place, text in damaged.items()}
-            yield LogColumns(dict(zip(wanted, values.T, strict=True)), layout.names, metadata, texts)
+            cut = bool(lines) and not lines[-1].endswith("\n")
+            yield LogColumns(dict(zip(wanted, values.T, strict=True)), layout.names, metadata, texts, cut)
 
 
 def _layout(path: Path) -> _Layout:

@@ -17,7 +17,7 @@ from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.log import read_columns
-from servotwin.logs.recordings import bare_name, named_unit, numbers_of, times_of
+from servotwin.logs.recordings import CUT, bare_name, named_unit, numbers_of, times_of
 from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
@@ -82,7 +82,7 @@ class DriveLog:
     found : mapping
         Number of samples by defect, in words.
     lost_motion : LostMotion or None
-        Gap between the two encoders, rad or m of the motor; None: there is one encoder.
+        Between the two encoders, rad or m of the motor; None: there is one encoder.
     """
 
     recording: DriveRecording
@@ -136,7 +136,8 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         raise InvalidInput(f"log {path}: {clean.time.size} samples can be used, of at least {_LEAST}")
     grid, usable, rate = _grid(clean.time)
     channels = {part: np.interp(grid, clean.time, values) for part, values in clean.channels.items()}
-    return _in_si(path, channels, units, (grid, usable, rate), wanted, DriveLog(None, chosen, None, clean.found))  # type: ignore[arg-type]
+    found = {**clean.found, **({CUT: 1} if table.ends_within_line else {})}
+    return _in_si(path, channels, units, (grid, usable, rate), wanted, DriveLog(None, chosen, None, found))  # type: ignore[arg-type]
 
 
 def _in_si(

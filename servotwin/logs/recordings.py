@@ -19,6 +19,7 @@ from servotwin.logs.gathering import THINNED, Gathering
 from servotwin.logs.log import read_blocks, read_columns
 from servotwin.plant.signals import Array
 
+CUT = "last line without its end: the file may have been cut off there"
 _LEAST = 100  # samples
 _BLOCK = 1_000_000  # samples that are cleaned at a time
 _MOST_LOST = 0.5  # of the samples: beyond, the log is not what it seems
@@ -98,8 +99,9 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
     load_unit = wanted.load_unit or units["load"] or "load unit"
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
     gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
+    cut = False
     for columns in read_blocks(path, tuple(chosen.values())):
-        damaged = {**columns.damaged, **damaged}
+        damaged, cut = {**columns.damaged, **damaged}, columns.ends_within_line
         arrays = _arrays(path, chosen, columns)
         size, before = len(arrays["motor"]), gathering.samples
         times = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size, before)
@@ -126,7 +128,7 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
         motor_count=counts["motor"] if thinned else None,
         load_count=counts["load"] if thinned else None,
     )
-    return RecordedLog(recording, chosen, gathering.samples, clean.found)
+    return RecordedLog(recording, chosen, gathering.samples, {**clean.found, **({CUT: 1} if cut else {})})
 
 
 def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:

@@ -17,6 +17,7 @@ from servotwin.link.broker import Broker
 from servotwin.link.url import is_here
 from servotwin.messages import MAX_BYTES
 from servotwin.twin_service.auth import read_secret
+from servotwin.twin_service.webhook import WebhookConfig, webhook_table
 
 PASSWORD = "SERVOTWIN_STORE_PASSWORD"
 """Environment variable with the password of the store."""
@@ -108,6 +109,8 @@ class ServiceConfig:
         Not shown.
     mqtt : MqttConfig or None
         A broker over which edges may reach the service as well.
+    webhook : WebhookConfig or None
+        An address to which alarms are posted.
     """
 
     bind: Annotated[
@@ -200,6 +203,13 @@ class ServiceConfig:
     watchers: Annotated[
         int, key(minimum=0, maximum=_MOST, help="Largest number of dashboards that watch the fleet at once.")
     ] = 100
+    machine_metrics: Annotated[
+        bool,
+        key(
+            help="Serve gap, interval, wear, version and link of each machine for Prometheus at /metrics/machines, to "
+            "operators' tokens only."
+        ),
+    ] = False
     queue: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of messages that wait for their commit.")
     ] = 2000
@@ -227,6 +237,7 @@ class ServiceConfig:
     ] = 30.0
     log_level: Annotated[str, key(choices=_LOG_LEVELS, help="Level of the log.")] = "info"
     mqtt: MqttConfig | None = None
+    webhook: WebhookConfig | None = None
 
     def __post_init__(self) -> None:
         check(self)
@@ -276,10 +287,16 @@ def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os
     if "mqtt" in table.values:
         mqtt = read_inner(table, "mqtt", lambda inner: read(inner, mqtt_table, folder, environment=environment))
     table.known("mqtt")
+    webhook = None
+    if "webhook" in table.values:
+        webhook = read_inner(table, "webhook", lambda inner: read(inner, webhook_table, folder))
+    table.known("webhook")
     file = read(table, store_password_table, folder)
     store = _sqlite_in(attribute(table, ServiceConfig, "store", folder), folder)
     password = environment.get(PASSWORD) if file is None else read_secret(file)
-    service: ServiceConfig = read(table, ServiceConfig, folder, store=store, store_password=password, mqtt=mqtt)
+    service: ServiceConfig = read(
+        table, ServiceConfig, folder, store=store, store_password=password, mqtt=mqtt, webhook=webhook
+    )
     return service
 
 

@@ -366,12 +366,12 @@ class Dispatcher:
         """Count and log a committed result."""
         for message in lease.messages:
             self._metrics.age.observe(max(0.0, now - message.received))
-        for kind, number in Counter(map(_log_kind, result.evidence)).items():
+        for kind, number in Counter(map(log_kind, result.evidence)).items():
             self._metrics.evidence.add(kind, by=number)
         about = {"servo": lease.servo, "serial": lease.serial, "seconds": round(seconds, 6)}
         windows = {message.id: message.key for message in lease.messages if message.kind is MessageKind.WINDOW}
         for record in result.evidence:
-            kind = _log_kind(record)
+            kind = log_kind(record)
             level = logging.WARNING if kind in ALARMS else logging.DEBUG if kind in QUIET else logging.INFO
             if log.isEnabledFor(level):
                 log.log(level, kind, extra={**about, **_identifiers(record, windows)})
@@ -382,7 +382,7 @@ def _queue(lease: Lease) -> tuple[str, bool]:
     return lease.servo, any(message.kind is MessageKind.VERIFICATION for message in lease.messages)
 
 
-def _log_kind(record: EvidenceRecord) -> str:
+def log_kind(record: EvidenceRecord) -> str:
     """Kind of evidence in logs and metrics: "failed" for any message that could not be processed."""
     return "failed" if record.status.startswith("failed") else record.kind
 

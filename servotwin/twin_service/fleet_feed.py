@@ -73,7 +73,7 @@ class FleetFeed:
         if len(self._queues) >= self._limit:
             raise RequestRejected(Refusal.TOO_MANY, f"{self._limit} pages watch the fleet already")
 
-    async def watch(self, after: StorePosition | None, allowed: Callable[[], None]) -> AsyncGenerator[bytes, None]:
+    async def watch(self, after: StorePosition | None, allowed: Callable[[], object]) -> AsyncGenerator[bytes, None]:
         """Events from a position on, or from now.
 
         Parameters

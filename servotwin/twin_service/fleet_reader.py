@@ -14,6 +14,7 @@ from servotwin.store.store import Store
 
 _CONTEXTS = 1000
 """Texts of contexts in memory."""
+_PAGE = 1000
 _GRACE_S = 5.0
 """s between two polls of an edge that counts as connected."""
 
@@ -61,12 +62,13 @@ class FleetReader:
     Parameters
     ----------
     store : Store
-    presence : EdgePresence
+    presence : callable
+        Tell whether an edge is connected, as `EdgePresence` does.
     wall : callable
         s since the epoch.
     """
 
-    def __init__(self, store: Store, presence: EdgePresence, wall: Callable[[], float]) -> None:
+    def __init__(self, store: Store, presence: Callable[[str], bool | None], wall: Callable[[], float]) -> None:
         self._store, self._presence, self._wall = store, presence, wall
         self._contexts: dict[str, str] = {}
 
@@ -79,6 +81,17 @@ class FleetReader:
             return FleetPage(rows, position, self._wall())
 
         return self._store.reading(read)
+
+    def all(self) -> list[FleetRow]:
+        """Rows of all servos, by name."""
+        rows: list[FleetRow] = []
+        while page := self.page(rows[-1].servo if rows else "", _PAGE).rows:
+            rows += page
+        return rows
+
+    def now(self) -> float:
+        """Present time, s since the epoch."""
+        return self._wall()
 
     def position(self) -> StorePosition:
         """Present position of the store."""

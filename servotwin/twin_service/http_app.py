@@ -6,6 +6,7 @@ No framework: its layers take longer for the PUT of a window than checking and c
 from __future__ import annotations
 
 import asyncio
+import ipaddress
 import logging
 import math
 import re
@@ -32,6 +33,7 @@ Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
 _Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
 _SAFE = ("GET", "HEAD")
+_DOMAIN = "host {!r}: a twin without tokens answers under localhost, an address or a name without a dot only"
 _UNBUFFERED = (b"x-accel-buffering", b"no")
 """Header that keeps a proxy from collecting the parts of a stream."""
 _pack = msgspec.msgpack.Encoder().encode
@@ -87,6 +89,13 @@ class HttpRequest:
             return site not in (b"same-origin", b"none")
         origin = self.header(b"origin")
         return origin is not None and origin.partition(b"://")[2] != self.header(b"host")
+
+    @property
+    def host(self) -> str:
+        """Name or address in the Host header, without the port."""
+        text = (self.header(b"host") or b"").decode("latin-1").strip()
+        name = text.partition("]")[0].removeprefix("[") if text.startswith("[") else text.rpartition(":")[0] or text
+        return name.lower().rstrip(".")
 
     @property
     def claim(self) -> str:
@@ -249,10 +258,15 @@ class HttpApp:
         Counts rejections.
     lifespan : callable
         Context manager that is entered before the first request and left after the last.
+    own_names : bool
+        Refuse requests under a domain's name, as a page of that domain can send them once its name leads here (DNS
+        rebinding): where no token protects the service.
     """
 
-    def __init__(self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan) -> None:
-        self._metrics, self.lifespan = metrics, lifespan
+    def __init__(
+        self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan, own_names: bool = False
+    ) -> None:
+        self._metrics, self.lifespan, self._own_names = metrics, lifespan, own_names
         declared = list(routes)
         # Encoded once: the routes do not change.
         document = msgspec.json.encode(
@@ -288,6 +302,8 @@ class HttpApp:
                 return self._no_route(405, "this path does not know that method", allowed)
             request = HttpRequest(scope, receive, match.groupdict())
             try:
+                if self._own_names and _is_domain(request.host):
+                    raise RequestRejected(Refusal.NOT_UNDERSTOOD, _DOMAIN.format(request.host[:64]), 403)
                 if scope["method"] not in _SAFE and request.foreign:
                     raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the request comes from a page of another site", 403)
                 return await handler(request)
@@ -325,6 +341,17 @@ class HttpApp:
             await send({"type": f"lifespan.{phase}.failed", "message": traceback.format_exc()})
             raise
         await send({"type": "lifespan.shutdown.complete"})
+
+
+def _is_domain(host: str) -> bool:
+    """True for a name that anybody may own: one with a dot that is no address."""
+    if host.endswith(".localhost") or "." not in host:
+        return False
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return True
+    return False
 
 
 def _pattern(path: str) -> re.Pattern[str]:

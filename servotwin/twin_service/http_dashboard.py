@@ -9,15 +9,16 @@ from typing import Any
 import msgspec
 import sqlalchemy as sa
 
-from servotwin.dashboard.assets import INDEX, SECURITY, Asset, assets
-from servotwin.dashboard.machine_facts import UNKNOWN, machine_facts
-from servotwin.dashboard.series import fallbacks, gap_series, table_csv, versions
+from servotwin.dashboard.assets import INDEX, REPORT_SECURITY, SECURITY, Asset, assets
+from servotwin.dashboard.machine_metrics import machine_metrics
+from servotwin.dashboard.series import machine_series, table_csv
 from servotwin.dashboard.window_view import MAX_POINTS, channel_series, sample_range, window_columns
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal, WindowMessage, decode
 from servotwin.messages.checks import InvalidMessage
 from servotwin.messages.codec import decompress
-from servotwin.store import overview, queries
+from servotwin.runtime.prometheus import CONTENT_TYPE
+from servotwin.store import overview
 from servotwin.store.records import StoredMessage
 from servotwin.store.store import Store
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
@@ -38,9 +39,11 @@ from servotwin.twin_service.openapi import (
     SECONDS,
     SEQUENCE,
     SERVO,
+    TEXT,
     operation,
     parameter,
 )
+from servotwin.twin_service.reports import report_of
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 
@@ -48,7 +51,6 @@ _NAME = re.compile(NAME_PATTERN)
 _LOGIN_BYTES, _LOGIN_S = 4096, 10.0
 _SPARK_SERVOS, _SPARK_WINDOWS = 64, 48
 """Servos in one request for short histories, and windows of each."""
-_DECISIONS = 500
 
 
 class Login(msgspec.Struct):
@@ -65,11 +67,20 @@ class DashboardApi:
     operators : OperatorAccess
     store, executor : Store, StoreExecutor
     reader, feed : FleetReader, FleetFeed
+    machine_metrics : bool
+        Serve metrics of each machine.
     """
 
     def __init__(
-        self, operators: OperatorAccess, store: Store, executor: StoreExecutor, reader: FleetReader, feed: FleetFeed
+        self,
+        operators: OperatorAccess,
+        store: Store,
+        executor: StoreExecutor,
+        reader: FleetReader,
+        feed: FleetFeed,
+        machine_metrics: bool = False,
     ) -> None:
+        self._machine_metrics = machine_metrics
         self._operators, self._store, self._executor = operators, store, executor
         self._reader, self._feed = reader, feed
         self._bodies = BodyReader(_LOGIN_BYTES, _LOGIN_S)
@@ -113,6 +124,11 @@ class DashboardApi:
             (parameter("after", {"type": "string"}, "Only names after this one."), limit),
             errors=QUERY_ERRORS,
         )
+        metrics = operation(
+            "Metrics of each machine for Prometheus, where machine_metrics is set",
+            {200: ("Text format 0.0.4.", TEXT)},
+            errors=QUERY_ERRORS,
+        )
         events = operation(
             "Changes of the fleet as server-sent events: rows, reload, trouble, ended",
             {200: ("Events without end; the id of each is the position after it.", EVENTS)},
@@ -130,6 +146,7 @@ class DashboardApi:
         )
         return [
             HttpRoute("GET", "/v1/fleet", self._get_fleet, fleet),
+            *([HttpRoute("GET", "/metrics/machines", self._get_metrics, metrics)] if self._machine_metrics else []),
             HttpRoute("GET", "/v1/fleet/events", self._get_events, events),
             HttpRoute("GET", "/v1/fleet/histories", self._get_histories, histories),
         ]
@@ -157,7 +174,14 @@ class DashboardApi:
             errors=QUERY_ERRORS,
         )
         channels_csv = operation("Every sample of a window", {200: ("CSV.", CSV)}, window, errors=QUERY_ERRORS)
+        report = operation(
+            "Report of a machine, to mail",
+            {200: ("One HTML file that needs no other.", HTML)},
+            (SERVO,),
+            errors=QUERY_ERRORS,
+        )
         return [
+            HttpRoute("GET", SERVO_PATH + "/report.html", self._get_report, report),
             HttpRoute("GET", SERVO_PATH + "/gaps", self._get_gaps, gaps),
             HttpRoute("GET", SERVO_PATH + "/gaps.csv", self._get_gaps_csv, gaps_csv),
             HttpRoute("GET", WINDOW_PATH + "/channels", self._get_channels, channels),
@@ -199,6 +223,11 @@ class DashboardApi:
         page = await store_query(self._executor, partial(self._reader.page, after, limit_of(request)))
         return _fresh({"rows": page.rows, "position": page.position.text, "now": page.now})
 
+    async def _get_metrics(self, request: HttpRequest) -> HttpResponse:
+        self._operators.check(request)
+        text = await store_query(self._executor, lambda: machine_metrics(self._reader.all()))
+        return HttpResponse(200, text.encode(), CONTENT_TYPE)
+
     async def _get_events(self, request: HttpRequest) -> HttpStream:
         self._operators.check(request)
         self._feed.admit()
@@ -231,23 +260,15 @@ class DashboardApi:
         return servo, limit_of(request), request.integer("before", 0) or None
 
     def _gaps(self, servo: str, limit: int, before: int | None) -> dict[str, Any]:
-        """Series of a servo, what was decided, and facts of its model."""
+        return self._store.reading(lambda connection: machine_series(connection, servo, limit, before))
 
-        def read(connection: sa.Connection) -> dict[str, Any]:
-            found = overview.gaps(connection, servo, limit, before)
-            decided = overview.decisions(connection, servo, _DECISIONS)
-            key = next((one.context for each in reversed(found) for one in each.evidence if one.context), "")
-            context = queries.contexts(connection, [key]).get(key)
-            return {
-                "servo": servo,
-                "first": found[0].window.id if found else None,
-                "windows": gap_series(found),
-                "versions": versions(decided),
-                "fallbacks": fallbacks(decided),
-                "machine": UNKNOWN if context is None else machine_facts(context),
-            }
-
-        return self._store.reading(read)
+    async def _get_report(self, request: HttpRequest) -> HttpResponse:
+        servo = admitted_servo(self._operators, request)
+        text = await store_query(self._executor, partial(report_of, self._store, self._reader, servo))
+        if text is None:
+            raise RequestRejected(Refusal.UNKNOWN_SERVO, f"servo {servo!r} has never sent a message")
+        attachment = {"content-disposition": f'attachment; filename="{servo}.html"'}
+        return HttpResponse(200, text.encode(), HTML, {**REPORT_SECURITY, **attachment, "cache-control": "no-store"})
 
     async def _get_channels(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)

@@ -67,12 +67,20 @@ class RateLimiter:
         Per s; number.
     monotonic : callable
         s.
-    counted : str
-        What a token stands for, in rejections.
+    counted, owner : str
+        What a token stands for, and whom a bucket belongs to, in rejections.
     """
 
-    def __init__(self, rate: float, burst: float, monotonic: Callable[[], float], counted: str = "messages") -> None:
-        self._rate, self._burst, self._now, self._counted = rate, max(1.0, burst), monotonic, counted
+    def __init__(
+        self,
+        rate: float,
+        burst: float,
+        monotonic: Callable[[], float],
+        counted: str = "messages",
+        owner: str = "servo",
+    ) -> None:
+        self._rate, self._burst, self._now = rate, max(1.0, burst), monotonic
+        self._counted, self._owner = counted, owner
         self._levels: OrderedDict[str, tuple[float, float]] = OrderedDict()
 
     def take(self, servo: str, number: float = 1.0) -> None:
@@ -95,7 +103,7 @@ class RateLimiter:
             self._levels.popitem(last=False)
         if empty:
             raise RequestRejected(
-                Refusal.TOO_MANY, f"more than {self._rate:g} {self._counted} per s of servo {servo!r}"
+                Refusal.TOO_MANY, f"more than {self._rate:g} {self._counted} per s of {self._owner} {servo!r}"
             )
 
     def give_back(self, servo: str, number: float) -> None:

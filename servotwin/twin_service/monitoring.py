@@ -23,6 +23,7 @@ _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0
 
 _WATCHED = ("alarm", "failed", "fallback", "withdrawn")
 """Kinds of evidence that an operator must see."""
+_POSTED = ("taken", "refused", "dropped")
 _Labels = tuple[str, ...]
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
 """Attributes that every log record has."""
@@ -124,9 +125,12 @@ class Metrics:
         self.missing = Counter(
             "servotwin_windows_missing_total", "Windows of a boot that did not come, though later ones did."
         )
+        self.webhook = Counter(
+            "servotwin_webhook_total", "Alarms that were posted, by outcome.", "outcome", known=_POSTED
+        )
         self._all: list[Counter | Gauge | Histogram] = [
             self.stored, self.rejected, self.commit, self.age, self.work, self.results, self.evidence, self.sent,
-            self.workers_lost, self.missing,
+            self.workers_lost, self.missing, self.webhook,
         ]  # fmt: skip
 
     def add_gauge(

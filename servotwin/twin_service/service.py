@@ -21,6 +21,7 @@ from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
+from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
@@ -33,6 +34,7 @@ from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.http_server import BodyReader
+from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
@@ -43,6 +45,7 @@ from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.strangers import StrangerLimit
 from servotwin.twin_service.twin_file import TwinFile
+from servotwin.twin_service.what_if_process import WhatIfProcess
 from servotwin.twin_service.worker import WorkerPool
 
 log = logging.getLogger(__name__)
@@ -109,11 +112,14 @@ class TwinService:
         )
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
+        self.webhook: AlarmWebhook | None = None
+        if config.webhook is not None:
+            self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
         self.dispatcher = Dispatcher(
             store=store,
             executor=self.executor,
             pool=self.pool,
-            commit=self.watch.commit,
+            commit=self.watch.commit if self.webhook is None else announced(self.watch.commit, self.webhook),
             notify=self.polls.notify,
             metrics=self.metrics,
             clocks=self.clocks,
@@ -131,6 +137,7 @@ class TwinService:
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)
         self.feed = FleetFeed(self._reader, self.executor, presence, config.watchers, self._shared)
+        self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
             handler = MqttRequestHandler(
@@ -145,12 +152,15 @@ class TwinService:
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
         operator = OperatorApi(self.operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
-        dashboard = DashboardApi(self.operators, self.store, self.executor, self._reader, self.feed)
-        routes = [*edge.routes(), *operator.routes(), *dashboard.routes()]
+        dashboard = DashboardApi(
+            self.operators, self.store, self.executor, self._reader, self.feed, self.config.machine_metrics
+        )
+        what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
+        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
-        return HttpApp(routes, self.metrics, self._lifespan)
+        return HttpApp(routes, self.metrics, self._lifespan, own_names=self.tokens is None)
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""
@@ -161,6 +171,9 @@ class TwinService:
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self.feed.run())
+        self._spawn(self.what_if.run())
+        if self.webhook is not None:
+            self._spawn(self.webhook.run())
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -189,6 +202,7 @@ class TwinService:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await self.what_if.stop()
         await self.pool.stop()
         await asyncio.to_thread(self.commits.close)
         with suppress(StoreUnavailable):

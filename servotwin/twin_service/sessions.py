@@ -45,13 +45,21 @@ class OperatorAccess:
         """True where no tokens are configured."""
         return self._access.open
 
-    def check(self, request: HttpRequest) -> None:
-        """Check that a request is an operator's; raises RequestRejected."""
+    def check(self, request: HttpRequest) -> str:
+        """Check that a request is an operator's, and return the operator's name; raises RequestRejected.
+
+        The name is empty where no tokens are configured.
+        """
         cookie = None if request.token is not None else request.cookie(COOKIE)
-        if cookie is None or self._access.open:
+        if self._access.open:
+            return ""
+        if cookie is None:
             self._access.check_operator(request.token)
-        elif not self.is_session(cookie):
+            return self._access.operator_of(request.token)
+        name = self.session_name(cookie)
+        if name is None:
             raise RequestRejected(Refusal.BAD_TOKEN, _ENDED, 401)
+        return name
 
     def session_cookie(self, token: bytes) -> str:
         """Set-Cookie header of a new session; raises RequestRejected where the token is no operator's."""
@@ -65,16 +73,17 @@ class OperatorAccess:
         """Set-Cookie header that ends a session."""
         return self._header("", 0.0)
 
-    def is_session(self, cookie: str) -> bool:
-        """Test whether a cookie is that of a session which has not ended."""
+    def session_name(self, cookie: str) -> str | None:
+        """Name of the operator whose session a cookie holds; None: it holds none."""
         match = _COOKIE.fullmatch(cookie)
         if match is None:
-            return False
+            return None
         try:
             name = bytes.fromhex(match[1]).decode()
         except ValueError:
-            return False
-        return hmac.compare_digest(self._code(name, match[2]), match[3]) and self._wall() < int(match[2])
+            return None
+        valid = hmac.compare_digest(self._code(name, match[2]), match[3]) and self._wall() < int(match[2])
+        return name if valid else None
 
     def _code(self, name: str, end: str) -> str:
         """Authentication code; of an operator that does not exist, one that nobody knows."""

@@ -66,7 +66,7 @@ class StrangerLimit:
         if authorization is not None:
             return self._access.knows(bearer_token(authorization))
         session = cookie_of(cookies, COOKIE)
-        return session is not None and self._operators.is_session(session)
+        return session is not None and self._operators.session_name(session) is not None
 
 
 class Stranger:

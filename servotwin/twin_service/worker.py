@@ -184,6 +184,11 @@ class WorkerProcess:
         for _ in leases:
             yield decode_result(await self._receive(self._timeout))
 
+    async def ask(self, question: bytes) -> bytes:
+        """Send a frame and return the body of the next one, where the command line is not a worker's; or WorkerLost."""
+        self._send(frame(question))
+        return await self._receive(self._timeout)
+
     async def stop(self) -> None:
         """Close the socket and wait for the end of the process."""
         if self._writer is not None:

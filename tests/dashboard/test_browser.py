@@ -165,6 +165,27 @@ def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
     assert download.value.path().read_text().startswith("received,sample_time,boot")
 
 
+def test_a_step_is_tried_on_the_model(open_page):
+    page = open_page(expected=("status of 400",))
+    open_machine(page, WEARING)
+    panel = page.locator("[aria-label='What if']")
+    panel.locator("text=Try on the model").click()
+    panel.locator("text=exactly simulated on the model").wait_for()
+    assert panel.locator(".uplot").count() == 2
+    before = panel.locator(".soft").first.inner_text()
+    panel.locator("label", has_text="k_DZ").locator("input").fill("300")
+    panel.locator(".soft", has_text=before).first.wait_for(state="detached")
+    assert serious_faults(page) == []
+    page.set_viewport_size({"width": 360, "height": 740})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    (PICTURES / "what-if.png").write_bytes(panel.screenshot())
+    page.locator("label", has_text="Kp").locator("input").fill("400")
+    has_text(page, "[aria-label='What if'] .error", "unstable on this servo even without a gap")
+    panel.locator("text=As in force").click()
+    panel.locator(".soft", has_text=before).first.wait_for()
+
+
 def test_states_without_data_are_said_in_words(open_page):
     page = open_page(expected=("status of 404",))
     open_machine(page, SILENT)

@@ -11,6 +11,7 @@ import pytest
 from servers import needed
 from service_system import twin_file
 
+from servotwin.dashboard.machine_metrics import machine_metrics
 from servotwin.edge_process.metrics import metrics_text
 from servotwin.store.store import open_store
 from servotwin.twin_service.service import TwinService
@@ -28,7 +29,7 @@ EDGE = {
 
 
 def exported(folder: Path) -> str:
-    """Metrics of a twin that has a broker, and of an edge."""
+    """Metrics of a twin that has a broker, of an edge, and of a fleet."""
     twin = read_twin(twin_file(folder, '[service.mqtt]\nurl = "mqtt://127.0.0.1:1"\n'))
     store = open_store(twin.service.store)
     system = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
@@ -38,7 +39,7 @@ def exported(folder: Path) -> str:
         system.commits.close()
         system.executor.close()
         store.close()
-    return app_metrics + metrics_text({"servo": "ax-1", **EDGE})
+    return app_metrics + metrics_text({"servo": "ax-1", **EDGE}) + machine_metrics([])
 
 
 def queries() -> list[str]:

@@ -21,6 +21,7 @@ from service_system import twin_file
 
 from servotwin.cli.app import app
 from servotwin.cli.audit_report import HEAD
+from servotwin.dashboard.machine_metrics import machine_metrics
 from servotwin.edge import outlet
 from servotwin.edge_process import outlet as pipe_outlet
 from servotwin.edge_process.monitoring import read_status
@@ -137,6 +138,9 @@ def test_every_metric_is_explained(system: TwinService) -> None:
     assert {name for name in explained if not name.startswith("servotwin_")} == calls(
         "twin_service", "counts.add", ".add"
     )
+    machines = set(re.findall(r"^# TYPE (\S+)", machine_metrics([]), re.MULTILINE))
+    assert set(named("Metrics of the machines")) == machines
+    told |= machines
     everywhere = re.findall(r"\bservotwin_[a-z_]+", ALARM + GUIDE)
     assert {name for name in everywhere if not name.startswith("servotwin_edge_")} - told <= {"servotwin_version"}
 

@@ -153,7 +153,7 @@ def test_defects_are_mended_and_counted(tmp_path, made):
     del text[500:560]
     text.insert(0, "-3600,0,0")
     path = tmp_path / "log.csv"
-    path.write_text("time_s,motor_rad,load_rad\n" + "\n".join(text))
+    path.write_text("\n".join(["time_s,motor_rad,load_rad", *text, ""]))
     log = read_recording(path, RecordingColumns())
     assert log.found.pop("turns of motor that were unwrapped") > 5
     assert log.found == {
@@ -167,6 +167,17 @@ def test_defects_are_mended_and_counted(tmp_path, made):
     motor = np.interp(log.recording.time, made.time, made.motor)
     turns = (log.recording.motor - motor) / (2.0 * np.pi)
     assert np.max(np.abs(turns - np.round(turns[0]))) < 0.01
+
+
+def test_a_log_that_ends_within_a_line_is_said_to(tmp_path, made):
+    path = csv(tmp_path / "log.csv", rows(made))
+    whole = path.read_bytes()
+    for content, numbers in ((whole, 0), (whole[:-1], 0), (whole[: whole.rindex(b",")], 1)):
+        path.write_bytes(content)
+        log = read_recording(path, RecordingColumns())
+        assert any("may have been cut off" in each for each in log.found) is (content is not whole)
+        assert log.found.get("without a number in some column", 0) == numbers
+        assert log.recording.time.size == made.time.size - numbers
 
 
 def test_a_clean_log_is_left_as_it_is(made):
@@ -208,11 +219,25 @@ def test_identify_from_a_log_to_json(tmp_path, made):
     result = CliRunner().invoke(app, ["identify", str(path), "--json"])
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
-    assert (found["status"], found["unit_motor"], found["unit_load"]) == ("ok", "rad", "mm")
-    low, high = found["interval_load"]
+    assert (found["status"], found["unit_motor"], found["unit_load"]) == ("lost motion", "rad", "mm")
+    low, high = found["lost_motion_interval_load"]
     assert low <= GAP * RATIO <= high
-    assert found["gap_motor"] == pytest.approx(GAP, abs=1e-3)
+    assert found["lost_motion_motor"] == pytest.approx(GAP, abs=1e-3)
+    assert (found["gap_load"], found["interval_load"]) == (None, [0.0, high])
+    assert "give the machine (--axis), or --stiff" in found["reasons"][-1]
     assert len(found["segments"]) > 10
+
+
+def test_lost_motion_is_gap_only_where_nothing_winds_up(tmp_path, made):
+    path = csv(tmp_path / "log.csv", rows(made), "t [s],motor [rad],load [mm]")
+    unknown, stiff = (
+        CliRunner().invoke(app, ["identify", str(path), *options]).output for options in ([], ["--stiff"])
+    )
+    assert re.search(r"lost motion 0\.00\d+ mm .* gap at most 0\.005\d+ mm: lost motion", " ".join(unknown.split()))
+    assert re.search(r"gap 0\.00\d+ mm at the load, .*: ok", " ".join(stiff.split()))
+    both = CliRunner().invoke(app, ["identify", str(path), "--stiff", "--axis", "ball-screw"])
+    assert both.exit_code == 2
+    assert "give one of the two" in both.stderr
 
 
 def test_a_page_of_the_gap(tmp_path, made):
@@ -234,8 +259,8 @@ def test_the_change_between_two_logs(tmp_path, made):
     second = csv(tmp_path / "new.csv", rows(worn))
     result = CliRunner().invoke(app, ["identify", str(first), str(second)])
     assert result.exit_code == 0, result.output
-    assert "change: +0.001" in result.output
-    assert "more than chance explains" in result.output
+    assert "change of the lost motion: +0.001" in " ".join(result.output.split())
+    assert "deviations: more than chance explains" in " ".join(result.output.split())
 
 
 def test_a_foreign_log_is_converted_without_its_defects(tmp_path, made):
@@ -271,6 +296,7 @@ def test_wear_over_three_logs_in_calendar_time(tmp_path):
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
     assert [each["date"][:10] for each in found] == ["2026-01-01", "2026-04-01", "2026-07-01"]
+    assert found[-1]["growth_of"] == "lost motion"
     assert found[-1]["growth_per_year_load"] == pytest.approx(0.01 * RATIO * 365.25 / 181, rel=0.05)
     wrong = CliRunner().invoke(app, ["identify", *map(str, logs), "--dates", "2026-01-01"])
     assert wrong.exit_code == 2

@@ -256,3 +256,59 @@ def test_a_fleet_comes_in_pages(tmp_path):
         assert (await client.get("/v1/fleet/histories?servos=a/b", headers=headers)).status_code == 400
 
     with_service(tmp_path, body)
+
+
+def test_a_report_is_one_file_that_runs_nothing(tmp_path):
+    async def body(system, client):
+        await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
+        assert (await client.get("/v1/servos/ax-1/report.html")).status_code == 401
+        answer = await client.get("/v1/servos/ax-1/report.html", headers=bearer(OPERATOR))
+        assert answer.status_code == 200
+        assert "attachment" in answer.headers["content-disposition"]
+        assert "script-src" not in answer.headers["content-security-policy"]
+        assert "default-src 'none'" in answer.headers["content-security-policy"]
+        assert "1970-01-01 00:00" in answer.text
+        assert (await client.get("/v1/servos/ax-7/report.html", headers=bearer(OPERATOR))).status_code == 404
+
+    with_service(tmp_path, body)
+
+
+@pytest.mark.parametrize(("host", "status"), [
+    ("localhost:8765", 200), ("127.0.0.1:8765", 200), ("[::1]:8765", 200), ("LOCALHOST.", 200), ("up.localhost", 200),
+    ("twin", 200), ("evil.example:8765", 403), ("127.0.0.1.evil.example", 403), ("evil.example.", 403),
+])  # fmt: skip
+def test_without_tokens_a_page_whose_name_leads_here_reads_nothing(tmp_path, host, status):
+    async def run():
+        async with served(twin_file(tmp_path, tokens=False)) as (_system, client):
+            answer = await client.get("/v1/fleet", headers={"host": host})
+            assert answer.status_code == status
+
+    asyncio.run(run())
+
+
+def test_with_tokens_a_twin_answers_under_any_name(tmp_path):
+    async def body(_system, client):
+        headers = {**bearer(OPERATOR), "host": "twin.plant.example"}
+        assert (await client.get("/v1/fleet", headers=headers)).status_code == 200
+
+    with_service(tmp_path, body)
+
+
+def test_metrics_of_machines_are_served_where_they_are_asked_for(tmp_path):
+    async def body(system, client):
+        await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
+        assert (await client.get("/metrics/machines")).status_code == 401
+        text = (await client.get("/metrics/machines", headers=bearer(OPERATOR))).text
+        assert 'servotwin_machine_last_message_seconds{servo="ax-1"} 5\n' in text
+        assert 'servotwin_machine_connected{servo="ax-1"} 0\n' in text
+        assert "servotwin_machine_gap_radians{" not in text
+        assert "ax-1" not in (await client.get("/metrics")).text
+
+    with_service(tmp_path, body, "machine_metrics = true")
+
+
+def test_metrics_of_machines_are_off_by_default(tmp_path):
+    async def body(_system, client):
+        assert (await client.get("/metrics/machines", headers=bearer(OPERATOR))).status_code == 404
+
+    with_service(tmp_path, body)

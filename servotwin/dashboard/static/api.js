@@ -32,7 +32,7 @@ export async function request(path, options = {}) {
   }
   if (!response.ok) {
     const said = await detail(response);
-    throw new ApiError(WORDS[response.status] || said || `The twin answers with status ${response.status}.`, response.status);
+    throw new ApiError((options.detailed && said) || WORDS[response.status] || said || `The twin answers with status ${response.status}.`, response.status);
   }
   if (response.status === 204) return null;
   try {
@@ -66,6 +66,9 @@ export const windowPath = (name, boot, sequence) => `${servo(name)}/windows/${en
 export const histories = (names) => request(`/v1/fleet/histories?servos=${names.map(encodeURIComponent).join(",")}`);
 export const gaps = (name, limit = 400) => request(`${servo(name)}/gaps?limit=${limit}`);
 export const gapsFile = (name) => `${servo(name)}/gaps.csv?limit=1000`;
+export const reportFile = (name) => `${servo(name)}/report.html`;
 export const updates = (name, limit = 20) => request(`${servo(name)}/audit?updates=1&limit=${limit}`);
 export const events = (name, limit = 50) => request(`${servo(name)}/events?limit=${limit}`);
 export const channels = (name, boot, sequence, points) => request(`${windowPath(name, boot, sequence)}/channels?points=${points}`);
+export const whatIf = (name, asked) =>
+  request(`${servo(name)}/what-if`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(asked), signal: AbortSignal.timeout(60000), detailed: true });

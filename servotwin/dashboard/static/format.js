@@ -90,6 +90,19 @@ export function linkOf(row, now) {
   return { word: "silent", kind: "bad", note: `for ${duration(Math.max(0, silence))}` };
 }
 
-export const clock = (time) => new Date(time * 1000).toLocaleTimeString([], { hour12: false });
-export const stamp = (time) =>
-  new Date(time * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "medium", hour12: false });
+// Dates as in ISO 8601, in the browser's time zone.
+const two = (number) => String(number).padStart(2, "0");
+export function stamp(time) {
+  const at = new Date(time * 1000);
+  return `${at.getFullYear()}-${two(at.getMonth() + 1)}-${two(at.getDate())} ${two(at.getHours())}:${two(at.getMinutes())}`;
+}
+export function clock(time) {
+  const at = new Date(time * 1000);
+  return `${two(at.getHours())}:${two(at.getMinutes())}:${two(at.getSeconds())}`;
+}
+
+// The unit in which the largest of small lengths or angles has a readable size; values are in m, rotary: rad.
+export function smallUnit(largest, rotary) {
+  const units = rotary ? [["rad", 1], ["mrad", 1e3], ["µrad", 1e6]] : [["mm", 1e3], ["µm", 1e6], ["nm", 1e9]];
+  return units.find(([, factor]) => largest * factor >= 1) ?? units.at(-1);
+}

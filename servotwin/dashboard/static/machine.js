@@ -4,8 +4,9 @@
 import * as api from "./api.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
-import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, stamp, statusText, travelText } from "./format.js";
-import { chainTable, eventList, simulated } from "./updates.js";
+import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, smallUnit, stamp, statusText, travelText } from "./format.js";
+import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
+import { WhatIfPanel } from "./what_if.js";
 
 const REFRESH_MS = 1500, EVERY = 20000;
 const scaled = (values, factor) => values.map((value) => (value === null ? null : value * factor));
@@ -65,6 +66,7 @@ export class MachinePage {
       this.plots.push(new TimePlot(place, options));
       return this.plots.at(-1);
     };
+    this.whatIf = new WhatIfPanel(name, () => this.start());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", {},
@@ -80,17 +82,25 @@ export class MachinePage {
           element("div", {}, element("h3", {}, "Hysteresis"),
             element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
             this.loop))),
+      panel("What if", this.whatIf.tools, ...this.whatIf.content),
       panel("Did it help?", [],
         legend(["blue", "of each window"], ["orange", "version applied"]),
         element("div", { class: "two" }, places.tail, places.residual)),
       panel("Updates", [], this.chain),
       panel("Behind the last update", [], this.proof),
       panel("Events", [], this.events));
-    this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: "#/" }, "All machines"));
+    this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
     this.tilesList = element("dl", { class: "facts" },
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
     this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
     this.makePlots(plot, places);
+    this.plots.push(...this.whatIf.plots);
+  }
+
+  // Where a trial on the model begins: at what is known of the machine.
+  start() {
+    const row = this.live.rows.get(this.name) ?? {};
+    return { gap: row.gap, limit: row.gap_limit, setting: settingInForce(this.updates, this.happened, row.version_in_force) };
   }
 
   makePlots(plot, places) {
@@ -195,8 +205,7 @@ export class MachinePage {
     const unit = positionUnit(machine);
     this.tailPlot.options.yLabel = `Error at the end (${unit.name})`;
     this.tailPlot.show([windows.received, scaled(windows.tail, unit.factor)], "Largest tracking error in the last tenth of each window");
-    const fine = Math.max(...windows.residual) < (unit.name === "mm" ? 1e-6 : 1e-3);
-    const residual = unit.name === "mm" ? (fine ? ["nm", 1e9] : ["µm", 1e6]) : fine ? ["µrad", 1e6] : ["mrad", 1e3];
+    const residual = smallUnit(Math.max(0, ...windows.residual), unit.name === "deg");
     this.residualPlot.options.yLabel = `Residual, rms (${residual[0]})`;
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
     this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));

@@ -35,6 +35,13 @@ function row(trace, step, unit) {
     cell(answerText(step)), cell(effectText(step.effect, unit), true));
 }
 
+// Setting of the version in force: of its update, or as the edge stated it at its start; null: unknown.
+export function settingInForce(traces, events, version) {
+  const steps = traces.flatMap((trace) => trace.steps).filter((step) => step.update.version === version);
+  const hello = events.find((one) => one.kind === "hello" && one.version === version);
+  return steps.at(-1)?.update.body?.setting ?? hello?.body?.setting ?? null;
+}
+
 function settingText(setting, unit) {
   const parts = [setting.tolerance ? `dead zone ${brief(setting.tolerance * unit.factor)} ${unit.name}` : "no dead zone"];
   const gains = setting.gains ?? {};
@@ -79,7 +86,7 @@ export function simulated(traces) {
   return element("div", {},
     element("p", {}, `Version ${update.version}, for a gap of ${brief((update.body.gap ?? NaN) * DEG)} deg:`),
     element("ul", { class: "simulated" }, tried.map((line) => element("li", {}, line))),
-    element("p", { class: "soft" }, `Not tried: gaps${region ? rangeText(region) : ""} and machines outside the ranges that the twin's file states; faults of sensors, drive or structure; references other than steps. Verified in simulation is not proved.`));
+    element("p", { class: "soft" }, `Not tried: gaps${region ? rangeText(region) : ""} and machines outside the ranges that the twin's file states; faults of sensors, drive or structure; references other than steps. A verification in simulation is no proof.`));
 }
 
 function rangeText(region) {

@@ -1,4 +1,4 @@
-"""Gap between two encoders without a model of the dynamics: `estimate_lost_motion`."""
+"""Lost motion between two encoders without a model of the dynamics: `estimate_lost_motion`."""
 
 from __future__ import annotations
 
@@ -38,6 +38,7 @@ _FINE = 17  # of each finer one
 _ROUNDS = 4
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
+_PIECES = 10  # of a stroke on the average, in each of which noise and hunting average out
 _SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
 _SKEW = 2.0  # samples between two channels that are nothing unusual
 _ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
@@ -66,13 +67,15 @@ class FittedCurves(NamedTuple):
 
 @dataclass(frozen=True)
 class LostMotion:
-    """Gap that a recording shows; angles and lengths in the units of the recording.
+    """Lost motion that a recording shows: the gap, and what friction winds up at a reversal, together.
+
+    Angles and lengths are in the units of the recording. `wind_up.gap_within` says what of it is gap.
 
     Attributes
     ----------
-    gap_motor, std_motor : float
-        Total gap on the motor's side and its standard deviation, the motor's unit; a lower bound where the status says
-        so; NaN where nothing is known.
+    at_motor, std_motor : float
+        Lost motion on the motor's side and its standard deviation, the motor's unit; a lower bound where the status
+        says so; NaN where nothing is known.
     interval_motor : (float, float)
         95 %.
     ratio : float
@@ -80,6 +83,7 @@ class LostMotion:
     lag : float
         s, by which the load follows.
     status : GapStatus
+        Of the lost motion: OK says nothing of the gap.
     reasons : tuple of str
     model : str
         The model that the evidence chose.
@@ -94,7 +98,7 @@ class LostMotion:
     curves : FittedCurves or None
     """
 
-    gap_motor: float
+    at_motor: float
     std_motor: float
     interval_motor: Interval
     ratio: float
@@ -109,8 +113,8 @@ class LostMotion:
     curves: FittedCurves | None = None
 
     @property
-    def gap_load(self) -> float:
-        return self.gap_motor * abs(self.ratio)
+    def at_load(self) -> float:
+        return self.at_motor * abs(self.ratio)
 
     @property
     def std_load(self) -> float:
@@ -143,7 +147,7 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     least = _least_motion(recording.motor, motor_count)
     strokes = strokes_of(recording, least)
     _check(recording, least, strokes.reversals)
-    if float(np.ptp(recording.load)) <= _least_motion(recording.load, load_count):
+    if not _follows(recording.load, load_count, strokes.reversals):
         return _bound(recording)
     prepared = regression(recording, strokes, 0)
     coarse = _coarse(prepared, least)
@@ -166,9 +170,23 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
 
 def _least_motion(values: Array, count: float) -> float:
     """Motion that is more than an encoder's counts and noise."""
+    return max(_COUNTS * count, 3.0 * _COUNTS * _noise(values), 1e-4 * float(np.ptp(values)))
+
+
+def _noise(values: Array) -> float:
+    """Standard deviation of what differs from sample to sample."""
     second = np.diff(values, 2)
-    noise = 1.4826 * float(np.median(np.abs(second - np.median(second)))) / np.sqrt(6.0)
-    return max(_COUNTS * count, 3.0 * _COUNTS * noise, 1e-4 * float(np.ptp(values)))
+    return 1.4826 * float(np.median(np.abs(second - np.median(second)))) / math.sqrt(6.0)
+
+
+def _follows(load: Array, count: float, reversals: int) -> bool:
+    """True for a load whose means over tenths of a stroke move by more than its counts and noise.
+
+    From sample to sample a machine that hunts moves as fast as noise does; its means move with the strokes.
+    """
+    size = max(1, load.size // (_PIECES * (reversals + 1)))
+    means = load[: load.size // size * size].reshape(-1, size).mean(axis=1)
+    return float(np.ptp(means)) > max(_COUNTS * count, 3.0 * _COUNTS * _noise(load) / math.sqrt(size))
 
 
 def strokes_in(recording: EncoderRecording) -> Strokes:
@@ -181,8 +199,8 @@ def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
     reach = float(np.ptp(recording.motor))
     if not reach > 2.0 * least:
         raise InvalidInput(
-            f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and noise explain: record a "
-            "motion to and fro that takes up the gap on both sides"
+            f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and its noise or hunting "
+            "explain: record a motion to and fro that takes up the gap on both sides"
         )
     if reversals < _LEAST_REVERSALS:
         raise InvalidInput(
@@ -235,14 +253,14 @@ def _tensor(prepared: Regression, coarse: float, least: float) -> tuple[Array, A
 def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
     """Gap by time and by travel, and their bootstrap, on grids that are narrowed to the spread."""
     places = model.places(prepared)
-    travel = _travel(prepared)
+    travel, least = _travel(prepared), 1e-3 * max(gap, width)
     for _ in range(_ROUNDS):
         grid = np.linspace(max(gap - width, 0.0), gap + width, _FINE)
         by_time = np.array([products(prepared, each) for each in grid])
         by_travel = np.array([products(prepared, each, travel) for each in grid])
         spread = draws.bootstrap(grid, by_time, by_travel, places)
         gap, other = (float(least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel))
-        wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), 1e-3 * gap)
+        wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), least)
         if 0.4 * width <= wanted <= 1.5 * width:
             break
         width = wanted
@@ -252,7 +270,7 @@ def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tup
 def _curves(
     recording: EncoderRecording, prepared: Regression, model: Model, found: LostMotion, grid: Array, rms: Array
 ) -> FittedCurves:
-    gap = found.gap_motor if math.isfinite(found.gap_motor) else 0.0
+    gap = found.at_motor if math.isfinite(found.at_motor) else 0.0
     values, _ = columns(prepared._replace(lag=found.lag), gap)
     places = model.places(prepared)
     fit = solved(values @ values.T, places)
@@ -314,7 +332,7 @@ def _answer(
     )
     rows, known = prepared.rows, judged.interval != NOTHING_KNOWN
     return LostMotion(
-        gap_motor=gap if known else math.nan,
+        at_motor=gap if known else math.nan,
         std_motor=half / quantile if known else math.inf,
         interval_motor=judged.interval,
         ratio=ratio,
@@ -361,5 +379,7 @@ def _no_gap() -> LostMotion:
 
 def _bound(recording: EncoderRecording) -> LostMotion:
     reach = float(np.ptp(recording.motor))
-    reason = f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the gap is larger"
+    reason = (
+        f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the lost motion is larger"
+    )
     return LostMotion(reach, np.inf, (reach, np.inf), np.nan, 0.0, GapStatus.LOWER_BOUND, (reason,))

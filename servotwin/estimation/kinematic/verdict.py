@@ -78,7 +78,8 @@ def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
         )
         return KinematicVerdict(GapStatus.MODEL_MISMATCH, NOTHING_KNOWN, (reason,))
     if none:
-        high = max(high, 3.0 * fit.left, *(gap + fit.half for gap in fit.simpler.values()))
+        # A load that hunts spoils the fit; no gap that it takes up is larger than the largest lead.
+        high = max(high, 3.0 * fit.left, fit.reach, *(gap + fit.half for gap in fit.simpler.values()))
         return KinematicVerdict(
             GapStatus.UNIDENTIFIABLE, (0.0, high), (f"no gap can be told from none: at most {high:.3g} {unit}",)
         )
@@ -97,8 +98,8 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
     reasons = []
     if abs(fit.by_travel - fit.gap) > _DISAGREE * math.hypot(fit.spread.std_of_difference, fit.quantisation):
         reasons.append(
-            f"the gap is {fit.gap:.4g} {unit} if every moment counts alike and {fit.by_travel:.4g} {unit} if the "
-            "motor's way does: the model leaves out something that is not noise"
+            f"the lost motion is {fit.gap:.4g} {unit} if every moment counts alike and {fit.by_travel:.4g} {unit} "
+            "if the motor's way does: the model leaves out something that is not noise"
         )
     if fit.left > max(_LEFT * fit.gap, fit.quantisation):
         reasons.append(f"the load deviates from the model by {fit.left:.3g} {unit} (rms, at the motor), noise aside")

@@ -1,12 +1,12 @@
-"""Wind-up of a known machine: by how much the friction of its load makes the lost motion larger than the gap."""
+"""The gap within a lost motion: what remains when the wind-up by friction is taken off."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus
+from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.plant.axis import Axis
@@ -18,6 +18,51 @@ _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
 _RATIO = 0.05  # by which the recording's load per motor may differ from the machine's
 _DOUBT = 1.0  # of the wind-up: friction changes, and a load that swings leaves less of it
 _SHARE = 0.5  # of the lost motion: a larger wind-up leaves no gap that is known
+_UNKNOWN = (
+    "two positions do not tell how much of the lost motion is wind-up by the load's friction: give the machine "
+    "(--axis), or --stiff where nothing winds up"
+)
+
+
+@dataclass(frozen=True)
+class TransmissionGap:
+    """Gap of a transmission, in the units of the recording that shows its lost motion.
+
+    Attributes
+    ----------
+    lost : LostMotion
+    gap_motor, std_motor : float
+        Total gap on the motor's side and its standard deviation, the motor's unit; NaN and inf where it is not known.
+    interval_motor : (float, float)
+        95 %; from 0 to the largest lost motion where the wind-up is not known.
+    status : GapStatus
+        LOST_MOTION: the lost motion is known, and how much of it is gap is not.
+    reasons : tuple of str
+    """
+
+    lost: LostMotion
+    gap_motor: float
+    std_motor: float
+    interval_motor: Interval
+    status: GapStatus
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def gap_load(self) -> float:
+        return self.gap_motor * abs(self.lost.ratio)
+
+    @property
+    def std_load(self) -> float:
+        return self.std_motor * abs(self.lost.ratio)
+
+    @property
+    def interval_load(self) -> Interval:
+        low, high = self.interval_motor
+        return (low * abs(self.lost.ratio), high * abs(self.lost.ratio))
+
+    @property
+    def ok(self) -> bool:
+        return self.status is GapStatus.OK
 
 
 def wind_up(machine: Plant) -> float:
@@ -30,42 +75,63 @@ def wind_up(machine: Plant) -> float:
     return 2.0 * machine.guide.friction / machine.transmission.k_d / machine.p
 
 
-def with_machine(recording: EncoderRecording, found: LostMotion, machine: Plant) -> LostMotion:
-    """Take a machine's wind-up off the lost motion that a recording shows.
+def gap_within(lost: LostMotion, off: float | None, unit: str = "") -> TransmissionGap:
+    """Take a wind-up off a lost motion; the one place that decides if a log shows a gap.
 
     Two positions do not tell how much of a lost motion is a gap: at a reversal the load sticks while the transmission
-    unwinds and winds up again. The friction counts as known within a factor of 0 to 2.
+    unwinds and winds up again. A wind-up that is given counts as known within a factor of 0 to 2.
+
+    Parameters
+    ----------
+    lost : LostMotion
+    off : float or None
+        Wind-up, the motor's unit: 0 for a stiff transmission; None where it is not known.
+    unit : str
+        The motor's, for the reasons.
+    """
+    low, high = lost.interval_motor
+    if lost.interval_motor == NOTHING_KNOWN:
+        return TransmissionGap(lost, math.nan, math.inf, NOTHING_KNOWN, lost.status, lost.reasons)
+    if off is None:
+        status = GapStatus.LOST_MOTION if lost.ok else lost.status
+        reasons = lost.reasons if status is GapStatus.UNIDENTIFIABLE else (*lost.reasons, _UNKNOWN)
+        return TransmissionGap(lost, math.nan, math.inf, (0.0, high), status, reasons)
+    if not off:
+        return TransmissionGap(lost, lost.at_motor, lost.std_motor, lost.interval_motor, lost.status, lost.reasons)
+    reason = f"{off:.4g} {unit} of the lost motion of {lost.at_motor:.4g} {unit} are wind-up by the load's friction"
+    interval = (max(low - 2.0 * _DOUBT * off, 0.0), high)
+    if math.isfinite(high):
+        half, middle = math.hypot(0.5 * (high - low), _DOUBT * off), 0.5 * (low + high) - off
+        interval = (max(middle - half, 0.0), max(middle + half, 0.0))
+    large = off > _SHARE * lost.at_motor
+    return TransmissionGap(
+        lost,
+        gap_motor=max(lost.at_motor - off, 0.0),
+        std_motor=math.hypot(lost.std_motor, 0.5 * _DOUBT * off),
+        interval_motor=interval,
+        status=GapStatus.UNIDENTIFIABLE if large and lost.ok else lost.status,
+        reasons=(*lost.reasons, reason),
+    )
+
+
+def gap_of_machine(recording: EncoderRecording, lost: LostMotion, machine: Plant) -> TransmissionGap:
+    """Take a machine's wind-up off the lost motion that a recording shows.
 
     Raises
     ------
     InvalidInput
         Units that are not known, or a ratio that is not the machine's.
     """
-    if found.interval_motor == NOTHING_KNOWN or not math.isfinite(found.ratio):
-        return found
+    if lost.interval_motor == NOTHING_KNOWN:
+        return gap_within(lost, None)
     motor_unit, load_unit = _units(recording, machine)
-    ratio = abs(found.ratio) * load_unit / motor_unit
+    ratio = abs(lost.ratio) * load_unit / motor_unit
     if abs(ratio / machine.p - 1.0) > _RATIO:
         raise InvalidInput(
             f"{recording.source}: its load moves by {ratio:.4g} per rad of the motor, in SI units, and that of --axis "
             f"by {machine.p:.4g}: check the units of both columns (--motor-unit, --load-unit) and the axis"
         )
-    off, unit = wind_up(machine) / motor_unit, recording.motor_unit
-    if not off:
-        return found
-    half = math.hypot(0.5 * (found.interval_motor[1] - found.interval_motor[0]), _DOUBT * off)
-    middle = 0.5 * (found.interval_motor[0] + found.interval_motor[1]) - off
-    reason = f"{off:.4g} {unit} of the lost motion of {found.gap_motor:.4g} {unit} are wind-up by the load's friction"
-    large = off > _SHARE * found.gap_motor
-    return replace(
-        found,
-        gap_motor=max(found.gap_motor - off, 0.0),
-        std_motor=math.hypot(found.std_motor, 0.5 * _DOUBT * off),
-        interval_motor=(max(middle - half, 0.0), max(middle + half, 0.0)),
-        status=GapStatus.UNIDENTIFIABLE if large and found.ok else found.status,
-        reasons=(*found.reasons, reason),
-        model=f"{found.model}, wind-up of the axis",
-    )
+    return gap_within(lost, wind_up(machine) / motor_unit, recording.motor_unit)
 
 
 def _units(recording: EncoderRecording, machine: Plant) -> tuple[float, float]:

@@ -32,7 +32,7 @@ def test_two_machines_in_one_log_are_told():
 
 
 def test_a_drift_much_smaller_than_the_gap_is_none():
-    assert np.isfinite(estimate_lost_motion(broken(lambda load: load + 2e-4)).gap_motor)
+    assert np.isfinite(estimate_lost_motion(broken(lambda load: load + 2e-4)).at_motor)
 
 
 def test_the_largest_step_of_a_residual():

@@ -21,13 +21,13 @@ def test_from_two_counts_to_most_of_the_travel(gap):
     assert found.ok, found.reasons
     assert low <= gap <= high
     assert high - low < 0.02 * gap + 1.5e-3
-    assert found.gap_load == pytest.approx(0.1 * found.gap_motor, rel=1e-3)
+    assert found.at_load == pytest.approx(0.1 * found.at_motor, rel=1e-3)
 
 
 def test_a_lag_is_told_from_the_gap():
     found = estimate_lost_motion(recording(lag=5e-3))
     assert found.ok
-    assert found.gap_motor == pytest.approx(0.05, abs=3e-4)
+    assert found.at_motor == pytest.approx(0.05, abs=3e-4)
     assert found.lag == pytest.approx(5e-3, rel=0.02)
 
 
@@ -54,6 +54,24 @@ def test_a_load_that_never_follows_is_a_bound():
     assert not math.isfinite(found.interval_motor[1])
 
 
+def test_a_load_that_hunts_follows_all_the_same():
+    # 3.3 samples a period: from sample to sample it moves as noise does.
+    time, motor = swings()
+    found = estimate_lost_motion(EncoderRecording(time, motor, 0.1 * play(motor, 2.0) + 0.15 * np.sin(950.0 * time)))
+    assert found.status is not GapStatus.LOWER_BOUND
+    resting = 0.3 + 1e-3 * np.random.default_rng(5).standard_normal(time.size)
+    assert estimate_lost_motion(EncoderRecording(time, motor, resting)).status is GapStatus.LOWER_BOUND
+
+
+def test_a_load_that_overshoots_at_every_reversal_shows_no_gap():
+    # All cycles agree on the least gap, 0: there is no spread to search within.
+    time, motor = swings()
+    load = 0.1 * motor + 0.01 * np.tanh(10.0 * np.gradient(motor, time))
+    found = estimate_lost_motion(EncoderRecording(time, motor, load))
+    assert math.isfinite(found.ratio)
+    assert found.status in (GapStatus.UNIDENTIFIABLE, GapStatus.MODEL_MISMATCH)
+
+
 @pytest.mark.parametrize("shift", [0.0, 0.7, 1.9, 3.1])
 def test_a_short_recording_gives_no_false_bound(shift):
     time = np.arange(0.0, 4.5, 0.002)
@@ -73,7 +91,7 @@ def test_a_swinging_load_is_no_gap():
         load[i] = state[0]
     found = estimate_lost_motion(EncoderRecording(time, motor, load))
     assert found.status is GapStatus.MODEL_MISMATCH
-    assert math.isnan(found.gap_motor)
+    assert math.isnan(found.at_motor)
 
 
 def test_each_reversal_shows_where_the_gap_is_worn():

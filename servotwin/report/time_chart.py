@@ -1,0 +1,177 @@
+"""Chart over time as SVG, made of text alone: where a page is made by a service that draws nothing else."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from html import escape
+from typing import NamedTuple
+
+BLUE, ORANGE, GREEN, RED = "#0072B2", "#B06F00", "#00664B", "#B34700"
+_WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 760.0, 300.0, 62.0, 12.0, 26.0, 46.0
+_STEPS_S = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21600, 43200, 86400, 172800, 604800, 2592000, 7776000)
+_DAY = 86400.0
+Values = Sequence[float | None]
+
+
+class ChartLine(NamedTuple):
+    """A line; None interrupts it. `dots`: points instead of a line; `dash`: as in SVG."""
+
+    name: str
+    color: str
+    values: Values
+    dots: bool = False
+    dash: str = ""
+
+
+class ChartMark(NamedTuple):
+    """A vertical line at a time, with a word."""
+
+    time: float
+    word: str
+    color: str = ORANGE
+
+
+@dataclass(frozen=True)
+class TimeChart:
+    """Values over time.
+
+    Attributes
+    ----------
+    label : str
+        Of the upright axis, with the unit.
+    time : sequence of float
+        s since the epoch, ascending.
+    lines : sequence of ChartLine
+    band : (sequence, sequence) or None
+        Low and high end of an interval.
+    marks : sequence of ChartMark
+    """
+
+    label: str
+    time: Sequence[float]
+    lines: Sequence[ChartLine]
+    band: tuple[Values, Values] | None = None
+    marks: Sequence[ChartMark] = ()
+
+    def svg(self) -> bytes:
+        """Draw it."""
+        x, y = self._scales()
+        head = (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" font-size="12" fill="none">'
+        )
+        parts = [*self._grid(x, y), *self._drawn_band(x, y), *self._drawn_marks(x)]
+        parts += [part for line in self.lines for part in self._drawn(line, x, y)]
+        return "".join(
+            [head, '<rect width="100%" height="100%" fill="#fff"/>', *parts, *self._legend(), "</svg>"]
+        ).encode()
+
+    def _scales(self) -> tuple[_Scale, _Scale]:
+        times = [*self.time, *(mark.time for mark in self.marks)] or [0.0]
+        values = [value for line in self.lines for value in line.values if value is not None] or [0.0]
+        top = max(values)
+        # An interval that is far wider than what is known would hide it.
+        if self.band is not None:
+            top = max([top, *(min(value, 2.0 * top) for value in self.band[1] if value is not None)])
+        low = min([0.0, *values])
+        x = _Scale(min(times), max(times), _LEFT, _WIDTH - _RIGHT)
+        return x, _Scale(low, low + 1.08 * (top - low), _HEIGHT - _BOTTOM, _TOP)
+
+    def _grid(self, x: _Scale, y: _Scale) -> Iterator[str]:
+        for value in _ticks(y.low, y.high):
+            place = y(value)
+            yield f'<path d="M{_LEFT:g} {place:.1f}H{_WIDTH - _RIGHT:g}" stroke="#DFE3E8"/>'
+            yield _text(f"{value:.6g}", _LEFT - 6, place + 4, "end")
+        for time in _time_ticks(x.low, x.high):
+            yield f'<path d="M{x(time):.1f} {_TOP:g}V{_HEIGHT - _BOTTOM:g}" stroke="#DFE3E8"/>'
+            yield _text(_time_text(time, x.high - x.low), x(time), _HEIGHT - _BOTTOM + 16, "middle")
+        begin = datetime.fromtimestamp(x.low, UTC).strftime("%Y-%m-%d %H:%M")
+        yield _text(f"Time, UTC (from {begin})", (_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 8, "middle")
+        middle = (_TOP + _HEIGHT - _BOTTOM) / 2
+        yield f'<g transform="translate(14 {middle:g}) rotate(-90)">{_text(self.label, 0, 0, "middle")}</g>'
+
+    def _drawn_band(self, x: _Scale, y: _Scale) -> Iterator[str]:
+        if self.band is None:
+            return
+        known = [
+            (time, low, min(high, y.high))
+            for time, low, high in zip(self.time, *self.band, strict=True)
+            if low is not None and high is not None
+        ]
+        if known:
+            there = [f"{x(time):.1f} {y(high):.1f}" for time, _, high in known]
+            back = [f"{x(time):.1f} {y(min(low, y.high)):.1f}" for time, low, _ in reversed(known)]
+            yield f'<path d="M{"L".join([*there, *back])}Z" fill="{BLUE}" fill-opacity="0.2"/>'
+
+    def _drawn_marks(self, x: _Scale) -> Iterator[str]:
+        free = -math.inf
+        for mark in sorted(self.marks):
+            place = x(mark.time)
+            yield f'<path d="M{place:.1f} {_TOP:g}V{_HEIGHT - _BOTTOM:g}" stroke="{mark.color}"/>'
+            if place > free:
+                inside = place + 8.0 * len(mark.word) < _WIDTH
+                where, anchor = (place + 3, "start") if inside else (place - 3, "end")
+                yield _text(mark.word, where, _TOP + 11, anchor, mark.color)
+                free = place + 8.0 * len(mark.word)
+
+    def _drawn(self, line: ChartLine, x: _Scale, y: _Scale) -> Iterator[str]:
+        known = [(time, value) for time, value in zip(self.time, line.values, strict=True) if value is not None]
+        if line.dots:
+            yield from (
+                f'<circle cx="{x(time):.1f}" cy="{y(value):.1f}" r="2.6" fill="{line.color}"/>' for time, value in known
+            )
+        elif known:
+            path = "L".join(f"{x(time):.1f} {y(value):.1f}" for time, value in known)
+            dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
+            yield f'<path d="M{path}" stroke="{line.color}" stroke-width="1.6"{dash}/>'
+
+    def _legend(self) -> Iterator[str]:
+        names = [(line.name, line.color) for line in self.lines if line.name]
+        names += [("95 % interval", "#99C7E0")] if self.band is not None else []
+        place = _LEFT
+        for name, color in names:
+            yield f'<path d="M{place:g} 11h14" stroke="{color}" stroke-width="4"/>'
+            yield _text(name, place + 19, 15, "start")
+            place += 34 + 7.0 * len(name)
+
+
+class _Scale(NamedTuple):
+    """Maps low to high to places on the screen."""
+
+    low: float
+    high: float
+    begin: float
+    end: float
+
+    def __call__(self, value: float) -> float:
+        spread = self.high - self.low
+        return self.begin + (self.end - self.begin) * ((value - self.low) / spread if spread else 0.5)
+
+
+def _ticks(low: float, high: float) -> list[float]:
+    spread = high - low
+    if not spread > 0.0:
+        return [low]
+    power = 10.0 ** math.floor(math.log10(spread / 5.0))
+    step = next(each * power for each in (1, 2, 5, 10) if each * power >= spread / 5.0 * (1.0 - 1e-9))
+    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
+    return [k * step for k in range(first, last + 1)]
+
+
+def _time_ticks(low: float, high: float) -> list[float]:
+    step = next((each for each in _STEPS_S if each >= (high - low) / 8.0), math.ceil((high - low) / 8.0))
+    return [float(k * step) for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+def _time_text(time: float, span: float) -> str:
+    form = (
+        "%Y-%m-%d" if span > 6.0 * _DAY else "%m-%d %H:%M" if span > _DAY else "%H:%M" if span > 600.0 else "%H:%M:%S"
+    )
+    return datetime.fromtimestamp(time, UTC).strftime(form)
+
+
+def _text(words: str, x: float, y: float, anchor: str, color: str = "#5B6570") -> str:
+    look = f'text-anchor="{anchor}" fill="{color}" font-family="system-ui, sans-serif"'
+    return f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(words)}</text>'
