@@ -29,8 +29,8 @@ def sample_range(window: WindowMessage, begin: float | None, end: float | None) 
     InvalidInput
         The part is empty.
     """
-    first = 0 if begin is None else max(0, int(begin * window.rate))
-    last = window.samples if end is None else min(window.samples, int(end * window.rate) + 2)
+    first = 0 if begin is None else max(0, int(min(begin * window.rate, window.samples)))
+    last = window.samples if end is None else min(window.samples, int(min(end * window.rate, window.samples)) + 2)
     if last - first < 2:
         raise InvalidInput(f"from, to: must hold 2 samples at least of the {window.samples / window.rate:g} s")
     return SampleRange(first, last)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import re
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Collection
+from contextlib import suppress
 from functools import partial
 
 import msgspec
@@ -16,6 +18,8 @@ from servotwin.store.overview import StorePosition
 from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.store_executor import StoreExecutor
+
+log = logging.getLogger(__name__)
 
 _TICK_S, _QUIET_S = 1.0, 15.0
 """s between two looks at the store; s without an event after which a comment shows that the connection lives."""
@@ -52,7 +56,6 @@ class FleetFeed:
         self._reader, self._executor, self._presence = reader, executor, presence
         self._limit, self._closed = limit, False
         self._queues: set[asyncio.Queue[bytes | None]] = set()
-        self._joined = asyncio.Event()
         self._positions: deque[StorePosition] = deque(maxlen=_TICKS_BACK if shared else 1)
         self._connected: frozenset[str] = frozenset()
         self._unreadable = False
@@ -84,12 +87,12 @@ class FleetFeed:
         """
         queue: asyncio.Queue[bytes | None] = asyncio.Queue()
         self._queues.add(queue)
-        self._joined.set()
         if self._closed:
             queue.put_nowait(None)
         try:
             yield b"retry: 2000\n\n"
             if after is not None:
+                await self._begin()  # before the changes are read: those that come meanwhile are the feed's to send
                 yield await self._since(after)
             while (event := await _next(queue)) is not None:
                 allowed()
@@ -102,31 +105,48 @@ class FleetFeed:
     async def run(self) -> None:
         """Look at the store once a second while there are watchers."""
         while True:
-            if not self._queues:
+            if self._queues:
+                self._send(await self._look())
+            else:
                 self._positions.clear()
-                self._joined.clear()
-                await self._joined.wait()
-            try:
-                event = await self._changes()
-            except StoreUnavailable:
-                event = b"" if self._unreadable else _event("trouble", None, "the twin cannot read its store now")
-                self._unreadable = True
-            if event:
-                self._send(event)
+                self._presence.refresh()  # for whoever reads the fleet without watching it
             await asyncio.sleep(_TICK_S)
+
+    async def _look(self) -> bytes:
+        """Event of one look; where it fails for whatever reason, watchers are told, and the next look repeats it."""
+        try:
+            return await self._changes()
+        except Exception as error:
+            first, self._unreadable = not self._unreadable, True
+            if not first:
+                return b""
+            if isinstance(error, StoreUnavailable):
+                return _event("trouble", None, "the twin cannot read its store now")
+            log.exception("the feed of the fleet failed")
+            return _event("trouble", None, "the twin cannot follow the fleet now")
+
+    async def _begin(self) -> None:
+        """Begin at the present position, unless the feed has one."""
+        if not self._positions:
+            with suppress(StoreUnavailable):
+                present = await self._executor.run(self._reader.position)
+                if not self._positions:
+                    self._positions.append(present)
 
     async def _changes(self) -> bytes:
         """Event with the rows that changed since the last look; empty: none did."""
-        before, self._connected = self._connected, self._presence.refresh()
+        connected, since = self._presence.refresh(), self._positions[0] if self._positions else None
+        if since is None:
+            since = await self._executor.run(self._reader.position)
+        found, position = await self._executor.run(partial(self._reader.changed, since, _MOST + 1))
+        names = {*found, *(self._connected ^ connected)}
+        event = await self._rows(names, position) if names or self._unreadable else b""
+        # Only now: what fails is repeated from the same place.
         if not self._positions:
-            self._positions.append(await self._executor.run(self._reader.position))
-            return b""
-        names, position = await self._executor.run(partial(self._reader.changed, self._positions[0], _MOST + 1))
+            self._positions.append(since)
         self._positions.append(position)
-        recovered, self._unreadable = self._unreadable, False
-        if not names and before == self._connected and not recovered:
-            return b""
-        return await self._rows({*names, *(before ^ self._connected)}, position)
+        self._connected, self._unreadable = connected, False
+        return event
 
     async def _since(self, after: StorePosition) -> bytes:
         """Event with the rows that changed after a position."""
@@ -142,6 +162,8 @@ class FleetFeed:
         return _event("rows", position, await self._executor.run(partial(self._reader.rows, names)))
 
     def _send(self, event: bytes) -> None:
+        if not event:
+            return
         for queue in tuple(self._queues):
             if queue.qsize() < _WAITING:
                 queue.put_nowait(event)

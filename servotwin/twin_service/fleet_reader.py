@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Iterable
 from typing import NamedTuple
 
@@ -53,7 +54,8 @@ class EdgePresence:
 
     def __call__(self, servo: str) -> bool | None:
         """True, False, or None where it cannot be known."""
-        return True if servo in self._seen else False if self._only_here else None
+        here = self._monotonic() - self._seen.get(servo, -math.inf) < _GRACE_S or servo in self._waiting()
+        return True if here else False if self._only_here else None
 
 
 class FleetReader:

@@ -220,6 +220,8 @@ class DashboardApi:
     async def _get_fleet(self, request: HttpRequest) -> HttpResponse:
         self._operators.check(request)
         after = request.argument("after") or ""
+        if after and not _NAME.match(after):
+            raise RequestRejected(Refusal.NOT_UNDERSTOOD, "after: give the name of a servo")
         page = await store_query(self._executor, partial(self._reader.page, after, limit_of(request)))
         return _fresh({"rows": page.rows, "position": page.position.text, "now": page.now})
 

@@ -145,6 +145,7 @@ class TwinService:
             )
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []
+        self._vital: list[asyncio.Task[None]] = []
         self._add_gauges()
 
     def http_app(self) -> HttpApp:
@@ -170,7 +171,7 @@ class TwinService:
             await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
-        self._spawn(self.feed.run())
+        self._spawn(self.feed.run(), vital=False)
         self._spawn(self.what_if.run())
         if self.webhook is not None:
             self._spawn(self.webhook.run())
@@ -218,9 +219,9 @@ class TwinService:
 
     @property
     def dispatching(self) -> bool:
-        """False where a task of the service has failed; only a restart begins it again."""
+        """False where a task without which no machine is served has failed; only a restart begins it again."""
         # A task that ended without an error did so because of the damage.
-        return not any(task.done() and not task.cancelled() and task.exception() for task in self._tasks)
+        return not any(task.done() and not task.cancelled() and task.exception() for task in self._vital)
 
     def _lagging(self, backlog: Backlog | None) -> list[str]:
         """The lag in a sentence, where it is above its limit."""
@@ -237,10 +238,12 @@ class TwinService:
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
         return await self.executor.run(lambda: self.store.outgoing(servo, after))
 
-    def _spawn(self, work: Coroutine[Any, Any, None]) -> None:
+    def _spawn(self, work: Coroutine[Any, Any, None], vital: bool = True) -> None:
         task = asyncio.create_task(work)
         task.add_done_callback(_log_failure)
         self._tasks.append(task)
+        if vital:
+            self._vital.append(task)
 
     async def _refresh_tokens(self) -> None:
         """Read the file of tokens again whenever it was replaced."""

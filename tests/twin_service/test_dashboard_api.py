@@ -10,8 +10,10 @@ from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, place, serve
 
 from servotwin.messages import encode
 from servotwin.store import overview
+from servotwin.store.engine import StoreUnavailable
 from servotwin.twin_service.auth import Verifiers
-from servotwin.twin_service.fleet_feed import position_of
+from servotwin.twin_service.fleet_feed import FleetFeed, position_of
+from servotwin.twin_service.fleet_reader import EdgePresence
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.sessions import COOKIE, SESSION_S
 
@@ -162,7 +164,6 @@ def test_events_tell_what_changed_and_resume_where_a_stream_broke(tmp_path):
         (event,), stream = await first_events(system.feed, 1, begun)
         assert event[b"event"] == b"rows"
         assert [row["servo"] for row in msgspec.json.decode(event[b"data"])] == ["ax-1"]
-        await asyncio.sleep(1.2)  # the feed has begun to look
         await asyncio.to_thread(say_hello, system.store, "ax-2", 5.0)
         async with asyncio.timeout(20.0):
             while not (part := await anext(stream)).startswith(b"id:"):
@@ -217,6 +218,52 @@ def test_a_slow_watcher_holds_nothing_up(tmp_path):
     with_service(tmp_path, body)
 
 
+def feed_of(system):
+    """A feed that looks only when it is told to."""
+    return FleetFeed(system._reader, system.executor, system._reader._presence, 2, False)
+
+
+@pytest.mark.parametrize("fault", [StoreUnavailable("locked"), ValueError("unforeseen")])
+def test_a_look_that_fails_is_told_and_repeated_from_the_same_place(tmp_path, monkeypatch, fault):
+    async def body(system, _client):
+        feed, rows = feed_of(system), system._reader.rows
+        await feed._changes()
+        await asyncio.to_thread(say_hello, system.store, "ax-2", 5.0)
+
+        def fail(_servos):
+            raise fault
+
+        monkeypatch.setattr(system._reader, "rows", fail)
+        assert b"event: trouble" in await feed._look()
+        assert await feed._look() == b""
+        monkeypatch.setattr(system._reader, "rows", rows)
+        assert b'"servo":"ax-2"' in await feed._look()
+        assert await feed._look() == b""
+
+    with_service(tmp_path, body)
+
+
+def test_the_first_look_tells_which_edges_came(tmp_path, monkeypatch):
+    async def body(system, _client):
+        await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
+        monkeypatch.setattr(system.polls, "_waiting", {"ax-1": {}})
+        assert b'"connected":true' in await feed_of(system)._changes()
+
+    with_service(tmp_path, body)
+
+
+def test_an_edge_counts_as_connected_until_it_is_silent():
+    waiting, now = ["a"], [0.0]
+    presence = EdgePresence(lambda: waiting, True, lambda: now[0])
+    assert (presence("a"), presence("b")) == (True, False)  # nobody has watched yet
+    presence.refresh()
+    waiting.clear()
+    now[0] = 4.0
+    assert presence("a") is True
+    now[0] = 6.0
+    assert presence("a") is False  # though nobody refreshed since
+
+
 def test_channels_of_a_window(tmp_path):
     async def body(_system, client):
         sent = window(3)
@@ -229,6 +276,8 @@ def test_channels_of_a_window(tmp_path):
             len((await client.get(url + "?from=0.05&to=0.06", headers=headers)).json()["channels"][0]["values"]) == 12
         )
         assert (await client.get(url + "?from=9", headers=headers)).status_code == 400
+        assert (await client.get(url + "?from=1e308", headers=headers)).status_code == 400
+        assert (await client.get(url + "?to=1e308", headers=headers)).status_code == 200
         assert (await client.get(url + "?from=nan", headers=headers)).status_code == 400
         text = (await client.get(url + ".csv", headers=headers)).text
         assert text.splitlines()[0] == "time_s,position_m,theta_m_rad"
@@ -254,6 +303,7 @@ def test_a_fleet_comes_in_pages(tmp_path):
             "ax-9": [],
         }
         assert (await client.get("/v1/fleet/histories?servos=a/b", headers=headers)).status_code == 400
+        assert (await client.get("/v1/fleet?after=a/b", headers=headers)).status_code == 400
 
     with_service(tmp_path, body)
 
