@@ -25,7 +25,7 @@ from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge.drive import DriveRefused
 from servotwin.edge.parameters import Parameters
-from servotwin.messages import AnyGains, Gains, Setting
+from servotwin.messages import AnyGains, Gains, LinearGains, Setting
 from servotwin.twin.settings import TwinSettings
 
 SCREW = st.Axis.preset("ball-screw")
@@ -140,7 +140,9 @@ def test_a_dead_zone_alone_needs_no_gains() -> None:
         (gains_of(CASCADE), ("Kp", "Ki", "Kd", "Tf", "Enter", "Leave"), "PositionGain, VelocityGain, IntegralTime"),
         (gains_of(CASCADE.replace(notch_hz=40.0)), OF_CASCADE, "NotchHz, NotchDamping, NotchDepth"),
         (gains_of(CASCADE.replace(velocity_feedforward=1.0)), OF_CASCADE, "VelocityFeedforward"),
-        (gains_of(LINEAR.replace(gain=0.5)), OF_CASCADE, "Gain"),
+        (gains_of(LINEAR.replace(gain=0.5)), OF_CASCADE, "Gain, IntegralShare"),
+        (LinearGains(), OF_CASCADE, "Gain, IntegralShare"),
+        (LinearGains(), ("Kp", "Ki", "Kd", "Tf", "Enter", "Leave"), "Gain, IntegralShare"),
         (Gains(1.0, 1.0, 0.0, 0.1), OF_CASCADE, "Kp, Ki, Kd, Tf"),
     ],
 )

@@ -12,7 +12,10 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
+from servotwin.estimation.output_error.estimator import _problem
+from servotwin.estimation.output_error.fit import search
 from servotwin.estimation.output_error.models import Priors, ShaftModel
+from servotwin.estimation.output_error.verdict import grown
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
@@ -157,6 +160,43 @@ def test_one_flank_gives_a_lower_bound() -> None:
     assert estimate.status is GapStatus.LOWER_BOUND, estimate.reasons
     assert 0.5 < estimate.gap <= 1.5
     assert math.isinf(estimate.interval[1])
+
+
+@pytest.mark.parametrize(("gap", "growth"), [(0.002, 1.0), (0.005, 1.0), (0.001, 0.2)])
+def test_a_bound_is_not_above_a_growing_gap_of_which_one_flank_is_touched(gap: float, growth: float) -> None:
+    """The other flank is left in the first samples only, which a delay may explain; bounds were up to twice the gap."""
+    time, p = np.arange(500) / 1000.0, TABLE.p
+    angle = np.round(3.0 * (1.0 - np.exp(-time / 0.08) * (1.0 + time / 0.08)) / 6e-5) * 6e-5
+    position = np.round(p * play(angle, gap * (1.0 + growth * time), -0.5 * gap) / 1e-7) * 1e-7
+    estimate = estimate_gap(Window(position, angle, sample_rate=1000.0), TABLE)
+    assert estimate.interval[0] <= gap * (1.0 + 0.5 * growth)
+
+
+def test_growth_within_a_window_with_rests_counts_for_the_whole_window() -> None:
+    """Samples of a rest are left out of the fit of a rigid screw, and the gap grows on in them."""
+    time = np.arange(4000) / 1000.0
+    swing = np.clip(np.abs(time - 2.0) - 1.0, 0.0, 1.0)
+    angle = np.round(np.sign(time - 2.0) * np.sin(2.0 * math.pi * swing) / 6e-5) * 6e-5
+    rough = 2e-5 * np.random.default_rng(0).normal(size=time.size)
+    position = np.round((TABLE.p * play(angle, 0.05) + rough) / 1e-7) * 1e-7
+    position = np.where((time > 1.0) & (time < 3.0), position[1000], position)
+    window = Window(position, angle, sample_rate=1000.0)
+    problem = _problem(window, angle, TABLE, OutputErrorSettings())
+    assert problem.position.size < 0.6 * window.samples
+    found = search(problem, 0.0)
+    rate = 1e-3 * 0.5 * TABLE.p * 0.05
+    assert grown(found, rate) == pytest.approx(rate * 4.0 / math.sqrt(12.0), rel=1e-3)
+
+
+def test_halves_that_differ_by_the_growth_that_is_told_are_no_mismatch() -> None:
+    time = np.arange(4000) / 1000.0
+    angle, gap = np.sin(6.0 * time), 0.05 * (1.0 + 0.02 * time)
+    position = TABLE.p * play(angle, gap) + 1e-8 * np.random.default_rng(0).normal(size=time.size)
+    window = Window(position, angle, sample_rate=1000.0)
+    assert estimate_gap(window, TABLE).status is GapStatus.MODEL_MISMATCH
+    told = estimate_gap(window, TABLE, settings=OutputErrorSettings(gap_rate=1e-3))
+    assert told.ok, told.reasons
+    assert told.interval[0] <= 0.052 <= told.interval[1]
 
 
 @pytest.mark.slow

@@ -33,13 +33,22 @@ def variable(name: str) -> str:
 
 
 def needed(gains: AnyGains) -> list[str]:
-    """Variables without which a drive cannot run on these gains: those without a default, and those that differ from
-    it; numbers of what is switched off are not needed."""
+    """Variables without which a drive cannot run on these gains: those without a default, those that tell the law from
+    others, and those that differ from their default; numbers of what is switched off are not needed."""
     fields = msgspec.structs.fields(type(gains))
-    different = [each.name for each in fields if each.required or getattr(gains, each.name) != each.default]
+    law = _LAW.get(type(gains), ())
+    different = [
+        each.name for each in fields if each.required or each.name in law or getattr(gains, each.name) != each.default
+    ]
     on = {name for name in different if name not in _BELONGS}
     return [variable(each.name) for each in fields if _BELONGS.get(each.name, each.name) in on]
 
+
+_LAW: dict[type, tuple[str, ...]] = {
+    CascadeGains: ("position_gain", "velocity_gain"),
+    LinearGains: ("gain", "integral_share"),
+}
+"""Gains that tell a law from others, and are needed whatever their values."""
 
 _BELONGS = {"velocity_time": "velocity_feedforward", "notch_damping": "notch_hz", "notch_depth": "notch_hz"}
 """Gains that mean nothing where another one is 0."""

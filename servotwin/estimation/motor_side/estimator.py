@@ -51,10 +51,14 @@ def check_reaction(plant: Plant) -> None:
     """
     needs = "the motor's encoder and the command do not show the gap"
     if isinstance(plant, Servo) or plant.play is not Play.FREE:
-        kind = "rigid" if plant.rigid else "held in the gap"
+        why = (
+            "rigid, so that in the model no load acts back on the motor, inside and outside of the gap alike"
+            if plant.rigid
+            else f"held in the gap, and method {METHOD!r} knows the reaction of a shaft that is free in the gap only"
+        )
         raise InvalidInput(
-            f"{needs}: the transmission is {kind}, so that in the model no load acts back on the motor inside or "
-            'outside of the gap alike; give the load\'s position, or describe the transmission as "free" in the gap'
+            f"{needs}: the transmission is {why}; "
+            'give the load\'s position, or describe the transmission as "free" in the gap'
         )
     if not np.any(plant.shaft().E):
         kind = type(plant.actuator).__name__

@@ -98,6 +98,11 @@ class MotorProblem:
         return float(np.ptp(self.position))
 
     @property
+    def duration(self) -> float:
+        """Of the window, s."""
+        return self.interval * self.position.size
+
+    @property
     def free(self) -> Flags:
         """(u,) unknowns that are fitted: no encoder shows where the load is."""
         return np.array([unknown.name not in _FIXED for unknown in self.model.unknowns])
@@ -109,10 +114,9 @@ class MotorProblem:
 
     def sizes(self) -> Array:
         """(u,) usual sizes of the unknowns."""
-        own = self.interval * self.position.size
         sizes = {
             "load": self.range,
-            "speed": self.range / own,
+            "speed": self.range / self.duration,
             "time": self.interval,
             "factor": 1.0,
             "damping": 1.0,
@@ -202,10 +206,6 @@ class MotorProblem:
                 each[own - 2 * n : own - n] = self.position[0] - side * (wide - off)
             tables.append(tried)
         return tables
-
-    def off_flank(self, values: Array, side: float, rate: float) -> float:
-        """Largest way (m or rad at the load) of the motor off the flank on a side, that of `on_one_flank`."""
-        return float(np.max(values[HALF] - side * (self.position - self.simulate(values, rate)[1])))
 
 
 @lru_cache(maxsize=64)

@@ -15,6 +15,7 @@ from servotwin.estimation.output_error.verdict import differing_halves, grown, u
 
 _BELIEVED = 60.0  # rise of the cost without the gap, or without the second flank, over the noise's variance
 _RIVAL = 30.0  # the same of another gap that explains the window as well
+_UNUSUAL = 3.3  # standard deviations of a friction or damping beforehand
 _DOUBT = 3.0  # interval over the computed one: friction is not as modelled
 _MISLED = 0.2  # of what the gap does not explain: error of the gap that a wrong model makes
 _ROUNDED = 0.5  # of a count: standard deviation of an error that does not average out
@@ -48,7 +49,7 @@ def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedGap:
     left = float(np.std(best.raw) / np.std(shut.raw))
     if reason := _unseen(found, shut, left, settings):
         return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=(reason,))
-    mismatches = unusual_numbers(found) + differing_halves(found)
+    mismatches = unusual_numbers(found) + _unusual_friction(found) + differing_halves(found, settings.gap_rate / unit)
     if mismatches:
         return JudgedGap(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     std = best.std(HALF, found.free)
@@ -64,7 +65,17 @@ def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedGap:
         known, limit = math.degrees(unit * math.hypot(_DOUBT * std, rivals)), math.degrees(unit * allowed)
         words = f"the gap is known to {known:.3g} deg only, and {limit:.3g} deg are allowed"
         return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=(words,))
-    return JudgedGap(GapStatus.OK, half, std, total)
+    return JudgedGap(GapStatus.OK, half, math.hypot(_DOUBT * std, rivals), total)
+
+
+def _unusual_friction(found: Search) -> tuple[str, ...]:
+    """List the frictions and dampings that would have to be far off: the motor's side tells them from a gap hardly."""
+    unknowns = zip(found.problem.model.unknowns, found.best.values.tolist(), strict=True)
+    return tuple(
+        f"the {unknown.name} would be {math.exp(value):.2g} times that of the model"
+        for unknown, value in unknowns
+        if unknown.unit == "damping" and abs(value) > _UNUSUAL * unknown.std
+    )
 
 
 def _shut(found: Search) -> Fit:
@@ -80,7 +91,7 @@ def _unseen(found: Search, shut: Fit, left: float, settings: MotorSideSettings) 
     best = found.best
     if (shut.cost - best.cost) / best.variance() < _BELIEVED:
         return "the motor feels no gap: friction, noise and counts hide it, or there is none"
-    if (one_flank(found)[0].cost - best.cost) / best.variance() < _BELIEVED:
+    if (one_flank(found).cost - best.cost) / best.variance() < _BELIEVED:
         return "one flank explains what the motor feels nearly as well as two"
     if left > settings.explained:
         return (

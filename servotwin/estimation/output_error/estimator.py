@@ -116,7 +116,7 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
     count = math.hypot(axis.p * at_motor, at_load)
     # Play does not depend on time: samples of a rest repeat one error, which the fit would take for many small ones.
     told = slice(None) if free else _moving(theta_m, window.position)
-    return Problem(model, axis.p * theta_m[told], window.position[told], interval, count)
+    return Problem(model, axis.p * theta_m[told], window.position[told], interval, count, window.duration)
 
 
 def _moving(theta_m: Array, position: Array) -> NDArray[np.bool_]:

@@ -74,7 +74,7 @@ class FitProblem(Protocol):
     """A window and a model of it: `Problem`, or the one of `servotwin.estimation.motor_side`.
 
     Its first unknown is the half gap at the load. `sizes` (u,) are usual sizes of the unknowns, `limits` (u,) their
-    largest ones, `misfit` (m,) is what the model leaves, `grid`, `on_one_flank` and `off_flank` are those of `Problem`.
+    largest ones, `misfit` (m,) is what the model leaves, `grid` and `on_one_flank` are those of `Problem`.
     """
 
     @property
@@ -88,6 +88,8 @@ class FitProblem(Protocol):
     @property
     def count(self) -> float: ...
     @property
+    def duration(self) -> float: ...
+    @property
     def range(self) -> float: ...
     @property
     def free(self) -> Flags: ...
@@ -96,7 +98,6 @@ class FitProblem(Protocol):
     def misfit(self, values: Array, rate: float = 0.0) -> Array: ...
     def grid(self, gap: float) -> list[list[Array]]: ...
     def on_one_flank(self, values: Array) -> list[list[Array]]: ...
-    def off_flank(self, values: Array, side: float, rate: float) -> float: ...
 
 
 def whitened_rows(
@@ -257,17 +258,16 @@ def _from_anew(problem: FitProblem, noise: Autoregression, free: Flags, gap: flo
     return fits
 
 
-def one_flank(found: Search) -> tuple[Fit, float]:
-    """The best fit of a window in which the motor touches one flank only, and the way off it (m or rad at the load).
+def one_flank(found: Search) -> Fit:
+    """The best fit of a window in which the motor touches one flank only.
 
     The gap is so wide that the other flank is out of reach, and fixed.
     """
     problem, free = found.problem, found.free.copy()
     free[HALF] = False
     best, rate = [], problem.model.slowing[1] * problem.model.speed
-    for side, tried in zip((-1.0, 1.0), problem.on_one_flank(found.best.values), strict=True):
+    for tried in problem.on_one_flank(found.best.values):
         costs = [_plain(problem, values, rate) for values in tried]
         start = tried[int(np.argmin(costs))]
-        best.append((descend(problem, start, found.noise, free, _SINGLE_STEPS, rate), side))
-    fit, side = min(best, key=lambda pair: pair[0].cost)
-    return fit, max(0.0, problem.off_flank(fit.values, side, rate))
+        best.append(descend(problem, start, found.noise, free, _SINGLE_STEPS, rate))
+    return min(best, key=lambda fit: fit.cost)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, RATIO, Flags, Motion, MotionModel
+from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel
 from servotwin.plant.signals import Array
 
 LARGEST = 4.0  # standard deviations by which an unknown may move
@@ -31,6 +31,8 @@ class Problem:
         s.
     count : float
         One count of either channel, seen at the load.
+    duration : float
+        s, of the window; samples of a rest may be left out.
     """
 
     model: MotionModel
@@ -38,6 +40,7 @@ class Problem:
     position: Array
     interval: float
     count: float
+    duration: float
 
     @property
     def lead(self) -> Array:
@@ -58,12 +61,17 @@ class Problem:
     def largest_delay(self) -> float:
         """s."""
         known = LARGEST * self.model.unknowns[DELAY].std
-        return min(known, _LARGEST_DELAY * self.interval * self.drive.size)
+        return min(known, _LARGEST_DELAY * self.duration)
 
     def sizes(self) -> Array:
         """(u,) usual sizes of the unknowns."""
-        own = self.interval * self.drive.size
-        sizes = {"load": self.range, "speed": self.range / own, "time": self.interval, "factor": 1.0, "damping": 1.0}
+        sizes = {
+            "load": self.range,
+            "speed": self.range / self.duration,
+            "time": self.interval,
+            "factor": 1.0,
+            "damping": 1.0,
+        }
         return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
 
     def limits(self) -> Array:
@@ -113,12 +121,6 @@ class Problem:
                 each[HALF], each[OFFSET] = wide, middle + place * self.range + side * wide
             tables.append(tried)
         return tables
-
-    def off_flank(self, values: Array, side: float, rate: float) -> float:
-        """Largest way (m or rad at the load) of the motor off the flank on a side, that of `on_one_flank`."""
-        driven = math.exp(values[RATIO]) * self.drive + values[OFFSET]
-        wide = math.exp(values[RATIO]) * values[HALF]
-        return float(np.max(wide - side * (driven - self.motion(values, rate).driven)))
 
 
 def delayed(drive: Array, samples: float) -> Array:

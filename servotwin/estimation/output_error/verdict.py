@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
+from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
 from servotwin.estimation.output_error.models import HALF
 from servotwin.estimation.output_error.settings import OutputErrorSettings
@@ -21,7 +22,7 @@ _APART = 4.0  # standard deviations between the halves of a window
 _UNEXPLAINED = 0.05  # of the position's variation
 _CHANCE = 2.0  # times the usual variance of an average of white noise
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
-_BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the way off a flank; smallest bound that says anything
+_BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0  # interval over the computed one
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in a window, of its length
@@ -56,13 +57,13 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFi
     std = settings.calibration * math.hypot(best.std(HALF, found.free), rounded(found))
     growth = grown(found, settings.gap_rate / unit)
     total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count, growth)
-    mismatches = _mismatches(found)
+    mismatches = _mismatches(found, settings.gap_rate / unit)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)
-    single, off = one_flank(found)
+    single = one_flank(found)
     rise = (single.cost - best.cost) / best.variance()
     if rise < _BELIEVED:
-        bound = _BOUND * off - 2.0 * float(np.std(single.raw)) - problem.count
+        bound = _BOUND * 2.0 * smallest_half(found, single) - problem.count
         enough = bound > _BOUND_COUNTS * problem.count
         words = "one flank explains the window nearly as well as two"
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
@@ -92,7 +93,7 @@ def _rival(found: Search, half: float, total: float, unit: float) -> str:
     return ""
 
 
-def _mismatches(found: Search) -> tuple[str, ...]:
+def _mismatches(found: Search, rate: float) -> tuple[str, ...]:
     """List the signs that the model is not that of the machine."""
     best, problem = found.best, found.problem
     sentences = []
@@ -101,7 +102,7 @@ def _mismatches(found: Search) -> tuple[str, ...]:
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
     sentences += unusual_numbers(found)
-    sentences += differing_halves(found)
+    sentences += differing_halves(found, rate)
     return tuple(sentences)
 
 
@@ -119,10 +120,10 @@ def unusual_numbers(found: Search) -> tuple[str, ...]:
     return tuple(sentences)
 
 
-def differing_halves(found: Search) -> tuple[str, ...]:
-    """Sentence for a window whose halves show different gaps."""
+def differing_halves(found: Search, rate: float) -> tuple[str, ...]:
+    """Sentence for a window whose halves differ by more than a growth at a `rate` (1/s, of the half gap) explains."""
     difference, spread = between_halves(found)
-    apart = abs(difference) / spread
+    apart = abs(difference) / math.hypot(spread, 0.5 * rate * found.problem.duration)
     return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > _APART else ()
 
 
@@ -187,9 +188,8 @@ def grown(found: Search, rate: float) -> float:
     The growth within the window is as likely as a `rate` (1/s, of the half gap) says, or what the halves of the window
     show of it, whichever is less: the rate may be a mere assumption.
     """
-    duration = found.problem.interval * found.problem.position.size
     apart, spread = between_halves(found)
-    return _EVENLY * min(rate * duration, 2.0 * math.hypot(apart, _DOUBT * spread))
+    return _EVENLY * min(rate * found.problem.duration, 2.0 * math.hypot(apart, _DOUBT * spread))
 
 
 def _deg(angle: float) -> str:
