@@ -60,7 +60,8 @@ def _of_axis(known: MachineFacts, file: str) -> MachineFacts:
     try:
         table = tomllib.loads(file)
         kind, rotary, transmission = table["actuator"]["kind"], table["load"]["kind"] == "rotary", table["transmission"]
-        travel, ratio = _number(transmission.get("pitch_m_per_rad")), _number(transmission.get("ratio"))
+        stated = (_number(transmission.get(name)) for name in ("pitch_m_per_rad", "travel_rad_per_rad"))
+        travel, ratio = next(filter(None, stated), None), _number(transmission.get("ratio"))
     except (tomllib.TOMLDecodeError, KeyError, TypeError, AttributeError):
         return known
     return replace(

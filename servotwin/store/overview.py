@@ -160,17 +160,28 @@ def _last_windows() -> sa.Select[Any]:
 
 _NEWEST_OF = {kind: _newest_of(kind) for kind in (*_NEWEST, *_VERSIONED)}
 _LAST_WINDOWS = _last_windows()
-_ALARMS = (
-    sa.select(*_COLUMNS, evidence.c.servo)
-    .where(
-        evidence.c.servo.in_(_SERVOS),
-        evidence.c.kind == "alarm",
-        evidence.c.version.is_(None),
-        evidence.c.created >= sa.bindparam("_since", type_=sa.Double),
+_ALARMS_OF_A_SERVO = 50
+"""Newest alarms of a servo that are read: a noisy one hides no other's."""
+
+
+def _alarms() -> sa.Select[Any]:
+    """Query of the newest alarms of each servo, newest first."""
+    rank = sa.func.row_number().over(partition_by=evidence.c.servo, order_by=evidence.c.id.desc())
+    ranked = (
+        sa.select(evidence.c.id, rank.label("rank"))
+        .where(
+            evidence.c.servo.in_(_SERVOS),
+            evidence.c.kind == "alarm",
+            evidence.c.version.is_(None),
+            evidence.c.created >= sa.bindparam("_since", type_=sa.Double),
+        )
+        .subquery()
     )
-    .order_by(evidence.c.id.desc())
-    .limit(1000)
-)
+    newest = sa.select(ranked.c.id).where(ranked.c.rank <= _ALARMS_OF_A_SERVO)
+    return sa.select(*_COLUMNS, evidence.c.servo).where(evidence.c.id.in_(newest)).order_by(evidence.c.id.desc())
+
+
+_ALARMS = _alarms()
 
 
 def names_after(connection: sa.Connection, after: str, limit: int) -> Sequence[str]:

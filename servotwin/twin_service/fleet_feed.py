@@ -184,7 +184,7 @@ async def _next(queue: asyncio.Queue[bytes | None]) -> bytes | None:
         async with asyncio.timeout(_QUIET_S):
             return await queue.get()
     except TimeoutError:
-        return b": still there\n\n"
+        return b"event: alive\ndata: {}\n\n"
 
 
 def _event(kind: str, position: StorePosition | None, data: object) -> bytes:

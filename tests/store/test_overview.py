@@ -53,6 +53,15 @@ def test_old_alarms_are_left_out(filled):
     assert facts(filled, ["a"], since=301.0)["a"].alarms == ()
 
 
+def test_a_noisy_servo_s_alarms_hide_no_other_s(filled):
+    (lease,) = claim(filled, servo="b")
+    many = [EvidenceRecord("alarm", lease.messages[0].id, b"", status=f"loud {number}") for number in range(1100)]
+    filled.commit([outcome(lease, *many)], 400.0)
+    found = facts(filled, ["a", "b"])
+    assert [alarm.status for alarm in found["a"].alarms] == ["loose"]
+    assert found["b"].alarms[0].status == "loud 1099"
+
+
 def test_changes_are_those_after_a_position(filled):
     position = filled.reading(overview.position)
     since = lambda at: sorted(filled.reading(lambda c: overview.changed(c, at, 10)))  # noqa: E731

@@ -151,7 +151,7 @@ async def first_events(feed, count, after=None, allowed=lambda: None):
     async with asyncio.timeout(20.0):
         while len(found) < count:
             part = await anext(stream)
-            if part.startswith((b"id:", b"event:")):
+            if part.startswith((b"id:", b"event:")) and not part.startswith(b"event: alive"):
                 found.append(dict(line.split(b": ", 1) for line in part.strip().split(b"\n")))
     return found, stream
 

@@ -2,7 +2,9 @@
 
 import * as api from "./api.js";
 import { element, setText, svg } from "./dom.js";
-import { ago, brief, DEG, gapText, limitInterval, limitText, linkOf, rateText, rateUnit, statusText, travelText } from "./format.js";
+import { ago, brief, DEG, limitInterval, limitText, linkOf, rateText, rateUnit, rowGapText, statusText, travelText } from "./format.js";
+
+const earliest = (row) => row.until_limit_interval?.[0] ?? row.until_limit;
 
 const OVERSCAN = 6, HISTORIES = 48, AGES_MS = 5000;
 const WIDTH = 120, HEIGHT = 32;
@@ -23,7 +25,7 @@ const COLUMNS = [
 const FILTERS = [
   ["all", "all", () => true],
   ["alarms", "with alarms", (row) => row.alarms.length > 0],
-  ["limit", "at the limit within 7 days", (row) => row.until_limit !== null && row.until_limit < 7 * 86400],
+  ["limit", "at the limit within 7 days", (row) => (earliest(row) ?? Infinity) < 7 * 86400],
   ["silent", "silent", (row, now) => linkOf(row, now).kind === "bad"],
   ["unknown", "without a gap", (row) => row.gap === null],
 ];
@@ -218,7 +220,7 @@ export class FleetPage {
   fill(cells, row) {
     const now = this.live.now(), link = linkOf(row, now);
     setText(cells.servo.lastChild, row.gap === null && !row.status ? "no estimate yet" : statusText(row.status));
-    pair(cells.gap, gapText(row.gap, row.interval), travelText(row.gap, row));
+    pair(cells.gap, rowGapText(row), travelText(row.gap, row));
     pair(cells.rate, rateText(row.rate, row.rate_interval, this.unit), row.rate === null ? "no trend yet" : "");
     pair(cells.limit, limitText(row), limitInterval(row));
     pair(cells.version, String(none(row.version_in_force, "–")), row.version_sent !== null && row.version_sent !== row.version_in_force ? `${row.version_sent} sent` : "");

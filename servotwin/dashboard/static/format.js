@@ -22,11 +22,22 @@ export function gapText(gap, interval, scale = DEG) {
   if (gap === null) return UNKNOWN;
   if (!interval || interval[0] === null) return brief(gap * scale);
   if (interval[1] === null) return `≥ ${brief(interval[0] * scale)}`;
-  const half = ((interval[1] - interval[0]) / 2) * scale;
+  const [low, high] = interval.map((end) => end * scale);
+  const half = (high - low) / 2;
   if (!(half > 0)) return brief(gap * scale);
   const decimals = decimalsFor(half);
+  // An interval that ends at zero, or lies otherwise on one side, is not "plus or minus".
+  if (Math.abs((high + low) / 2 - gap * scale) > 0.05 * half) return low > 0 ? `${fixed(low, decimals)} to ${fixed(high, decimals)}` : `≤ ${fixed(high, decimals)}`;
   return `${fixed(gap * scale, decimals)} ± ${fixed(half, decimals)}`;
 }
+
+// The gap in a row of the fleet: in brackets where the estimate was not accepted.
+export function rowGapText(row) {
+  const text = gapText(row.gap, row.interval);
+  return row.gap === null || ACCEPTED.includes(row.status) ? text : `(${text})`;
+}
+
+const ACCEPTED = ["ok", "nothing moved", "lower bound", ""];
 
 // The store's word for a window that told nothing new is "nothing moved".
 export const statusText = (status) => ({ ok: "estimate accepted", "nothing moved": "unchanged", "": "no estimate yet" })[status] ?? status;
@@ -34,8 +45,10 @@ export const statusText = (status) => ({ ok: "estimate accepted", "nothing moved
 // The gap as travel of the load: micrometres or degrees.
 export function travelText(gap, row) {
   if (gap === null || !row.travel) return "";
-  const travel = gap * row.travel;
-  return row.travel_unit === "rad" ? `${brief(travel * DEG)} deg at the load` : `${brief(travel * 1e6)} µm of travel`;
+  const bound = row.interval && row.interval[0] !== null && row.interval[1] === null;
+  const travel = (bound ? row.interval[0] : gap) * row.travel;
+  const text = row.travel_unit === "rad" ? `${brief(travel * DEG)} deg at the load` : `${brief(travel * 1e6)} µm of travel`;
+  return bound ? `≥ ${text}` : text;
 }
 
 // Unit in which positions of a machine are shown, and its factor.
@@ -72,12 +85,13 @@ export const ago = (time, now) => (time === null ? "never" : `${duration(Math.ma
 export function limitText(row) {
   if (row.gap_limit === null) return "no limit";
   if (row.until_limit === 0) return "reached";
+  if (row.until_limit === null && row.until_limit_interval) return "uncertain";
   if (row.until_limit === null) return row.rate === null ? UNKNOWN : "not growing";
   return duration(row.until_limit);
 }
 
 export function limitInterval(row) {
-  if (!row.until_limit_interval || !row.until_limit) return "";
+  if (!row.until_limit_interval || row.until_limit === 0) return "";
   const [early, late] = row.until_limit_interval;
   return late === null ? `at the earliest in ${duration(early)}` : `${duration(early)} to ${duration(late)}`;
 }

@@ -2,6 +2,7 @@
 
 import * as api from "./api.js";
 
+const SILENT_MS = 40000; // the twin sends a sign of life every 15 s
 const RETRY_MS = [1000, 2000, 4000, 8000, 15000];
 
 export class Live {
@@ -40,6 +41,8 @@ export class Live {
   follow() {
     const source = new EventSource(`/v1/fleet/events?after=${this.position}`);
     this.source = source;
+    this.heard();
+    for (const name of ["open", "rows", "alive", "trouble"]) source.addEventListener(name, () => this.heard());
     source.addEventListener("open", () => {
       this.failures = 0;
       this.set("live");
@@ -50,6 +53,12 @@ export class Live {
     source.addEventListener("trouble", (event) => this.set("trouble", read(event) || "The twin reports trouble."));
     source.addEventListener("ended", () => this.end("The session has ended, or its token was revoked."));
     source.addEventListener("error", () => this.lost());
+  }
+
+  // A twin that hangs, and a network that is gone, end no connection.
+  heard() {
+    clearTimeout(this.silence);
+    this.silence = setTimeout(() => this.retry("The twin has not been heard for 40 s."), SILENT_MS);
   }
 
   take(event) {
@@ -93,6 +102,7 @@ export class Live {
 
   stop() {
     clearTimeout(this.timer);
+    clearTimeout(this.silence);
     this.source?.close();
   }
 

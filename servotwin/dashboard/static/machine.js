@@ -4,7 +4,7 @@
 import * as api from "./api.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
-import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, smallUnit, stamp, statusText, travelText } from "./format.js";
+import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
 import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
@@ -150,7 +150,7 @@ export class MachinePage {
     setText(this.blank, unknown ? "The twin knows no machine of this name." : none);
     if (!row) return;
     const unit = rateUnit([row.rate]), link = linkOf(row, now);
-    this.tile("gap", gapText(row.gap, row.interval), [statusText(row.status), travelText(row.gap, row)]);
+    this.tile("gap", rowGapText(row), [statusText(row.status), travelText(row.gap, row)]);
     this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time, 95 %"]);
     this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
     this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? row.receipt : ""]);
@@ -209,7 +209,7 @@ export class MachinePage {
     this.residualPlot.options.yLabel = `Residual, rms (${residual[0]})`;
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
     this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
-    this.proof.replaceChildren(simulated(this.updates));
+    this.proof.replaceChildren(simulated(this.updates, unit));
     this.events.replaceChildren(eventList(this.happened));
     await this.chooseWindows();
   }

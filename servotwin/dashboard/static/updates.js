@@ -66,7 +66,7 @@ function effectText(effect, unit) {
 }
 
 // The simulated runs behind the last update, and what was not tried.
-export function simulated(traces) {
+export function simulated(traces, unit) {
   const trace = traces.find((each) => each.steps.length);
   if (!trace) return element("p", { class: "soft" }, "No update was sent.");
   const { update } = trace.steps.at(-1), { verification } = update.body ?? {};
@@ -77,7 +77,7 @@ export function simulated(traces) {
   const tried = [
     `${verification.members} machines, drawn at random from what is stated and learnt, were simulated with this setting; ${percent(verification.settled)} of them settled.`,
     verification.confidence ? `Of such machines at least ${percent(verification.settled_least)} settle, at a confidence of ${percent(verification.confidence)}.` : null,
-    `Largest overshoot ${percent(verification.overshoot)} of the step, largest error at the end ${brief(verification.tail * 1e6)} µm.`,
+    `Largest overshoot ${percent(verification.overshoot)} of the step, largest error at the end ${brief(verification.tail * unit.factor)} ${unit.name}.`,
     verification.Ms_worst ? `Peak of the sensitivity ${brief(verification.Ms)} on the model, ${brief(verification.Ms_worst)} on the worst plant; least phase margin ${brief(verification.phase_margin_worst * DEG)} deg.` : null,
     `${verification.looked_at} settings were simulated until this one was chosen.`,
     verification.saturated ? "A machine reached the limit of the command." : "No machine reached the limit of the command.",
