@@ -11,9 +11,9 @@ from benchmarks import (
     certificates,
     compensation,
     endurance,
-    faults,
     friction_feedforward,
     glances,
+    hostile_command,
     overload,
     tick,
 )
@@ -46,10 +46,12 @@ class QualityBenchmark(NamedTuple):
 
 ALONE: Mapping[str, QualityBenchmark] = {
     accuracy.NAME: QualityBenchmark(accuracy.accuracy, QUICK_SIZE, 1.0),
-    endurance.NAME: QualityBenchmark(endurance.endurance, endurance.QUICK, endurance.MACHINES),
+    hostile_command.NAME: QualityBenchmark(
+        hostile_command.hostile_twins, hostile_command.QUICK, hostile_command.MACHINES
+    ),
     whole.NAME: QualityBenchmark(whole.fleet, QUICK, FleetScale()),
     overload.NAME: QualityBenchmark(overload.overload, overload.QUICK, overload.SMALL),
-    faults.NAME: QualityBenchmark(faults.endure, faults.QUICK, faults.MINUTES),
+    endurance.NAME: QualityBenchmark(endurance.endure, endurance.QUICK, endurance.MINUTES),
     glances.NAME: QualityBenchmark(glances.triage, glances.QUICK, glances.GAPS),
     side_by_side.NAME: QualityBenchmark(side_by_side.policies, side_by_side.QUICK, side_by_side.MACHINES),
     in_the_loop.NAME: QualityBenchmark(in_the_loop.loops, in_the_loop.QUICK, in_the_loop.MACHINES),
@@ -65,7 +67,7 @@ ALONE: Mapping[str, QualityBenchmark] = {
 
 FULL: Mapping[str, Any] = {whole.NAME: FleetScale().full(), overload.NAME: overload.OverloadScale()}
 """Scale of the full length, for benchmarks that have one."""
-SEEDED = (from_windows.NAME, in_the_loop.NAME, certificates.NAME, faults.NAME)
+SEEDED = (from_windows.NAME, in_the_loop.NAME, certificates.NAME, endurance.NAME)
 """Benchmarks whose machines follow a seed that can be chosen."""
 
 
@@ -94,8 +96,8 @@ def run_alone(
         raise InvalidInput(f"--full: only bench {' or '.join(FULL)} takes it, and not with --quick")
     if seed is not None and not (len(names) == 1 and names[0] in SEEDED):
         raise InvalidInput(f"--seed: only bench {', '.join(SEEDED[:-1])} or {SEEDED[-1]} takes it")
-    if minutes is not None and list(names) != [faults.NAME]:
-        raise InvalidInput(f"--minutes: only bench {faults.NAME} takes it")
+    if minutes is not None and list(names) != [endurance.NAME]:
+        raise InvalidInput(f"--minutes: only bench {endurance.NAME} takes it")
     if name is None:
         return False
     if len(names) > 1 or others:

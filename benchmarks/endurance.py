@@ -1,117 +1,297 @@
-"""`servotwin bench hostile`: measure that the loop stays in its certified band with hostile twins."""
+"""`servotwin bench endurance`: twin, machines and edges as processes under random faults; nothing may get lost.
+
+Faults: kills of the twin, of its worker, of an edge and of its link process; a disk that is full for some seconds, for
+the twin or for an edge; a damaged page in an edge's outbox; a twin or an edge that starts on a clock 90 days off.
+"""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
+import os
+import resource
+import signal
+import socket
+import sqlite3
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import closing, suppress
 from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
 
 from rich.console import Console
-from rich.progress import track
 from rich.table import Table
 
-from benchmarks import hostile, report
-from benchmarks.hostile import HostileOutcome
-from benchmarks.hostiletwin import TwinFault
-from servotwin.analysis.maps.pool import shared, workplace
+from benchmarks import report
+from benchmarks.endurance_site import SERVOS, Member, Site, Witness, ask
+from benchmarks.fleet.processes import check_system, children, used
 
-SCHEMA = "servotwin-bench-hostile/1"
-NAME = "hostile"
-MACHINES, QUICK = 200, 8
-FRICTION_SHARE = 5  # for so many machines one more, with friction
-FRICTION = "any, and friction"
-HEADS = ("twin", "machines", "worst, bands", "outside", "updates applied", "fell back")
-
-EnduranceTask = tuple[int, TwinFault, bool]
-"""Seed, fault of the twin, and friction."""
+SCHEMA, NAME = "servotwin-bench-endurance/1", "endurance"
+QUICK, MINUTES = 0.5, 10.0
+_FAULTS_S = (4.0, 12.0)
+"""s between two faults, at least and at most."""
+_DISK_S, _START_S, _END_S = 5.0, 120.0, 120.0
+_CLOCKS_DAYS = (-90, 0, 90)
+_YEAR_WINDOWS = 365.25 * 86400.0 / 20.0
+"""Windows of a servo that sends one every 20 s, in a year."""
 
 
-def endurance(
-    date: str = "",
-    output: Path | None = None,
-    count: int = MACHINES,
-    kinds: Sequence[TwinFault] = hostile.KINDS,
-    console: Console | None = None,
-) -> tuple[HostileOutcome, ...]:
-    """Let machines endure their twins, print the outcomes, and write JSON on request.
+class EnduranceOutcome(NamedTuple):
+    """Figures of a run.
 
-    Parameters
+    Attributes
     ----------
-    date : str
-        Written into the JSON.
-    output : Path, optional
-        File to write, suffix .json.
-    count : int
-        Machines within the stated range; the kinds of twins take turns. A fifth as many more have friction.
-    kinds : sequence of TwinFault
-    console : Console, optional
+    seconds : float
+    faults : dict of str to int
+    starts, ended_alone : int
+        Starts of edges, and those that ended without a fault.
+    boots, stored : int
+        Boots of edges from which windows are stored, and those windows.
+    lost_acknowledged, holes, unseen, counted, waiting : int
+        Windows that an edge has held as acknowledged and the store lacks; numbers that are missing within a boot; more
+        windows that a boot's last status before a fault names as cut than are stored or waiting, also at its end; those
+        that the edges themselves count as dropped; windows left in the outboxes.
+    applied : int
+        Updates that edges applied.
+    bytes_per_window, outbox_bytes : float
+        The store's size per window; of the largest outbox.
+    memory : dict of str to (int, int)
+        Largest resident bytes of each kind of process in the first and in the last third of the time.
+    """
+
+    seconds: float
+    faults: dict[str, int]
+    starts: int
+    ended_alone: int
+    boots: int
+    stored: int
+    lost_acknowledged: int
+    holes: int
+    unseen: int
+    counted: int
+    waiting: int
+    applied: int
+    bytes_per_window: float
+    outbox_bytes: int
+    memory: dict[str, tuple[int, int]]
+
+
+class Faults:
+    """Random faults, one at a time."""
+
+    def __init__(self, site: Site, seed: int) -> None:
+        self._site, self._random = site, Random(seed)
+        self.counts: Counter[str] = Counter()
+        self._deck: list[tuple[str, Callable[[], None]]] = []
+
+    def strike(self) -> None:
+        """Deal the next fault; all come before one comes again."""
+        if not self._deck:
+            self._deck = [
+                ("twin killed", self._kill_twin), ("worker killed", self._kill_worker),
+                ("edge killed", self._kill_edge), ("link process killed", self._kill_link),
+                ("twin's disk full", self._fill_twin),
+                ("edge's disk full", self._fill_edge), ("page of an outbox damaged", self._damage),
+                ("twin's clock", self._step_twin), ("edge's clock", self._step_edge),
+            ]  # fmt: skip
+            self._random.shuffle(self._deck)
+        name, act = self._deck.pop()
+        act()
+        self.counts[name] += 1
+
+    def _edge(self) -> tuple[str, Member]:
+        return self._random.choice(list(self._site.edges.items()))
+
+    def _clock(self) -> float:
+        return 86400.0 * self._random.choice(_CLOCKS_DAYS)
+
+    def _again(self, member: Member, clock_s: float = 0.0) -> None:
+        member.kill()
+        time.sleep(self._random.uniform(0.0, 1.5))
+        member.start(clock_s)
+
+    def _kill_twin(self) -> None:
+        self._again(self._site.twin)
+
+    def _kill_worker(self) -> None:
+        for pid in children(self._site.twin.pid)[:1]:
+            os.kill(pid, signal.SIGKILL)
+
+    def _kill_edge(self) -> None:
+        self._again(self._edge()[1])
+
+    def _kill_link(self) -> None:
+        for pid in children(self._edge()[1].pid)[:1]:
+            os.kill(pid, signal.SIGKILL)
+
+    def _fill_twin(self) -> None:
+        _full_disk([self._site.twin.pid])
+
+    def _fill_edge(self) -> None:
+        _full_disk(children(self._edge()[1].pid))
+
+    def _step_twin(self) -> None:
+        self._again(self._site.twin, self._clock())
+
+    def _step_edge(self) -> None:
+        self._again(self._edge()[1], self._clock())
+
+    def _damage(self) -> None:
+        """Overwrite a page while the edge is dead; the log of its file is merged before, as a stop would do."""
+        servo, member = self._edge()
+        member.kill()
+        file = self._site.outbox(servo)
+        with closing(sqlite3.connect(file)) as database:
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        pages = file.stat().st_size // 4096
+        with file.open("r+b") as open_file:
+            open_file.seek(4096 * self._random.randrange(1, max(2, pages)))
+            open_file.write(self._random.randbytes(4096))
+        member.start()
+
+
+def _full_disk(pids: list[int]) -> None:
+    """No file of these processes may be written for some seconds: EFBIG in place of ENOSPC."""
+    for pid in filter(None, pids):
+        with suppress(ProcessLookupError):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (0, resource.RLIM_INFINITY))
+    time.sleep(_DISK_S)
+    for pid in filter(None, pids):
+        with suppress(ProcessLookupError):
+            resource.prlimit(pid, resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+
+
+def endure(
+    date: str = "", output: Path | None = None, minutes: float = MINUTES, seed: int = 1, console: Console | None = None
+) -> EnduranceOutcome:
+    """Run a site under faults, print the table, and write JSON on request.
 
     Raises
     ------
     InvalidInput
-        An output that cannot be written.
+        The output cannot be written, or the system has no /proc.
     """
     console = console or Console()
     report.check(output)
-    tasks = [(seed, kinds[seed % len(kinds)], False) for seed in range(count)]
-    tasks += [(seed, kinds[seed % len(kinds)], True) for seed in range(count // FRICTION_SHARE)]
-    with workplace(), warnings.catch_warnings():
-        # A process whose caches have grown is replaced by another; its jobs are not lost.
-        warnings.filterwarnings("ignore", "A worker stopped while some jobs were given", UserWarning)
-        running = track(shared(endured, tasks), "enduring", len(tasks), console=console, transient=True)
-        result = dict(running)
-    outcomes = tuple(result[task] for task in tasks)
-    console.print(shown(outcomes))
-    console.print(verdict(outcomes), highlight=False)
-    report.write(output, dumps(outcomes, date), console)
-    return outcomes
+    check_system()
+    with TemporaryDirectory(prefix="endure-") as name, console.status(f"{minutes:g} minutes of faults"):
+        outcome = _outcome(Site(Path(name), _free_port(), minutes), minutes, seed)
+    console.print(shown(outcome))
+    report.write(output, report.text(SCHEMA, date, minutes=minutes, seed=seed, outcome=outcome._asdict()), console)
+    return outcome
 
 
-def endured(task: EnduranceTask) -> HostileOutcome:
-    """Run one machine with its twin."""
-    seed, kind, friction = task
-    return hostile.endured(seed, kind, friction=friction)
+def _outcome(site: Site, minutes: float, seed: int) -> EnduranceOutcome:
+    faults, random, witness = Faults(site, seed), Random(seed), Witness(site)
+    samples: list[tuple[float, dict[str, int]]] = []
+    with site.running():
+        _until(site.begun, _START_S)
+        begin = time.monotonic()
+        while (now := time.monotonic() - begin) < 60.0 * minutes:
+            samples.append((now, _memory(site)))
+            time.sleep(random.uniform(*_FAULTS_S))
+            witness.look()
+            faults.strike()
+        for machine in site.machines.values():
+            machine.kill()
+        if not site.twin.pid:
+            site.twin.start()
+        _until(lambda: not site.waiting(), _END_S)
+        witness.look()
+        for member in (*site.edges.values(), site.twin):
+            member.end()
+        return _figures(site, witness, faults.counts, samples)
 
 
-def verdict(outcomes: Sequence[HostileOutcome]) -> str:
-    """Sum up all outcomes in one sentence."""
-    stated = [outcome for outcome in outcomes if not outcome.case.friction]
-    band, inside = hostile.band(), sum(outcome.worst <= 1.0 for outcome in stated)
-    limit = f"{band.error * 1e3:.3f} mm from {band.settling:g} s after each step on"
-    return f"{inside} of {len(stated)} machines as stated stay within {limit}."
+def _figures(
+    site: Site,
+    witness: Witness,
+    faults: Mapping[str, int],
+    samples: list[tuple[float, dict[str, int]]],
+) -> EnduranceOutcome:
+    stored, waiting, boots = site.stored(), site.waiting(), dict[tuple[str, str], list[int]]()
+    for servo, boot, sequence in stored:
+        boots.setdefault((servo, boot), []).append(sequence)
+    counts = "SELECT number FROM counts WHERE what LIKE 'dropped: %'"
+    unseen = {each: cut - len(boots.get(each, ())) - waiting.get(each, 0) for each, cut in witness.cut.items()}
+    applied = "SELECT count(*) FROM evidence WHERE kind = 'receipt' AND status = 'applied'"
+    seconds = samples[-1][0]
+    return EnduranceOutcome(
+        seconds=seconds,
+        faults=dict(faults),
+        starts=sum(edge.starts for edge in site.edges.values()),
+        ended_alone=sum(edge.ended_alone for edge in site.edges.values()),
+        boots=len(boots),
+        stored=len(stored),
+        lost_acknowledged=len(witness.acknowledged - stored),
+        holes=sum(max(numbers) + 1 - len(numbers) for numbers in boots.values()),
+        unseen=sum(max(0, number) for number in unseen.values()),
+        counted=sum(number for servo in site.edges for (number,) in ask(site.outbox(servo), counts)),
+        waiting=sum(waiting.values()),
+        applied=ask(site.folder / "twin.db", applied)[0][0],
+        bytes_per_window=(site.folder / "twin.db").stat().st_size / max(1, len(stored)),
+        outbox_bytes=max(site.outbox(servo).stat().st_size for servo in site.edges),
+        memory={
+            kind: (
+                max(sample[kind] for at, sample in samples if at <= seconds / 3.0),
+                max(sample[kind] for at, sample in samples if at >= seconds * 2.0 / 3.0),
+            )
+            for kind in samples[0][1]
+        },
+    )
 
 
-def shown(outcomes: Sequence[HostileOutcome]) -> Table:
-    """A row for each kind of twin, and one for machines with friction."""
-    result = Table(title="hostile: what the edge endures", title_justify="left", box=None, pad_edge=False)
-    for head in HEADS:
-        result.add_column(head, justify="left" if head == HEADS[0] else "right")
-    for row in dict.fromkeys(map(_row, outcomes)):
-        some = [outcome for outcome in outcomes if _row(outcome) == row]
-        numbers = f"{max(o.worst for o in some):.2f}", sum(o.worst > 1.0 for o in some), sum(o.applied for o in some)
-        result.add_row(row, str(len(some)), *map(str, numbers), str(sum(bool(o.fallbacks) for o in some)))
+def _memory(site: Site) -> dict[str, int]:
+    """Largest resident bytes of each kind of process."""
+    edges = [edge.pid for edge in site.edges.values()]
+    kinds = {
+        "twin": [site.twin.pid],
+        "worker": children(site.twin.pid),
+        "edge": edges,
+        "link process": [pid for edge in edges for pid in children(edge)],
+    }
+    usages = {kind: [used(pid) for pid in pids if pid] for kind, pids in kinds.items()}
+    return {kind: max((each.memory for each in found if each is not None), default=0) for kind, found in usages.items()}
+
+
+def _until(condition: Callable[[], bool], seconds: float) -> None:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.5)
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port: int = free.getsockname()[1]
+    return port
+
+
+def shown(outcome: EnduranceOutcome) -> Table:
+    """A row for each figure."""
+    result = Table(title="endurance: windows under random faults", title_justify="left", box=None)
+    result.add_column("figure")
+    result.add_column("value", justify="right")
+    year = outcome.bytes_per_window * _YEAR_WINDOWS
+    rows = {
+        "time, s; edges": f"{outcome.seconds:.0f}; {SERVOS}",
+        "starts of edges; ended without a fault": f"{outcome.starts}; {outcome.ended_alone}",
+        "boots with stored windows": str(outcome.boots),
+        **{f"faults: {name}": str(number) for name, number in sorted(outcome.faults.items())},
+        "windows stored": str(outcome.stored),
+        "acknowledged, and not stored": str(outcome.lost_acknowledged),
+        "numbers missing within a boot": str(outcome.holes),
+        "cut up to 1 s before a fault, and neither stored nor waiting": str(outcome.unseen),
+        "dropped, counted by edges": str(outcome.counted),
+        "left waiting": str(outcome.waiting),
+        "updates applied": str(outcome.applied),
+        "store, kB per window; GB in a year of a servo": f"{outcome.bytes_per_window / 1e3:.1f}; {year / 1e9:.1f}",
+        "largest outbox, MB": f"{outcome.outbox_bytes / 1e6:.1f}",
+        **{
+            f"memory of a {kind}, MB: first, last third": f"{first / 1e6:.0f}, {last / 1e6:.0f}"
+            for kind, (first, last) in outcome.memory.items()
+        },
+    }
+    for name, value in rows.items():
+        result.add_row(name, value)
     return result
-
-
-def _row(outcome: HostileOutcome) -> str:
-    return FRICTION if outcome.case.friction else outcome.kind.value
-
-
-def dumps(outcomes: Sequence[HostileOutcome], date: str) -> str:
-    """The document: schema, date, machine, band, and every outcome."""
-    band = hostile.band()
-    rows = [
-        {
-            "twin": outcome.kind.value,
-            "friction_n_m": outcome.case.friction,
-            "worst_bands": outcome.worst,
-            "outside_s": outcome.outside,
-            "recovered": outcome.recovered,
-            "applied": outcome.applied,
-            "fallbacks": [cause.value for cause in outcome.fallbacks],
-            "refused": {reason.value: number for reason, number in sorted(outcome.refused.items())},
-        }
-        for outcome in outcomes
-    ]
-    limits = {"error_m": band.error, "settling_s": band.settling}
-    return report.text(SCHEMA, date, band=limits, outcomes=rows)

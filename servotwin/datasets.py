@@ -6,11 +6,12 @@ The standard library is enough for one file over HTTPS; a package for it (pooch)
 from __future__ import annotations
 
 import hashlib
+import http.client
 import io
 import os
-import urllib.error
 import urllib.request
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -90,8 +91,11 @@ def fetch(name: str, folder: str | os.PathLike[str] | None = None) -> Path:
         )
     known = DATASETS[name]
     path = _folder(name, folder) / known.file
-    if path.is_file() and _digest(path.read_bytes()) == known.sha256:
-        return path
+    try:
+        if path.is_file() and _digest(path.read_bytes()) == known.sha256:
+            return path
+    except OSError as error:
+        raise InvalidInput(f"dataset {name}: {path}: cannot be read ({error.strerror})") from None
     content = _unpacked(name, known, _downloaded(name, known))
     if _digest(content) != known.sha256:
         raise InvalidInput(
@@ -122,8 +126,8 @@ def _downloaded(name: str, known: PublicDataset) -> bytes:
     try:
         with urllib.request.urlopen(known.url, timeout=_TIMEOUT) as answer:
             content: bytes = answer.read(known.largest + 1)
-    except (OSError, urllib.error.URLError) as error:
-        reason = getattr(error, "reason", None) or error
+    except (OSError, http.client.HTTPException) as error:
+        reason = getattr(error, "reason", None) or repr(error)
         raise InvalidInput(f"dataset {name}: cannot be fetched from {known.url} ({reason})") from None
     if len(content) > known.largest:
         raise InvalidInput(f"dataset {name}: {known.url} sent more than {known.largest} bytes; nothing was kept")
@@ -143,7 +147,7 @@ def _unpacked(name: str, known: PublicDataset, content: bytes) -> bytes:
                 )
             with archive.open(member) as file:
                 return file.read(known.largest + 1)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError) as error:
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError) as error:
         raise InvalidInput(f"dataset {name}: the archive of {known.url} cannot be read ({error})") from None
 
 

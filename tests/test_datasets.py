@@ -1,6 +1,7 @@
 """Public data by name, from a server on this machine."""
 
 import hashlib
+import http.client
 import http.server
 import io
 import threading
@@ -101,6 +102,23 @@ def test_names_and_places_are_checked(server, known, tmp_path, monkeypatch):
     monkeypatch.setenv("SERVOTWIN_CACHE_DIR", "")
     with pytest.raises(InvalidInput, match="there is no cache folder"):
         datasets.fetch("some")
+
+
+def test_a_broken_answer_and_an_unreadable_cache_are_one_sentence(known, tmp_path, monkeypatch):
+    def broken(*_, **__):
+        raise http.client.BadStatusLine("gibberish")
+
+    monkeypatch.setattr(datasets.urllib.request, "urlopen", broken)
+    with pytest.raises(InvalidInput, match=r"cannot be fetched from .*gibberish"):
+        datasets.fetch("some", tmp_path)
+
+    def unreadable(_):
+        raise PermissionError(13, "Permission denied")
+
+    (tmp_path / "data.mat").touch()
+    monkeypatch.setattr(datasets.Path, "read_bytes", unreadable)
+    with pytest.raises(InvalidInput, match=r"data.mat: cannot be read \(Permission denied\)"):
+        datasets.fetch("some", tmp_path)
 
 
 def test_the_command_says_whose_data_it_is(server, known, tmp_path, monkeypatch):

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -17,7 +18,7 @@ from rich.text import Text
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
-from servotwin.estimation.kinematic.growth import GapGrowth, growth
+from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within
 from servotwin.logs.log import read_columns
@@ -26,6 +27,7 @@ from servotwin.plant.plants import resolve_plant
 
 _Answer = tuple[RecordedLog, TransmissionGap]
 _DATED = 3e8  # s since 1970: smaller times are no dates
+_DAY = re.compile(r"\d{4}-\d\d-\d\d$")
 _PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
 
 
@@ -72,16 +74,20 @@ def show(
         log, found = answers[-1]
         said = Text.from_markup(headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
         write_page(page, log, found, said)
+    _check_units(answers)
     stamps = [_date(log, day) for (log, _), day in zip(answers, given, strict=True)]
-    grown = _growth(answers, stamps)
+    wear = _wear(answers, stamps)
     if as_json:
-        rows = [as_dict(log, found) | {"date": _iso(at)} for (log, found), at in zip(answers, stamps, strict=True)]
-        if grown is not None:
-            low, high = grown.interval
+        rows = [
+            as_dict(log, found) | {"date": _iso(stamp.time), "date_from": stamp.origin}
+            for (log, found), stamp in zip(answers, stamps, strict=True)
+        ]
+        if isinstance(wear, _Wear):
             rows[-1] |= {
-                "growth_of": _compared(answers),
-                "growth_per_year_load": grown.per_year,
-                "growth_interval_load": [low, high],
+                "growth_of": wear.quantity,
+                "growth_logs": wear.logs,
+                "growth_per_year_load": wear.growth.per_year,
+                "growth_interval_load": list(wear.growth.interval),
             }
         print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))
         return
@@ -89,18 +95,12 @@ def show(
         _print(console, log, found)
     for before, after in pairwise(answers):
         console.print(_change(before, after), highlight=False)
-    if grown is not None:
-        low, high = grown.interval
-        unit = answers[-1][0].recording.load_unit
-        console.print(
-            f"wear from {_iso(min(stamps))[:10]} to {_iso(max(stamps))[:10]}: {_compared(answers)} "
-            f"{grown.per_year:+.4g} {unit} per year (95 %: {low:+.4g} .. {high:+.4g})",
-            highlight=False,
-        )
+    if wear:
+        console.print(_said(wear, answers[-1][0].recording.load_unit), highlight=False)
 
 
 def dates_of(text: str | None, logs: int) -> list[float | None]:
-    """Dates with commas between them as seconds since 1970, one for each log; None: from the log or its file.
+    """Dates with commas between them as seconds since 1970, one for each log; None: of the log or its file.
 
     Raises
     ------
@@ -111,6 +111,8 @@ def dates_of(text: str | None, logs: int) -> list[float | None]:
         return [None] * logs
     days = text.split(",")
     try:
+        if not all(_DAY.match(day.strip()) for day in days):
+            raise ValueError
         found = [float(np.datetime64(day.strip(), "s").astype(np.int64)) for day in days]
     except ValueError:
         raise InvalidInput(f"--dates {text!r}: give dates such as 2026-03-01, with commas between them") from None
@@ -119,21 +121,63 @@ def dates_of(text: str | None, logs: int) -> list[float | None]:
     return list(found)
 
 
-def _date(log: RecordedLog, given: float | None) -> float:
-    """Seconds since 1970: as given, of the log's first time stamp if it is a date, or of its file."""
+class _Stamp(NamedTuple):
+    """Date of a log, s since 1970, and where it is from: "given", "stamped" in the log, or that of its "file"."""
+
+    time: float
+    origin: str
+
+
+class _Wear(NamedTuple):
+    """Growth of a quantity over so many logs, from one date to another."""
+
+    growth: GapGrowth
+    quantity: str
+    logs: int
+    begin: float
+    end: float
+
+
+def _date(log: RecordedLog, given: float | None) -> _Stamp:
     if given is not None:
-        return given
+        return _Stamp(given, "given")
     first = float(log.recording.time[0])
-    return first if first > _DATED else Path(log.recording.source.removeprefix("log ")).stat().st_mtime
+    if first > _DATED:
+        return _Stamp(first, "stamped")
+    return _Stamp(Path(log.recording.source.removeprefix("log ")).stat().st_mtime, "file")
 
 
 def _iso(date: float) -> str:
     return str(np.datetime64(round(date), "s"))
 
 
-def _growth(answers: Sequence[_Answer], dates: Sequence[float]) -> GapGrowth | None:
-    values = [_value(found, _compared(answers)) for _, found in answers]
-    return growth(dates, [value for value, _ in values], [_half(interval) / NORMAL_95 for _, interval in values])
+def _check_units(answers: Sequence[_Answer]) -> None:
+    first = answers[0][0].recording
+    for log, _ in answers[1:]:
+        if log.recording.load_unit != first.load_unit:
+            raise InvalidInput(
+                f"{log.recording.source}: its load is in {log.recording.load_unit}, that of {first.source} in "
+                f"{first.load_unit}: give --load-unit"
+            )
+
+
+def _wear(answers: Sequence[_Answer], stamps: Sequence[_Stamp]) -> _Wear | str:
+    """Growth over the logs whose gap, or lost motion, is known; or the reason against, empty for one log or two."""
+    if len(answers) < LEAST:
+        return ""
+    if any(stamp.origin == "file" for stamp in stamps):
+        return "the dates of files are not those of recordings; give --dates"
+    quantity = _compared(answers)
+    known = [place for place, (_, found) in enumerate(answers) if found.ok or found.lost.ok]
+    dates = [stamps[place].time for place in known]
+    values = [_value(answers[place][1], quantity) for place in known]
+    grown = growth(dates, [value for value, _ in values], [_half(interval) / NORMAL_95 for _, interval in values])
+    if grown is None:
+        return f"the {quantity} is known in {len(known)} of {len(answers)} logs; three of different dates are needed"
+    longest = max(float(np.ptp(log.recording.time)) for log, _ in answers)
+    if max(dates) - min(dates) <= longest:
+        return f"the dates lie within {max(dates) - min(dates):.4g} s, and one log alone lasts {longest:.4g} s"
+    return _Wear(grown, quantity, len(known), min(dates), max(dates))
 
 
 def _compared(answers: Sequence[_Answer]) -> str:
@@ -145,6 +189,16 @@ def _value(found: TransmissionGap, name: str) -> tuple[float, Interval]:
     """Gap or lost motion at the load, and its 95 % interval."""
     lost = found.lost
     return (found.gap_load, found.interval_load) if name == "gap" else (lost.at_load, lost.interval_load)
+
+
+def _said(wear: _Wear | str, unit: str) -> str:
+    if isinstance(wear, str):
+        return f"no growth per year: {wear}"
+    low, high = wear.growth.interval
+    return (
+        f"wear from {_iso(wear.begin)[:10]} to {_iso(wear.end)[:10]}: {wear.quantity} {wear.growth.per_year:+.4g} "
+        f"{unit} per year (95 %: {low:+.4g} .. {high:+.4g}), in {wear.logs} logs"
+    )
 
 
 def _tell(status: Any, name: str, samples: int) -> None:
@@ -274,14 +328,9 @@ def _binned(keys: Any, gaps: Any) -> list[tuple[str, str, str]]:
 
 def _change(before: _Answer, after: _Answer) -> str:
     """The difference of two logs' gaps, or lost motions, and if it is more than their uncertainty."""
-    (first, old), (second, new) = before, after
+    (_, old), (second, new) = before, after
     if not (math.isfinite(old.lost.std_load) and math.isfinite(new.lost.std_load)):
         return "no change can be told: the lost motion of the two logs is only bounded"
-    if first.recording.load_unit != second.recording.load_unit:
-        raise InvalidInput(
-            f"{second.recording.source}: its load is in {second.recording.load_unit}, that of {first.recording.source} "
-            f"in {first.recording.load_unit}: give --load-unit"
-        )
     name = _compared((before, after))
     (one, its), (other, of_it) = _value(old, name), _value(new, name)
     change, std = other - one, math.hypot(_half(its), _half(of_it)) / NORMAL_95

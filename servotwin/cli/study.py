@@ -53,14 +53,18 @@ def convert(
     load: Annotated[str | None, typer.Option(help="Column of the load's position.")] = None,
     command: Annotated[str | None, typer.Option(help="Column of the motor's command.")] = None,
     time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Sample rate, Hz, of a log without times; its own times do not count then.")
+    ] = None,
+    motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as deg.")] = None,
+    load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as mm.")] = None,
 ) -> None:
     """Convert a recorded log to another format; with --motor and --load any log, cleaned of what is damaged."""
     from servotwin.cli.simulate import convert as run
     from servotwin.cli.simulate import convert_recording
     from servotwin.logs.recordings import RecordingColumns
 
-    columns = RecordingColumns(motor, load, command, time, rate)
+    columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
     if columns == RecordingColumns():
         run(log, output)
         return
@@ -76,7 +80,9 @@ def identify(
         str | None, typer.Option(help="Column of the motor's command: shows how far it winds up.")
     ] = None,
     time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
+    rate: Annotated[
+        float | None, typer.Option(help="Sample rate, Hz, of a log without times; its own times do not count then.")
+    ] = None,
     motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as deg.")] = None,
     load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as mm.")] = None,
     page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
@@ -92,7 +98,7 @@ def identify(
         typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
     ] = False,
     dates: Annotated[
-        str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their own, or their files'.")
+        str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")
     ] = None,
     start: Annotated[
         float | None, typer.Option(help="Start of a single window, s, instead of a window at each step.")

@@ -317,14 +317,24 @@ class Commissioning:
         needed = 0.0 if second >= 1.0 else min(usual, self._shortest_window[0])
         return self._whole(max(usual * second, needed))
 
-    def with_longest(self, window: float, pre_trigger: float) -> Commissioning:
-        """The same with the longest window and pre-trigger that the twin may request, in the servo's own seconds."""
+    def with_longest(self, window: float, pre_trigger: float, samples: int) -> Commissioning:
+        """The same with the longest window and pre-trigger that the twin may request, in the servo's own seconds.
+
+        Raises
+        ------
+        InvalidInput
+            A window has more samples than `samples`, which the twin takes at most.
+        """
+        rate = self.recording.sample_rate
+        if round(self.window * rate) > samples:
+            count = f"has {round(self.window * rate)} samples at {rate!r} Hz"
+            raise InvalidInput(
+                f"window = {self.window!r} s: {count}; the twin takes at most samples_per_window = {samples}"
+            )
         second = scales(self.servo).time
-        longest = (
-            max(self._whole(window * second), self.window),
-            max(self._whole(pre_trigger * second), self.pre_trigger),
-        )
-        recording = dataclasses.replace(self.recording, longest_window=longest[0], longest_pre_trigger=longest[1])
+        longest = max(min(self._whole(window * second), samples / rate), self.window)
+        before = max(self._whole(min(pre_trigger * second, longest / 2.0)), self.pre_trigger)
+        recording = dataclasses.replace(self.recording, longest_window=longest, longest_pre_trigger=before)
         return dataclasses.replace(self, recording=recording)
 
     def _whole(self, seconds: float) -> float:

@@ -70,4 +70,4 @@ def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) ->
 
 def _shaft(known: Uncertainty) -> Values:
     """Half-widths of load, stiffness and damping, which a second encoder shows."""
-    return {"m_percent": 100.0 * known.m, "k_percent": 100.0 * known.k, "c_percent": 100.0 * known.c}
+    return {f"{name}_percent": 100.0 * float(getattr(known, name)) for name in ("m", "k", "c")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import msgspec
@@ -23,8 +24,9 @@ from servotwin.twin.model_registry import ServoModel
 
 MAX_SAMPLES = 100_000
 """Of a simulated step."""
-_SHOWN_S, _LONGEST = 6.0, 5.0
-"""s that are shown of a machine as fast as the paper's, in its own seconds; and how many times as long one may ask."""
+_SHOWN_S, _SHOWN_BANDWIDTHS, _LONGEST = 6.0, 60.0, 5.0
+"""Time that is shown: the longer of so many of the machine's own seconds, as if it were the paper's, and of so many
+times one over its bandwidth (rad/s); and how many times as long one may ask."""
 _SAMPLES, _COLUMNS = 4000, 400
 """Samples of a continuous loop, and columns of the screen."""
 _LARGEST_STEP = 10.0
@@ -81,8 +83,8 @@ def simulated_step(model: ServoModel, asked: WhatIf) -> dict[str, Any]:
     dict
         Ready for JSON, SI units: gap, tolerance, k_dz, gains, step, duration as simulated; units of travel and command;
         time, position, reference and command, decimated to the least and greatest sample of each column of a screen;
-        overshoot (share of the step), settled (s; None: not within the run), last_error (greatest error in the last
-        quarter) and last_motion (peak to peak in it).
+        sensitivity_peak (Ms of the loop without a gap); overshoot (share of the step), settled (s; None: not within the
+        run), last_error (greatest error in the last quarter) and last_motion (peak to peak in it).
 
     Raises
     ------
@@ -114,9 +116,16 @@ def simulated_step(model: ServoModel, asked: WhatIf) -> dict[str, Any]:
         "travel": servo.p,
         "travel_unit": position_unit(servo).si,
         "command_unit": command_unit(servo),
+        "sensitivity_peak": _sensitivity_peak(servo, law),
         **_series(run),
         **_figures(run, step, tolerance),
     }
+
+
+@lru_cache(maxsize=256)
+def _sensitivity_peak(servo: Plant, law: AnyController) -> float:
+    """Ms, remembered while only the gap or the dead zone is dragged."""
+    return float(servo.replace(controller=law).margins().Ms)
 
 
 def _law(servo: Plant, asked: WhatIf) -> AnyController:
@@ -144,7 +153,7 @@ def _step(model: ServoModel, asked: WhatIf) -> float:
 
 
 def _duration(servo: Plant, law: AnyController, asked: WhatIf) -> float:
-    shown = _SHOWN_S * scales(servo).time
+    shown = _shown(servo)
     longest = _LONGEST * shown
     if law.sample_rate is not None:
         longest = min(longest, (MAX_SAMPLES - 1) / law.sample_rate)
@@ -153,6 +162,12 @@ def _duration(servo: Plant, law: AnyController, asked: WhatIf) -> float:
     if not 0.0 < asked.duration <= longest:
         raise InvalidInput(f"duration = {asked.duration:g} s: must be above 0 and at most {longest:g} s")
     return asked.duration
+
+
+@lru_cache(maxsize=64)
+def _shown(servo: Plant) -> float:
+    """Time in which a step of the running loop has settled, s."""
+    return max(_SHOWN_S * scales(servo).time, _SHOWN_BANDWIDTHS / servo.margins().bandwidth)
 
 
 def _series(run: Run) -> dict[str, Any]:

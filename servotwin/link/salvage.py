@@ -28,6 +28,9 @@ _MOST_PROBED = 20_000
 _MOST_COPIED = 2_000_000_000
 _WINDOWS = "SELECT place, boot, sequence, reason, encoding, body FROM windows"
 _LETTERS = "SELECT place, digest, body FROM letters"
+# By the order of the index, which holds all that is asked for: the table's pages are not read.
+_KEYS = "SELECT boot, sequence FROM windows ORDER BY boot, sequence"
+_ACKNOWLEDGED = f"SELECT boot, sequence FROM acknowledged WHERE at != {AGAIN}"
 
 
 class Salvage(NamedTuple):
@@ -60,6 +63,8 @@ class Salvaged:
         As in the tables.
     lost : set of Key
         Windows that waited and cannot be read. More may be lost where the index is damaged too.
+    lost_is_complete : bool
+        The index and the acknowledgements are not damaged: no more are lost.
     """
 
     windows: list[tuple[str, int, str, str, bytes]] = field(default_factory=list)
@@ -67,6 +72,7 @@ class Salvaged:
     counts: dict[str, int] = field(default_factory=dict)
     notes: dict[str, bytes] = field(default_factory=dict)
     lost: set[Key] = field(default_factory=set)
+    lost_is_complete: bool = False
 
 
 def salvage(path: Path) -> Salvaged:
@@ -79,7 +85,8 @@ def salvage(path: Path) -> Salvaged:
         copy = Path(folder) / "copy.sqlite"
         _copy(path, copy)
         _read_into(found, copy.absolute().as_uri())
-        if not found.windows and not found.lost:
+        found.lost_is_complete = _is_whole(copy, _KEYS, _ACKNOWLEDGED)
+        if not found.windows and not found.lost and not found.lost_is_complete:
             _replace_first_page(copy)
             _read_into(found, copy.absolute().as_uri())
         return found
@@ -101,21 +108,31 @@ def _copy(path: Path, copy: Path) -> None:
 def _read_into(found: Salvaged, address: str) -> None:
     with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True)) as connection:
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # raises where the first page is damaged
-        acknowledged = set(_rows(connection, f"SELECT boot, sequence FROM acknowledged WHERE at != {AGAIN}"))
+        acknowledged = set(_rows(connection, _ACKNOWLEDGED))
         for place, *row in _by_place(connection, _WINDOWS, lambda row: row[1:3] not in acknowledged):
             boot, sequence, _, encoding, body = row
             if _is_window(place, boot, sequence, encoding, body):
                 found.windows.append((boot, sequence, row[2], encoding, body))
             elif isinstance(boot, str) and isinstance(sequence, int):
                 found.lost.add((boot, sequence))
-        # By the order of the index, which holds all that is asked for: the table's pages are not read.
-        keys = set(_rows(connection, "SELECT boot, sequence FROM windows ORDER BY boot, sequence"))
+        keys = set(_rows(connection, _KEYS))
         found.lost |= keys - acknowledged
         found.lost -= {(boot, sequence) for boot, sequence, *_ in found.windows}
         letters = [(digest, body) for _, digest, body in _by_place(connection, _LETTERS)]
         found.letters = [each for each in letters if all(isinstance(part, bytes) for part in each)]
         found.counts = {what: n for what, n in _rows(connection, "SELECT what, number FROM counts") if _is(n, int)}
         found.notes = {name: v for name, v in _rows(connection, "SELECT name, value FROM notes") if _is(v, bytes)}
+
+
+def _is_whole(copy: Path, *texts: str) -> bool:
+    """Test whether queries can be read to their ends."""
+    try:
+        with closing(sqlite3.connect(copy)) as connection:
+            for text in texts:
+                connection.execute(text).fetchall()
+    except sqlite3.Error:
+        return False
+    return True
 
 
 def _is(value: object, kind: type) -> bool:

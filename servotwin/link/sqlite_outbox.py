@@ -339,7 +339,9 @@ class SqliteOutbox:
         rescued = {(row[0], row[1]): row for row in found.windows if (row[0], row[1]) not in in_memory}
         # Known by name: from memory where the file was open before, and from what is left of the file.
         lost = (self._index.keys() | found.lost) - in_memory - rescued.keys()
-        number = max(len(lost), self._waiting - len(rescued) if not self._index else 0)
+        # The number of the last status is old by up to a second: it counts only where the names are not known.
+        unnamed = not (self._index or found.lost_is_complete)
+        number = max(len(lost), self._waiting - len(rescued) if unnamed else 0)
         self._restore(found, rescued, in_memory)
         self._count(_DROPPED + BROKEN, number)
         self._count(BROKEN)

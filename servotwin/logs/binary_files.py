@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +40,7 @@ def read_parquet(path: Path, requested: Collection[str]) -> LogColumns:
 
     try:
         schema = parquet.read_schema(path)
+        _check_names(path, schema.names)
         table = parquet.read_table(path, columns=[name for name in requested if name in schema.names])
         columns = {name: table[name].to_numpy() for name in table.column_names}
     except pyarrow.ArrowException as error:
@@ -56,11 +57,18 @@ def parquet_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumn
     try:
         with parquet.ParquetFile(path) as file:
             names = file.schema_arrow.names
+            _check_names(path, names)
             for batch in file.iter_batches(_ROWS, columns=[name for name in requested if name in names]):
                 columns = {name: batch[name].to_numpy(zero_copy_only=False) for name in batch.schema.names}
                 yield LogColumns(columns, names, {})
     except pyarrow.ArrowException as error:
         raise _not_numbers(path, error) from None
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    double = next((name for place, name in enumerate(names) if name in names[:place]), None)
+    if double is not None:
+        raise InvalidInput(f"log {path}: has two columns {double!r}: each needs a name of its own")
 
 
 def write_parquet(table: SignalTable, path: Path) -> None:

@@ -16,6 +16,10 @@ _STALE = 50.0  # times the usual interval: a first sample so far before the othe
 _DROPOUT = 5.0  # times the usual interval
 _SPIKE = 20.0  # times the usual step between samples, there and back
 _FASTEST, _UNSURE = 0.99, 0.35  # quantile of the steps, and turns: beyond, half a turn more is not told from one less
+NEAR_TURN = 0.2
+"""Of a turn: a jump by a turn is one within so much."""
+WITHIN = 1.01
+"""Turns: the range of an angle that wraps."""
 _WRAPS = 3  # jumps of about one turn that make an angle a wrapped one
 
 
@@ -79,7 +83,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             table[:, place], count = _unwrapped(table[:, place], turns[name])
             if count:
                 _check_followed(name, table[:, place], turns[name])
-                found[f"turns of {name} that were unwrapped"] = count
+                found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
         keep(~_spikes(table[:, place]), f"spikes of {name}")
     gaps = _dropouts(table[:, 0])
@@ -88,11 +92,16 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found)
 
 
+def unwrapped_turns(name: str) -> str:
+    """Name of the defect of an angle that wraps."""
+    return f"turns of {name} that were unwrapped"
+
+
 def _unwrapped(angle: Array, turn: float) -> tuple[Array, int]:
     """The angle without its jumps by a turn, and their number; unchanged where it does not wrap."""
     steps = np.diff(angle)
-    jumps = np.abs(np.abs(steps) - turn) < 0.2 * turn
-    within = angle.size > 0 and float(np.ptp(angle)) <= 1.01 * turn
+    jumps = np.abs(np.abs(steps) - turn) < NEAR_TURN * turn
+    within = angle.size > 0 and float(np.ptp(angle)) <= WITHIN * turn
     if not within or np.sum(jumps) < 1 or (np.sum(jumps) < _WRAPS and float(np.ptp(angle)) < 0.95 * turn):
         return angle, 0
     return np.unwrap(angle, period=turn), int(np.sum(jumps))

@@ -7,12 +7,13 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from servotwin.logs.cleaning import Cleaned, cleaned
+from servotwin.logs.cleaning import NEAR_TURN, WITHIN, Cleaned, cleaned, unwrapped_turns
 from servotwin.plant.signals import Array
 
 MOST = 1_500_000
 """Samples that are held; a longer log is thinned."""
 _GROUP = 6  # samples, of which the first, and the lowest and the highest of the motor stay
+_BULK = (0.01, 0.99)  # quantiles of an angle, between which no spike counts
 THINNED = "left out of a long log, turning points kept"
 
 
@@ -34,13 +35,18 @@ class Gathering:
         self._last: Array | None = None
         self._found: Counter[str] = Counter()
         self._thinnings = 0
+        # Decided once for the log: angles that wrap, and those that cannot, for they go beyond a turn.
+        self._wrapped: set[str] = set()
+        self._ranges: dict[str, tuple[float, float]] = {}
         self.samples = 0
 
     def add(self, time: Array, channels: Mapping[str, Array]) -> None:
         """Add the next block: (n,) times in s and (n,) arrays by name, of which the first is the motor."""
         self.samples += len(time)
         self._names = tuple(channels)
-        part = cleaned(time, channels, self._turns, first=self._last is None)
+        turns = self._within_a_turn(channels)
+        part = cleaned(time, channels, turns, first=self._last is None)
+        self._wrapped |= {name for name in turns if unwrapped_turns(name) in part.found}
         self._found.update(part.found)
         table = self._after_last(np.column_stack([part.time, *part.channels.values()]))
         if not len(table):
@@ -59,6 +65,17 @@ class Gathering:
         table = np.concatenate([empty, *self._parts])
         return Cleaned(table[:, 0], dict(zip(self._names, table[:, 1:].T, strict=True)), dict(self._found))
 
+    def _within_a_turn(self, channels: Mapping[str, Array]) -> dict[str, float]:
+        """Full turns of the angles that have stayed within one so far."""
+        for name in self._turns:
+            values = channels[name][np.isfinite(channels[name])] if name in channels else np.empty(0)
+            if values.size:
+                low, high = np.quantile(values, _BULK)
+                before = self._ranges.get(name, (low, high))
+                self._ranges[name] = (min(before[0], low), max(before[1], high))
+        spans = {name: high - low for name, (low, high) in self._ranges.items()}
+        return {name: turn for name, turn in self._turns.items() if spans.get(name, 0.0) <= WITHIN * turn}
+
     def _after_last(self, table: Array) -> Array:
         """The block behind the one before: later samples only, and angles in the turn in which they go on."""
         if self._last is None or not len(table):
@@ -69,8 +86,12 @@ class Gathering:
             table = table[later]
         for place, name in enumerate(self._names, 1):
             if name in self._turns and len(table):
-                turn = self._turns[name]
-                table[:, place] += turn * np.round((self._last[place] - table[0, place]) / turn)
+                turn, step = self._turns[name], self._last[place] - table[0, place]
+                low, high = self._ranges.get(name, (0.0, 0.0))
+                if abs(abs(step) - turn) < NEAR_TURN * turn and high - low <= WITHIN * turn:
+                    self._wrapped.add(name)
+                if name in self._wrapped:
+                    table[:, place] += turn * np.round(step / turn)
         return table
 
     def _thin(self, table: Array) -> Array:

@@ -164,6 +164,8 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
     for part in ("time", "motor", "load", "command"):
         given = getattr(wanted, part)
         name = given_column(path, part, given, names) if given is not None else guessed_column(_GUESSES[part], names)
+        if part == "time" and wanted.rate is not None:
+            continue
         if name is not None:
             result[part] = name
         elif part in ("motor", "load"):
@@ -233,7 +235,9 @@ def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size
         if unit and unit.lower() not in _SECONDS:
             raise InvalidInput(f"log {path}: times in {unit!r}: allowed are {', '.join(_SECONDS)}")
         return time * _SECONDS.get(unit.lower(), 1.0)
-    if rate is None or not (np.isfinite(rate) and rate > 0.0):
+    if rate is not None and not (np.isfinite(rate) and rate > 0.0):
+        raise InvalidInput(f"log {path}: --rate {rate:g}: must be above 0 Hz and finite")
+    if rate is None:
         raise InvalidInput(f"log {path}: no column is called like a time; give --time COLUMN, or --rate in Hz above 0")
     return np.arange(before, before + size) / rate
 

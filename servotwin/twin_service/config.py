@@ -166,7 +166,7 @@ class ServiceConfig:
     samples_per_window: Annotated[
         int,
         key(minimum=1, help="Largest number of samples of a window; a worker's time and memory for it grow with them."),
-    ] = 100_000
+    ] = 250_000
     megabytes_per_day: Annotated[
         float,
         key(
@@ -175,9 +175,14 @@ class ServiceConfig:
             help="Largest mean rate at which one servo fills the disk, in MB of messages as they are stored; of a rate "
             "above it the edge keeps what is too much, and sends it later.",
         ),
-    ] = 2000.0
+    ] = 10_000.0
     strangers: Annotated[
-        int, key(minimum=1, maximum=_MOST, help="Largest number of connections open at once that have shown no token.")
+        int,
+        key(
+            minimum=1,
+            maximum=_MOST,
+            help="Largest number of connections open at once that have shown no token and no dashboard's session.",
+        ),
     ] = 8192
     strangers_per_address: Annotated[
         int,

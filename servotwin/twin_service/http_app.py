@@ -39,6 +39,15 @@ _UNBUFFERED = (b"x-accel-buffering", b"no")
 _pack = msgspec.msgpack.Encoder().encode
 
 
+def cookie_of(header: bytes | None, name: str) -> str | None:
+    """Cookie in a Cookie header; None: there is none of that name."""
+    try:
+        jar = SimpleCookie((header or b"").decode("latin-1"))
+    except CookieError:
+        return None
+    return jar[name].value if name in jar else None
+
+
 class HttpRequest:
     """One request.
 
@@ -69,11 +78,7 @@ class HttpRequest:
 
     def cookie(self, name: str) -> str | None:
         """A cookie; None: there is none of that name."""
-        try:
-            jar = SimpleCookie((self.header(b"cookie") or b"").decode("latin-1"))
-        except CookieError:
-            return None
-        return jar[name].value if name in jar else None
+        return cookie_of(self.header(b"cookie"), name)
 
     @property
     def foreign(self) -> bool:

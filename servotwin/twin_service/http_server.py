@@ -19,7 +19,6 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
 from servotwin.runtime.service_manager import ServiceManager
-from servotwin.twin_service.auth import bearer_token
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
@@ -106,7 +105,8 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
         self._unreported = 0
         self._stop_timer()
         if self._stranger is not None:
-            self._stranger.show(bearer_token(dict(self.headers).get(b"authorization")))
+            headers = dict(self.headers)
+            self._stranger.show(headers.get(b"authorization"), headers.get(b"cookie"))
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:

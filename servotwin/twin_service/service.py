@@ -82,7 +82,8 @@ class TwinService:
         self.pool = pool or WorkerPool(config.workers, twin.start, config.job_timeout_s)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
-        self.strangers = StrangerLimit.of(config, self.access)
+        self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
+        self.strangers = StrangerLimit.of(config, self.access, self.operators)
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
@@ -132,7 +133,6 @@ class TwinService:
         self.claims = EdgeClaims(
             store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
         )
-        self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)

@@ -56,7 +56,7 @@ class OperatorAccess:
         if cookie is None:
             self._access.check_operator(request.token)
             return self._access.operator_of(request.token)
-        name = self._name_in(cookie)
+        name = self.session_name(cookie)
         if name is None:
             raise RequestRejected(Refusal.BAD_TOKEN, _ENDED, 401)
         return name
@@ -73,7 +73,7 @@ class OperatorAccess:
         """Set-Cookie header that ends a session."""
         return self._header("", 0.0)
 
-    def _name_in(self, cookie: str) -> str | None:
+    def session_name(self, cookie: str) -> str | None:
         """Name of the operator whose session a cookie holds; None: it holds none."""
         match = _COOKIE.fullmatch(cookie)
         if match is None:

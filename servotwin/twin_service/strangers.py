@@ -1,4 +1,4 @@
-"""Connections of strangers, which have shown no valid token: bounded in all, and from each address."""
+"""Connections of strangers, which have shown no valid token and no session: bounded in all, and from each address."""
 
 from __future__ import annotations
 
@@ -6,33 +6,37 @@ import asyncio
 from collections import Counter
 from collections.abc import Callable
 
-from servotwin.twin_service.auth import AccessControl
+from servotwin.twin_service.auth import AccessControl, bearer_token
 from servotwin.twin_service.config import ServiceConfig
+from servotwin.twin_service.http_app import cookie_of
+from servotwin.twin_service.sessions import COOKIE, OperatorAccess
 
 _GRACE_S = 2.0
 """s in which a client shows its token: after an outage all edges of a network connect at once, from one address."""
 
 
 class StrangerLimit:
-    """Limit of the connections that have shown no valid token.
+    """Limit of the connections that have shown neither a valid token nor the cookie of a session.
 
     Parameters
     ----------
     access : AccessControl
+    operators : OperatorAccess
     most, per_address : int
-        Connections in all; and from one address, of those that are older than a grace period.
+        Connections in all, of which one address may have half; and from one address, of those that are older than a
+        grace period.
     """
 
-    def __init__(self, access: AccessControl, most: int, per_address: int) -> None:
-        self._access, self._most, self._per_address = access, most, per_address
+    def __init__(self, access: AccessControl, operators: OperatorAccess, most: int, per_address: int) -> None:
+        self._access, self._operators, self._most, self._per_address = access, operators, most, per_address
         self._of = Counter[str]()
 
     @classmethod
-    def of(cls, config: ServiceConfig, access: AccessControl) -> StrangerLimit | None:
+    def of(cls, config: ServiceConfig, access: AccessControl, operators: OperatorAccess) -> StrangerLimit | None:
         """Limit of a service; None where nobody has a token, or where a proxy shares connections among clients."""
         if config.tokens is None or config.behind_proxy:
             return None
-        return cls(access, config.strangers, config.strangers_per_address)
+        return cls(access, operators, config.strangers, config.strangers_per_address)
 
     @property
     def open(self) -> int:
@@ -40,8 +44,9 @@ class StrangerLimit:
         return self._of.total()
 
     def enter(self, address: str, close: Callable[[], None]) -> Stranger | None:
-        """Count a new connection; None: there are too many, and it has to be closed."""
-        if self.open >= self._most:
+        """Count a new connection; None: there are too many, in all or from its address, and it has to be closed."""
+        # Half of the places at most, also within the grace period: one address must not shut all others out.
+        if self.open >= self._most or self._of[address] >= max(1, self._most // 2):
             return None
         self._of[address] += 1
         return Stranger(self, address, close)
@@ -56,13 +61,16 @@ class StrangerLimit:
         """Test whether an address has more connections than it may."""
         return self._of[address] > self._per_address
 
-    def knows(self, token: bytes | None) -> bool:
-        """Test whether a token is a servo's or an operator's."""
-        return self._access.knows(token)
+    def knows(self, authorization: bytes | None, cookies: bytes | None) -> bool:
+        """Test whether these headers of a request hold a servo's or an operator's token, or an operator's session."""
+        if authorization is not None:
+            return self._access.knows(bearer_token(authorization))
+        session = cookie_of(cookies, COOKIE)
+        return session is not None and self._operators.session_name(session) is not None
 
 
 class Stranger:
-    """One connection, until it shows a token or ends.
+    """One connection, until it shows a token or a session, or ends.
 
     Parameters
     ----------
@@ -77,9 +85,9 @@ class Stranger:
         self._counted = True
         self._timer = asyncio.get_running_loop().call_later(_GRACE_S, self._check)
 
-    def show(self, token: bytes | None) -> None:
-        """Note the token of a request."""
-        if self._counted and self._limit.knows(token):
+    def show(self, authorization: bytes | None, cookies: bytes | None) -> None:
+        """Note two headers of a request."""
+        if self._counted and self._limit.knows(authorization, cookies):
             self.leave()
 
     def leave(self) -> None:

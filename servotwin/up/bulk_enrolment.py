@@ -113,7 +113,11 @@ def enroll_all(twin_path: Path, source: Path, requests: Mapping[int, Enrolment])
         with _all_or_nothing(requests.values()):
             written, verifiers = list[Path](), dict[str, bytes]()
             for line, request in requests.items():
-                files, verifiers[request.servo] = write_folder(twin, request, texts[line])
+                try:
+                    files, verifiers[request.servo] = write_folder(twin, request, texts[line])
+                except (InvalidInput, OSError) as error:
+                    _require_none(source, {line: str(error)})
+                    raise
                 written += files
             write_tokens(tokens, replace(known, servos={**known.servos, **verifiers}))
     return [*written, tokens]
@@ -189,12 +193,16 @@ def _require_none(path: Path, faults: Mapping[int, str]) -> None:
 def _all_or_nothing(requests: Iterable[Enrolment]) -> Iterator[None]:
     """Leave the folders of all requests as they were where the block fails."""
     before = {request.folder: _contents(request.folder) for request in requests}
+    missing = {parent for folder in before for parent in folder.parents if not parent.exists()}
     try:
         yield
     except BaseException:
         for folder, contents in before.items():
             with suppress(OSError, InvalidInput):
                 _put_back(folder, contents)
+        for parent in sorted(missing, key=lambda path: len(path.parts), reverse=True):
+            with suppress(OSError):
+                parent.rmdir()
         raise
 
 

@@ -166,7 +166,8 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     law = model.servo.pidf.replace(sample_rate=request.sample_rate if sampled else None)
     servo = model.servo.replace(controller=law)
     commissioning = Commissioning(servo, law, model.settings, Recording(request.sample_rate), noise=request.noise)
-    commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S)
+    most = twin.service.samples_per_window
+    commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S, most)
     commissioning.check_window()
     agent = commissioning.agent_settings(request.servo, UNBOOTED)
     certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE

@@ -57,5 +57,5 @@ def test_document(tmp_path, monkeypatch: pytest.MonkeyPatch):
 
 
 def test_only_some_take_a_seed():
-    with pytest.raises(InvalidInput, match="--seed: only bench windows, loops or certificates"):
+    with pytest.raises(InvalidInput, match="--seed: only bench windows, loops, certificates or endurance"):
         alone.run_alone(("estimator",), "", None, True, False, seed=3)

@@ -51,6 +51,7 @@ def test_the_step_is_the_exact_simulation_s(registry):
     assert found["tolerance"] == 0.5 * servo.p * 0.1
     assert found["k_dz"] == pytest.approx(0.5)
     assert found["gains"]["Kp"] == 1000.0
+    assert found["sensitivity_peak"] == pytest.approx(servo.replace(Kp=1000.0).margins().Ms)
     assert len(found["time"]) < 3300
 
 

@@ -71,7 +71,7 @@ def test_every_number_comes_back_bit_for_bit(a: float, b: float, c: float, text:
         ProbeLimits(c, 20.0, 0.5),
     )  # fmt: skip
     twin = TwinLink("https://twin.example:8443/base", None, "TOKEN", "ca.pem", 3.0, 5.0)
-    files, sensor = StoredFiles("o.db", "p.json", "s.json", "b", 9, 2_500_000), SensorGuard(0.003, -0.5)
+    files, sensor = StoredFiles("o.db", "p.json", "s.json", "b", "m.prom", 9, 2_500_000), SensorGuard(0.003, -0.5)
     drive = {"kind": "opcua", "list": [1, 2.5], "flag": True, "map": {"text": text}}
     config = EdgeConfig(agent, "supervise", LAW, drive, twin, files, sensor)
     assert again(config) == config

@@ -88,6 +88,20 @@ def test_windows_that_were_acknowledged_are_not_salvaged(tmp_path: Path) -> None
     assert len(rescued) >= 12
 
 
+def test_acknowledged_windows_do_not_count_as_lost_though_the_last_status_has_them_as_waiting(tmp_path: Path) -> None:
+    path = tmp_path / "outbox.sqlite"
+    box = SqliteOutbox(path, "axis-1", kept=AcknowledgedLimits(10**7, 3600.0))
+    for k in range(WINDOWS):
+        box.put(window(k))
+        box.remove(("b0", k))
+    box.close()
+    overwrite(path, leaves(path)[3:4])
+    box = reopened(path, waiting=5)
+    assert (box.pending(), box.dropped) == ([], {})
+    assert [found.lost for found in box.salvages] == [0]
+    box.close()
+
+
 def test_a_damaged_first_page_loses_no_window(tmp_path: Path) -> None:
     path = filled(tmp_path, WINDOWS)
     overwrite(path, [1])

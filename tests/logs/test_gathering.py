@@ -42,6 +42,17 @@ def test_an_angle_that_wraps_goes_on_from_block_to_block(made):
     assert np.allclose(turns, np.round(turns[0]), atol=1e-6)
 
 
+def test_an_angle_that_does_not_wrap_keeps_its_turns(made):
+    # Samples so far apart that a block ends more than half a turn before the next begins.
+    sparse = slice(None, None, 60)
+    gathering = Gathering(TURN)
+    time, motor = made.time[sparse], 5.0 * made.motor[sparse]
+    for begin in range(0, time.size, 10):
+        part = slice(begin, begin + 10)
+        gathering.add(time[part], {"motor": motor[part]})
+    assert np.array_equal(gathering.cleaned().channels["motor"], motor)
+
+
 def test_a_block_that_begins_before_the_last_one_ended_is_cut(made):
     gathering = Gathering({})
     for part in (slice(0, 1000), slice(900, 2000)):

@@ -79,6 +79,23 @@ def test_a_converted_log_keeps_its_first_sample_and_its_metadata(tmp_path, made)
     assert log.metadata == described
 
 
+@pytest.mark.parametrize("rate", [-5.0, 0.0, np.nan])
+def test_a_rate_that_is_none_is_refused(tmp_path, made, rate):
+    path = csv(tmp_path / "a.csv", rows(made), "timestamp,motor,load")
+    with pytest.raises(InvalidInput, match=r"--rate .*: must be above 0 Hz"):
+        read_recording(path, RecordingColumns(rate=rate))
+
+
+def test_two_parquet_columns_of_one_name_are_refused(tmp_path):
+    pyarrow = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    values = pyarrow.array([1.0, 2.0])
+    parquet.write_table(pyarrow.Table.from_arrays([values] * 3, ["motor", "load", "motor"]), tmp_path / "a.parquet")
+    with pytest.raises(InvalidInput, match="has two columns 'motor'"):
+        read_recording(tmp_path / "a.parquet", RecordingColumns(rate=100.0))
+
+
 def test_a_given_rate_takes_the_place_of_times(tmp_path, made):
     values = rows(made) * [1e3, 1.0, 1.0]
     path = csv(tmp_path / "a.csv", values, "timestamp,motor,load")
@@ -240,6 +257,29 @@ def test_lost_motion_is_gap_only_where_nothing_winds_up(tmp_path, made):
     assert "give one of the two" in both.stderr
 
 
+def test_dates_of_files_and_of_one_day_are_no_wear(tmp_path):
+    logs = [
+        csv(tmp_path / f"{place}.csv", rows(recording(gap=gap, ratio=RATIO, seconds=8.0, rate=100.0)))
+        for place, gap in enumerate((0.05, 0.055, 0.06))
+    ]
+    plain = CliRunner().invoke(app, ["identify", *map(str, logs)])
+    assert "no growth per year: the dates of files are not those of recordings" in " ".join(plain.output.split())
+    rows_of = json.loads(CliRunner().invoke(app, ["identify", *map(str, logs), "--json"]).stdout)
+    assert {each["date_from"] for each in rows_of} == {"file"}
+    assert "growth_per_year_load" not in rows_of[-1]
+    mixed = CliRunner().invoke(
+        app,
+        [
+            "identify",
+            str(logs[0]),
+            str(csv(tmp_path / "mm.csv", rows(recording()), "time_s,motor_rad,load_mm")),
+            "--json",
+        ],
+    )
+    assert mixed.exit_code == 2
+    assert "its load is in mm" in mixed.stderr
+
+
 def test_a_page_of_the_gap(tmp_path, made):
     log = csv(tmp_path / "log <b>.csv", rows(made))
     result = CliRunner().invoke(app, ["identify", str(log), "--page", str(tmp_path / "gap.html")])
@@ -298,6 +338,10 @@ def test_wear_over_three_logs_in_calendar_time(tmp_path):
     assert [each["date"][:10] for each in found] == ["2026-01-01", "2026-04-01", "2026-07-01"]
     assert found[-1]["growth_of"] == "lost motion"
     assert found[-1]["growth_per_year_load"] == pytest.approx(0.01 * RATIO * 365.25 / 181, rel=0.05)
+    for dates in (",,", "NaT,NaT,NaT", "2026-01-01,20280,2026-03-01"):
+        wrong = CliRunner().invoke(app, ["identify", *map(str, logs), "--dates", dates])
+        assert wrong.exit_code == 2
+        assert "give dates such as 2026-03-01" in wrong.stderr
     wrong = CliRunner().invoke(app, ["identify", *map(str, logs), "--dates", "2026-01-01"])
     assert wrong.exit_code == 2
     assert "has 1 dates for 3 logs" in wrong.stderr

@@ -92,7 +92,7 @@ def test_windows_are_in_the_servos_own_time_but_hold_enough_samples() -> None:
 
 
 def test_windows_are_whole_samples_and_the_twin_may_request_longer_ones() -> None:
-    slow = edge(SERVO.replace(k=7e3)).with_longest(4.0, 0.3)
+    slow = edge(SERVO.replace(k=7e3)).with_longest(4.0, 0.3, 250_000)
     agent = slow.agent_settings("axis", "boot-1")
     second = math.sqrt(1e4 / 7e3)
     assert agent.window_s == pytest.approx(second, abs=2e-4)
@@ -102,7 +102,7 @@ def test_windows_are_whole_samples_and_the_twin_may_request_longer_ones() -> Non
     samples = round(5000.0 * request.times.window)
     assert samples <= agent.longest_samples
     assert long_enough(samples / 5000.0, round(5000.0 * request.times.pre_trigger) / 5000.0, request)
-    fast = edge(scaled(SERVO, time=1e-3)).with_longest(4.0, 0.3)
+    fast = edge(scaled(SERVO, time=1e-3)).with_longest(4.0, 0.3, 250_000)
     assert fast.agent_settings("axis", "boot-1").longest_window_s == fast.window
 
 

@@ -1,18 +1,20 @@
-"""Connections without a valid token are bounded, in all and per address; those of edges are not."""
+"""Connections without a valid token or session are bounded, in all and per address; others are not."""
 
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-from service_system import TOKEN, served, twin_file
+from service_system import OPERATOR, TOKEN, served, twin_file
 
 from servotwin.twin_service import strangers
 from servotwin.twin_service.http_server import HttpServer, listening_socket
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
-Connect = Callable[[str], Awaitable[Stream]]
+Connect = Callable[..., Awaitable[Stream]]
 PATIENCE = 30.0
+SESSION = "session"
+"""In place of a token: the cookie of an operator's session."""
 
 
 def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None]]) -> None:
@@ -26,10 +28,14 @@ def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None
             task = asyncio.create_task(server.serve([listener]))
             opened: list[asyncio.StreamWriter] = []
 
-            async def connect(token: str) -> Stream:
-                reader, writer = await asyncio.open_connection(*listener.getsockname()[:2])
+            async def connect(token: str, source: str = "127.0.0.1") -> Stream:
+                reader, writer = await asyncio.open_connection(*listener.getsockname()[:2], local_addr=(source, 0))
                 opened.append(writer)
                 head = f"Authorization: Bearer {token}\r\n" if token else ""
+                if token.endswith(SESSION):
+                    cookie = system.operators.session_cookie(OPERATOR.encode()).partition(";")[0]
+                    # A forged one has another code at its end.
+                    head = f"Cookie: a=b; {cookie if token == SESSION else cookie[:-64] + 64 * '0'}\r\n"
                 writer.write(f"GET /v1/servos/ax-1/outgoing HTTP/1.1\r\nHost: twin\r\n{head}\r\n".encode())
                 return reader, writer
 
@@ -81,12 +87,32 @@ def test_strangers_of_an_address_are_bounded_and_edges_are_not(tmp_path: Path, m
     serving(tmp_path, "strangers_per_address = 3", body)
 
 
-def test_strangers_are_bounded_in_all_and_their_places_become_free(tmp_path: Path) -> None:
+def test_a_session_is_no_stranger_and_a_forged_one_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(strangers, "_GRACE_S", 0.05)
+
+    async def body(connect: Connect) -> None:
+        known, forged = await connect(SESSION), [await connect(f"forged {SESSION}") for _ in range(2)]
+        # A session reads the fleet, not an edge's messages.
+        assert [b"401" in await answer(reader) for reader, _ in (known, *forged)] == [True] * 3
+        assert await is_closed(forged[0][0])
+        for reader, writer in (known, forged[1]):
+            assert not writer.is_closing()
+            assert not reader.at_eof()
+
+    serving(tmp_path, "strangers_per_address = 1", body)
+
+
+def test_strangers_are_bounded_in_all_and_one_address_has_half_of_the_places(tmp_path: Path) -> None:
     async def body(connect: Connect) -> None:
         first, second = await connect(""), await connect("")
         assert b"401" in await answer(first[0])
         assert b"401" in await answer(second[0])
         assert await answer((await connect(TOKEN))[0]) == b""
+        assert b"200" in await answer((await connect(TOKEN, "127.0.0.2"))[0])
+        others = [await connect("", source) for source in ("127.0.0.2", "127.0.0.3")]
+        for reader, _ in others:
+            assert b"401" in await answer(reader)
+        assert await answer((await connect(TOKEN, "127.0.0.4"))[0]) == b""
         first[1].close()
         await first[1].wait_closed()
         async with asyncio.timeout(PATIENCE):
@@ -95,7 +121,7 @@ def test_strangers_are_bounded_in_all_and_their_places_become_free(tmp_path: Pat
         for _ in range(5):  # who has shown a token counts no more
             assert b"200" in await answer((await connect(TOKEN))[0])
 
-    serving(tmp_path, "strangers = 2", body)
+    serving(tmp_path, "strangers = 4", body)
 
 
 def test_without_tokens_and_behind_a_proxy_nobody_is_a_stranger(tmp_path: Path) -> None:

@@ -89,8 +89,9 @@ def test_a_folder_that_cannot_be_written_leaves_all_as_it_was(folder: Path) -> N
     (folder / "file").write_text("")
     before, tokens = files(folder), (folder / "tokens.toml").read_bytes()
     token = (folder / "ax-1/token").read_bytes()
-    code, _, error = enroll(folder, "name,edge\nax-1,\nax-2,\nax-3,file/ax-3\n", "--url", URL, "--again")
+    code, _, error = enroll(folder, "name,edge\nax-1,\nax-2,new/deep/x\nax-3,file/ax-3\n", "--url", URL, "--again")
     assert code == 2
+    assert "line 4: " in error
     assert "file/ax-3" in error
     assert (files(folder), (folder / "tokens.toml").read_bytes()) == (before, tokens)
     assert (folder / "ax-1/token").read_bytes() == token
@@ -112,6 +113,16 @@ def test_a_file_that_is_no_list_of_servos_is_one_sentence(folder: Path, rows: st
     assert code == 2
     assert fault in error
     assert error.count("\n") == 1
+
+
+def test_no_window_of_an_enrolled_edge_is_longer_than_its_twin_takes(folder: Path) -> None:
+    assert enroll(folder, "name,sample_rate_hz\nax-1,200000\n", "--url", URL)[0] == 0
+    agent = load(folder / "ax-1/edge.toml").agent
+    assert agent.window_samples < agent.longest_samples == 250_000
+    twin_file(folder, 'samples_per_window = 100\ntokens = "tokens.toml"', tokens=False)
+    code, _, error = enroll(folder, "name\nax-2\n", "--url", URL)
+    assert code == 2
+    assert "line 2: window = 1.0 s: has 5000 samples at 5000.0 Hz; the twin takes at most samples_per_window" in error
 
 
 def test_a_name_and_a_file_exclude_each_other(folder: Path) -> None:

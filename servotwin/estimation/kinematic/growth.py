@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import t as student
 
 from servotwin.estimation.estimate import NORMAL_95
 
@@ -24,15 +25,18 @@ class GapGrowth(NamedTuple):
         The gap's unit per year.
     std : float
         Its standard deviation; larger than the gaps' own make it where they scatter about the line by more than that.
+    deviations : float
+        Standard deviations on either side of a 95 % interval: by Student's distribution where the scatter makes `std`.
     """
 
     per_year: float
     std: float
+    deviations: float
 
     @property
     def interval(self) -> tuple[float, float]:
         """95 %."""
-        return self.per_year - NORMAL_95 * self.std, self.per_year + NORMAL_95 * self.std
+        return self.per_year - self.deviations * self.std, self.per_year + self.deviations * self.std
 
 
 def growth(dates: ArrayLike, gaps: ArrayLike, stds: ArrayLike) -> GapGrowth | None:
@@ -55,4 +59,5 @@ def growth(dates: ArrayLike, gaps: ArrayLike, stds: ArrayLike) -> GapGrowth | No
     slope = float(np.sum(weights * (years - middle) * values)) / moment
     left = values - np.average(values, weights=weights) - slope * (years - middle)
     scatter = float(np.sum(weights * left**2)) / (values.size - 2)
-    return GapGrowth(slope, math.sqrt(max(scatter, 1.0) / moment))
+    deviations = float(student.ppf(0.975, values.size - 2)) if scatter > 1.0 else NORMAL_95
+    return GapGrowth(slope, math.sqrt(max(scatter, 1.0) / moment), deviations)

@@ -29,7 +29,7 @@ from servotwin.estimation.kinematic.regression import (
     regression,
     solved,
 )
-from servotwin.estimation.kinematic.strokes import Strokes, counts_of, play_and_side, strokes_of
+from servotwin.estimation.kinematic.strokes import counts_of, play_and_side, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
@@ -187,11 +187,6 @@ def _follows(load: Array, count: float, reversals: int) -> bool:
     size = max(1, load.size // (_PIECES * (reversals + 1)))
     means = load[: load.size // size * size].reshape(-1, size).mean(axis=1)
     return float(np.ptp(means)) > max(_COUNTS * count, 3.0 * _COUNTS * _noise(load) / math.sqrt(size))
-
-
-def strokes_in(recording: EncoderRecording) -> Strokes:
-    """Cut at the reversals that are more than the encoder's counts and noise."""
-    return strokes_of(recording, _least_motion(recording.motor, counts_of(recording)[0]))
 
 
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:

@@ -20,6 +20,12 @@ def test_gaps_that_scatter_more_than_they_should_widen_the_interval():
     assert growth(dates, [1.0, 2.0, 1.0, 2.0], [0.01] * 4).std > 10.0 * growth(dates, [1.0] * 4, [0.01] * 4).std
 
 
+def test_a_scatter_that_three_gaps_show_is_known_poorly():
+    # Student's t with one degree of freedom.
+    found = growth(np.arange(3) * YEAR, [1.0, 2.0, 1.0], [0.01] * 3)
+    assert found.interval[1] - found.per_year == pytest.approx(12.706 * found.std, rel=1e-3)
+
+
 @pytest.mark.parametrize(
     ("dates", "gaps", "stds"),
     [([0, YEAR], [1, 2], [1, 1]), ([5, 5, 5], [1, 2, 3], [1, 1, 1]), ([0, 1, 2], [1, 2, np.nan], [1, 1, np.inf])],

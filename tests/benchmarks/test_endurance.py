@@ -6,11 +6,13 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from benchmarks import faults
+from benchmarks import endurance, endurance_site
 from benchmarks.cli import app
+from benchmarks.endurance_site import Member, Site, Witness, ask
 
 TABLES = """
 CREATE TABLE acknowledged (boot, sequence);
@@ -39,20 +41,47 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
         windows=[("b2", 0), ("b2", 1), ("b2", 2)],
         counts=[("dropped: outbox broken", 2), ("sent", 9)],
     )
+    (tmp_path / "ax-0/status.json").write_text('{"schema": "servotwin-edge-status/1", "boot": "b2", "windows_cut": 7}')
+    edge = SimpleNamespace(starts=4, ended_alone=1)
     site: Any = SimpleNamespace(
-        folder=tmp_path, edges={"ax-0": None}, outbox=lambda servo: tmp_path / servo / "outbox.sqlite"
+        folder=tmp_path, edges={"ax-0": edge}, outbox=lambda servo: tmp_path / servo / "outbox.sqlite"
     )
-    site.stored, site.waiting = lambda: faults.Site.stored(site), lambda: faults.Site.waiting(site)
+    site.stored, site.waiting = lambda: Site.stored(site), lambda: Site.waiting(site)
+    witness = Witness(site)
+    witness.look()
     samples = [(float(second), {"twin": 100 + second}) for second in range(10)]
-    found = faults._figures(site, {"edge killed": 3}, samples)
+    found = endurance._figures(site, witness, {"edge killed": 3}, samples)
     assert (found.stored, found.boots, found.applied) == (3, 2, 1)
     assert (found.lost_acknowledged, found.holes, found.counted, found.waiting) == (1, 1, 2, 1)
+    # Seven were cut in b2 up to its last status: one is stored, one waits.
+    assert (found.starts, found.ended_alone, found.unseen) == (4, 1, 5)
     assert found.memory == {"twin": (103, 109)}
     with (console := Console(width=120)).capture() as printed:
-        console.print(faults.shown(found))
+        console.print(endurance.shown(found))
     lines = [line.split() for line in printed.get().splitlines()]
     assert ["acknowledged,", "and", "not", "stored", "1"] in lines
     assert ["faults:", "edge", "killed", "3"] in lines
+
+
+def test_an_outbox_that_cannot_be_read_is_no_empty_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(endurance_site, "_PATIENCE_S", 0.0)
+    (tmp_path / "outbox.sqlite").write_bytes(b"no database" * 1000)
+    for name in ("outbox.sqlite", "missing.sqlite"):
+        with pytest.raises(RuntimeError, match=f"{name}: cannot be read"):
+            ask(tmp_path / name, "SELECT count(*) FROM windows")
+
+
+def test_a_process_that_ends_without_a_fault_is_counted_once(tmp_path: Path) -> None:
+    for code, alone in (("raise SystemExit(2)", 1), ("import time; time.sleep(60)", 0)):
+        member = Member(tmp_path, tmp_path / "log", "-c", code)
+        member.start()
+        if alone:
+            assert member.process is not None
+            member.process.wait()
+            assert member.pid == 0
+        member.kill()
+        member.kill()
+        assert (member.starts, member.ended_alone) == (1, alone)
 
 
 def test_minutes_are_for_the_endurance_alone() -> None:

@@ -1,0 +1,257 @@
+"""Twin, machines and edges of `servotwin bench endurance` as processes in a folder, and what they leave there."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from servotwin.edge_process.config_file import edge_toml, load
+from servotwin.edge_process.monitoring import read_status
+from servotwin.runtime.retry import Retry
+from servotwin.up.enrolment import Enrolment, enroll
+
+SERVOS = 4
+_RATE, _WINDOW_S, _PERIOD_S = 500.0, 0.8, 1.64
+_END_S, _PATIENCE_S = 120.0, 60.0
+_TWIN = """
+[service]
+port = {port}
+tokens = "tokens.toml"
+workers = 1
+rate_limit_per_s = 1000
+log_level = "warning"
+[models.paper]
+servo = "paper"
+[models.paper.controller]
+sample_rate_hz = {rate}
+[models.paper.twin]
+policy = "paper"
+k_dz = 1.0
+initial_gap_deg = 2.0
+validity_s = 100.0
+[servos]
+"ax-*" = "paper"
+"""
+_MACHINE = """
+role = "supervise"
+listen = "unix:{folder}/drive.sock"
+slack_s = 60.0
+block_s = 0.1
+[scenario]
+servo = "paper"
+duration_s = {duration}
+seed = {seed}
+[scenario.reference]
+kind = "square"
+amplitude_mm = 1.0
+period_s = {period}
+[scenario.gap]
+from_deg = 2.0
+to_deg = 20.0
+over_s = {duration}
+[scenario.recording]
+sample_rate_hz = {rate}
+window_s = {window}
+[scenario.controller]
+sample_rate_hz = {rate}
+[scenario.noise]
+std_mm = 0.001
+[scenario.twin]
+initial_gap_deg = 2.0
+policy = "paper"
+k_dz = 1.0
+"""
+_CLOCK = """
+import os, time
+_ahead, _time, _ns = float(os.environ.get("BENCH_CLOCK_S", 0)), time.time, time.time_ns
+if _ahead:
+    time.time = lambda: _time() + _ahead
+    time.time_ns = lambda: _ns() + int(_ahead * 1e9)
+"""
+
+
+Window = tuple[str, str, int]
+"""Servo, boot and sequence."""
+
+
+class Member:
+    """A process that is killed and started again.
+
+    Parameters
+    ----------
+    folder : Path
+    log : Path
+    arguments : str
+        Of Python.
+
+    Attributes
+    ----------
+    starts, ended_alone : int
+        Number of starts; of those that had ended without a fault when the next fault or the end of the run came.
+    """
+
+    def __init__(self, folder: Path, log: Path, *arguments: str) -> None:
+        self._folder, self._log, self._command = folder, log, [sys.executable, *arguments]
+        self.process: subprocess.Popen[bytes] | None = None
+        self.starts = self.ended_alone = 0
+        self._running = False
+
+    @property
+    def pid(self) -> int:
+        """Process id; 0: it does not run."""
+        return 0 if self.process is None or self.process.poll() is not None else self.process.pid
+
+    def start(self, clock_s: float = 0.0) -> None:
+        """Start, on a clock that is ahead."""
+        environment = {**os.environ, "PYTHONPATH": _python_path(self._log.parent), "BENCH_CLOCK_S": str(clock_s)}
+        self.starts, self._running = self.starts + 1, True
+        with self._log.open("ab") as log:
+            self.process = subprocess.Popen(
+                self._command, cwd=self._folder, stdout=log, stderr=log, env=environment, start_new_session=True
+            )
+
+    def kill(self) -> None:
+        """Kill it and its children."""
+        if self.process is not None:
+            self.ended_alone += self._running and self.process.poll() is not None
+            self._running = False
+            with suppress(ProcessLookupError):
+                os.killpg(self.process.pid, signal.SIGKILL)
+            self.process.wait()
+
+    def end(self) -> None:
+        """Ask it to end, and wait."""
+        if self.process is not None and self.process.poll() is None:
+            self._running = False
+            self.process.terminate()
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(_END_S)
+        self.kill()
+
+
+class Site:
+    """A twin, machines and their edges in a folder."""
+
+    def __init__(self, folder: Path, port: int, minutes: float) -> None:
+        self.folder = folder
+        (folder / "sitecustomize.py").write_text(_CLOCK, encoding="utf-8")
+        (folder / "twin.toml").write_text(_TWIN.format(port=port, rate=_RATE), encoding="utf-8")
+        self.twin = Member(folder, folder / "twin.log", "-m", "servotwin", "twin")
+        self.edges: dict[str, Member] = {}
+        self.machines: dict[str, Member] = {}
+        for number in range(SERVOS):
+            self._add(f"ax-{number}", number, 60.0 * minutes + 600.0)
+
+    def _add(self, servo: str, seed: int, duration: float) -> None:
+        folder = self.folder / servo
+        drive = {"kind": "simulated", "address": "unix:drive.sock", "silence_s": 5.0}
+        enroll(self.folder / "twin.toml", Enrolment(servo, folder, "supervise", _RATE, drive))
+        config = load(folder / "edge.toml")
+        agent = replace(config.agent, window_s=_WINDOW_S, pre_trigger_s=0.0, retry=Retry(0.2, 2.0, 2.0))
+        (folder / "edge.toml").write_text(edge_toml(replace(config, agent=agent)), encoding="utf-8")
+        known = {"folder": servo, "seed": seed, "rate": _RATE, "window": _WINDOW_S, "period": _PERIOD_S}
+        (self.folder / f"{servo}.toml").write_text(_MACHINE.format(duration=duration, **known), encoding="utf-8")
+        machine = ("-m", "servotwin.drives.simulated", f"{servo}.toml")
+        self.machines[servo] = Member(self.folder, self.folder / f"{servo}-machine.log", *machine)
+        self.edges[servo] = Member(
+            folder, self.folder / f"{servo}-edge.log", "-m", "servotwin.edge_process", "edge.toml"
+        )
+
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Start all; kill what is left in the end."""
+        members = [*self.machines.values(), self.twin, *self.edges.values()]
+        try:
+            for each in members:
+                each.start()
+            yield
+        finally:
+            for each in members:
+                each.kill()
+
+    def outbox(self, servo: str) -> Path:
+        """File of an edge's outbox."""
+        return self.folder / servo / "outbox.sqlite"
+
+    def waiting(self) -> dict[tuple[str, str], int]:
+        """Numbers of windows in the outboxes that are not acknowledged, by servo and boot."""
+        text = (
+            "SELECT boot, count(*) FROM windows "
+            "WHERE (boot, sequence) NOT IN (SELECT boot, sequence FROM acknowledged) GROUP BY boot"
+        )
+        return {(servo, boot): number for servo in self.edges for boot, number in ask(self.outbox(servo), text)}
+
+    def stored(self) -> set[Window]:
+        """Windows in the store."""
+        text = "SELECT servo, boot, sequence FROM messages WHERE kind = 'window'"
+        return set(ask(self.folder / "twin.db", text))
+
+    def begun(self) -> bool:
+        """True where windows have come from all edges."""
+        try:
+            with closing(sqlite3.connect(f"file:{self.folder / 'twin.db'}?mode=ro", uri=True)) as database:
+                [(servos,)] = database.execute("SELECT count(DISTINCT servo) FROM messages WHERE kind = 'window'")
+        except sqlite3.Error:
+            return False
+        return bool(servos == len(self.edges))
+
+
+class Witness:
+    """Notes during the run what edges have said, since a fault may take their files.
+
+    Attributes
+    ----------
+    acknowledged : set of (str, str, int)
+        Windows that an edge has held as acknowledged.
+    cut : dict
+        Most windows that a status of a boot has named as cut, by servo and boot.
+    """
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self.acknowledged = set[Window]()
+        self.cut: dict[tuple[str, str], int] = {}
+
+    def look(self) -> None:
+        """Note what is there now; raises RuntimeError where an outbox cannot be read."""
+        for servo in self._site.edges:
+            file = self._site.outbox(servo)
+            rows = ask(file, "SELECT boot, sequence FROM acknowledged") if file.exists() else []
+            self.acknowledged |= {(servo, boot, sequence) for boot, sequence in rows}
+            status = read_status(file.with_name("status.json")) or {}
+            boot, number = status.get("boot"), status.get("windows_cut")
+            if isinstance(boot, str) and isinstance(number, int):
+                self.cut[servo, boot] = max(number, self.cut.get((servo, boot), 0))
+
+
+def ask(file: Path, text: str) -> list[Any]:
+    """Rows of a query; a file that is being replaced, or is damaged until its edge has replaced it, is tried again.
+
+    Raises
+    ------
+    RuntimeError
+        It cannot be read for a while.
+    """
+    end = time.monotonic() + _PATIENCE_S
+    while True:
+        try:
+            with closing(sqlite3.connect(f"file:{file}?mode=rw", uri=True, timeout=_PATIENCE_S)) as database:
+                return database.execute(text).fetchall()
+        except sqlite3.Error as error:
+            if time.monotonic() > end:
+                raise RuntimeError(f"{file}: cannot be read ({error})") from None
+            time.sleep(0.2)
+
+
+def _python_path(folder: Path) -> str:
+    known = os.environ.get("PYTHONPATH", "")
+    return f"{folder}{os.pathsep}{known}" if known else str(folder)
