@@ -36,7 +36,7 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class CommissionOptions:
-    """The command's options, in SI."""
+    """The command's options, in SI but for the largest gap: mm, of a rotary axis deg."""
 
     logs: Sequence[Path]
     columns: DriveColumns
@@ -108,9 +108,10 @@ def _texts(options: CommissionOptions, found: CommissionedAxis) -> dict[Path, st
         return {}
     axis = found.axis
     if axis is None:
+        source, doubts = found.logs[0].recording.source, "; ".join(found.drive.doubts)
         raise InvalidInput(
-            f"{found.logs[0].recording.source}: an axis file holds the controller, which a log without a reference "
-            "does not show: give --reference COLUMN, or --position-gain and --velocity-gain"
+            f"{source}: an axis file holds the controller that ran, which the log does not show: {doubts}; "
+            "give --reference COLUMN, or --position-gain and --velocity-gain"
         )
     texts = {options.output: axis_text(found, axis)}
     if options.scenario is not None and options.largest_gap is not None:
@@ -210,7 +211,7 @@ def _remarks(found: CommissionedAxis) -> list[str]:
         reset = "" if law.integral_time is None else f", integral time {law.integral_time:.4g} s"
         lines.append(
             f"controller: position gain {law.position_gain:.5g} 1/s, velocity gain "
-            f"{law.velocity_gain / (found.force_per_command or 1.0):.5g} {recording.command_unit or 'command'} s/"
+            f"{law.velocity_gain / abs(found.force_per_command or 1.0):.5g} {recording.command_unit or 'command'} s/"
             f"{recording.unit}{reset}, speed filter {1e3 * law.speed_filter:.3g} ms; "
             f"{100 * law.left:.2g} % of the command is left"
         )
@@ -222,6 +223,8 @@ def _remarks(found: CommissionedAxis) -> list[str]:
         )
     lines += _shaft_lines(found)
     lines += [f"no simulation: {doubt}" for doubt in drive.doubts]
+    if found.axis is None:
+        lines.append("no axis: the controller that ran is not known; give --position-gain and --velocity-gain")
     if found.force_per_command is None:
         lines.append(
             f"no scale of the command is known: parameters are per {recording.force_unit}; give --scale, or "
@@ -241,6 +244,8 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
             f"lost motion at the load: {lost.at_load:.4g} {unit} ({low:.4g} .. {high:.4g}): {lost.status.value}; "
             "it is the gap and the wind-up by friction together"
         )
+        if lost.ratio < 0.0:
+            lines.append("the motor's encoder counts against the load's: its positions are turned")
     if shaft is None:
         return lines
     late = f"the load's encoder is {1e3 * shaft.delay:.3g} +- {2e3 * shaft.delay_std:.2g} ms late"
@@ -260,6 +265,8 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
             f"({_units(found)['inertia']}), stiffness {shaft.stiffness(load):.4g}, "
             f"damping {shaft.shaft_damping(load):.4g}"
         )
+    else:
+        lines.append("shaft: not used, its stiffness is not known: gap and elasticity look alike in this log")
     return lines
 
 

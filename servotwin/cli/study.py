@@ -170,7 +170,7 @@ def commission(
     load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it.")] = None,
     command_unit: Annotated[str | None, typer.Option(help="Where the header does not say it: N, 'N m', A, V.")] = None,
     scale: Annotated[
-        float | None, typer.Option(help="Force (rotary: torque) at the encoder per unit of the command, N or N m.")
+        float | None, typer.Option(help="Force (rotary: torque) at the load per unit of the command, N or N m.")
     ] = None,
     inertia: Annotated[
         float | None, typer.Option(help="Instead: known mass (rotary: inertia) of all that moves, kg or kg m^2.")
@@ -208,8 +208,6 @@ def commission(
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
     """Identify inertia and friction from logs of command and position in closed loop, and write an axis file."""
-    import math
-
     from servotwin.cli.commission import CommissionOptions, show
     from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
     from servotwin.logs.drive_recordings import DriveColumns, travel_of
@@ -218,7 +216,6 @@ def commission(
         motor, command, reference, load, time, rate, motor_unit, command_unit, reference_unit, load_unit, scale,
         travel_of(lead_mm, ratio),
     )  # fmt: skip
-    unit = 1e-3 if ratio is None else math.pi / 180.0
     show(
         CommissionOptions(
             logs=logs,
@@ -230,7 +227,7 @@ def commission(
             crossover=crossover,
             output=output,
             scenario=scenario,
-            largest_gap=None if largest_gap is None else largest_gap * unit,
+            largest_gap=largest_gap,
             page=page,
             as_json=json,
         )

@@ -8,9 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from servotwin.analysis.tuning.cascade import tune_cascade
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.closed_loop import rigid_axis
+from servotwin.estimation.inverse_dynamics.conditioning import motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.estimation.inverse_dynamics.identify import IdentifiedDrive, identify_drive
@@ -25,6 +28,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty
 _WIDEST = 0.99  # relative half-width that an uncertainty may have
 # Relative errors beyond the statistical ones that derivatives and a gap in the shaft brought (test_shaft).
 _SHAFT = {"m": 0.03, "k": 0.1, "c": 0.5}
+_SINE = 2.0 * math.sqrt(2.0)  # range of a sine over its standard deviation
 _PHASE_MARGIN = math.radians(60.0)
 _BY_NAME, _FITTED = DriveColumns(), GivenGains()
 
@@ -112,9 +116,9 @@ def commission(
     first = read[0].recording
     scale = first.force_per_command
     if gains.velocity_gain is not None and scale is not None:
-        gains = replace(gains, velocity_gain=gains.velocity_gain * scale)
+        gains = replace(gains, velocity_gain=gains.velocity_gain * abs(scale))
     travel = 1.0 if read[0].travel is None else read[0].travel
-    drive = identify_drive([each.recording for each in read], gains, travel, applied)
+    drive = _without_hidden_shaft(read[0], identify_drive([each.recording for each in read], gains, travel, applied))
     found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
     axis = None if drive.law is None else rigid_axis(found.best, drive.law, first, travel)
     if axis is not None and drive.shaft is not None and drive.split is not None:
@@ -154,11 +158,19 @@ def _scaled(logs: Sequence[DriveLog], inertia: float, gains: GivenGains, applied
     )
 
 
+def _without_hidden_shaft(log: DriveLog, drive: IdentifiedDrive) -> IdentifiedDrive:
+    """The drive without inertias at a shaft whose elastic deflection is less than the lost motion, which hides it."""
+    recording, lost, shaft = log.recording, log.lost_motion, drive.shaft
+    if drive.split is None or shaft is None or recording.load is None or lost is None:
+        return drive
+    acceleration = motion_of(recording.load, recording.rate, drive.bands[0]).acceleration
+    deflection = _SINE * float(np.std(acceleration)) / (2.0 * math.pi * shaft.resonance) ** 2
+    return replace(drive, split=None) if lost.at_load > deflection else drive
+
+
 def _with_shaft(axis: Axis, shaft: ShaftResponse, split: ParameterFit) -> Axis:
     """The axis with its inertia divided, on a shaft that is free in its gap."""
     motor, load, p = split["motor_inertia"], split["load_inertia"], axis.p
-    if min(motor, load) <= 0.0:
-        return axis
     actuator = replace(axis.actuator, J=motor * p * p)  # type: ignore[arg-type]
     screw = Transmission(p, shaft.stiffness(load), shaft.shaft_damping(load), FREE)
     return replace(axis, actuator=actuator, transmission=screw, load=Load((load,), motion=axis.load.motion))

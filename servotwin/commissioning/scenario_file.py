@@ -9,6 +9,7 @@ from servotwin.commissioning.commission import CommissionedAxis
 from servotwin.config.toml import Values, dumps
 from servotwin.errors import InvalidInput
 from servotwin.plant.sensors import LOAD
+from servotwin.redesign.certified.uncertainty import Uncertainty
 
 _STEPS = (30.0, 100.0)  # amplitudes of the square wave, in gaps, that the twin's settings must settle
 _WEAR = (0.1, 1.0)  # gap at the begin and at the end of the scenario, of the largest one
@@ -20,7 +21,7 @@ _TIMES = 40.0  # time constants of the loop in half a period
 
 
 def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) -> str:
-    """Text of a scenario in which the gap grows to the largest one (m, rotary: rad, at the load).
+    """Text of a scenario in which the gap grows to the largest one (mm, of a rotary axis deg, at the load).
 
     Raises
     ------
@@ -34,6 +35,7 @@ def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) ->
         raise InvalidInput(f"--largest-gap {largest_gap!r}: must be positive and finite")
     rotary, known = found.logs[0].recording.rotary, found.uncertainty
     unit, per = ("deg", 180.0 / math.pi) if rotary else ("mm", 1e3)
+    largest_gap = largest_gap / per
     amplitude = _STEPS[0] * largest_gap
     crossovers = axis.margins().gain_crossovers
     half = _TIMES / min(each.omega for each in crossovers) if crossovers else 1.0
@@ -53,6 +55,7 @@ def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) ->
         "twin": {
             "policy": "certified",
             "uncertainty": {
+                **({} if found.drive.split is None else _shaft(known)),
                 "k_t_percent": 100.0 * known.k_T,
                 "k_b_percent": 100.0 * known.k_B,
                 "gap_deg": [0.0, 1.5 * gaps[1]],
@@ -63,3 +66,8 @@ def scenario_of(found: CommissionedAxis, axis_file: Path, largest_gap: float) ->
         },
     }
     return dumps(values)
+
+
+def _shaft(known: Uncertainty) -> Values:
+    """Half-widths of load, stiffness and damping, which a second encoder shows."""
+    return {f"{name}_percent": 100.0 * float(getattr(known, name)) for name in ("m", "k", "c")}

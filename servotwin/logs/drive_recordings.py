@@ -9,23 +9,21 @@ from pathlib import Path
 
 import numpy as np
 
-from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, Mask
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
+from servotwin.estimation.kinematic.wind_up import ANGLES, LENGTHS
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.log import read_columns
-from servotwin.logs.recordings import CUT, bare_name, named_unit, numbers_of, times_of
+from servotwin.logs.recordings import CUT, given_column, guessed_column, named_unit, numbers_of, times_of
 from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
+_SAME = math.log(1.2)  # of two ways
 _HELD = 2.5  # usual intervals: nothing is known of the motion within a longer one
-# Metres or radians per unit.
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "°": math.pi / 180.0, "rev": 2.0 * math.pi}
-_POSITIONS = {**_LENGTHS, **_ANGLES}
+_POSITIONS = {**LENGTHS, **ANGLES}
 _TORQUES = ("n m", "nm", "n_m", "n·m")
 _GUESSES = {
     "time": ("time", "t", "timestamp"),
@@ -49,7 +47,7 @@ class DriveColumns:
     motor_unit, command_unit, reference_unit, load_unit : str or None
         Where the header does not say them; the reference's is the motor's, or the load's where there is one.
     force_per_command : float or None
-        N (of a rotary axis N m) at the encoder per unit of the command.
+        N (of a rotary axis N m) at the load per unit of the command.
     travel : float or None
         m (rotary: rad) of the load per radian of the motor.
     """
@@ -129,47 +127,56 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         )
     units = {part: _unit(path, part, chosen, wanted) for part in chosen}
     time = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, sizes.pop())
-    clean = cleaned(
-        time, arrays, {part: 2.0 * math.pi / _ANGLES[units[part]] for part in arrays if units[part] in _ANGLES}
-    )
+    turns = {part: 2.0 * math.pi / ANGLES[units[part]] for part in arrays if units[part] in ANGLES}
+    try:
+        clean = cleaned(time, arrays, turns)
+    except InvalidInput as error:
+        raise InvalidInput(f"log {path}: {error}") from None
     if clean.time.size < _LEAST:
         raise InvalidInput(f"log {path}: {clean.time.size} samples can be used, of at least {_LEAST}")
     grid, usable, rate = _grid(clean.time)
     channels = {part: np.interp(grid, clean.time, values) for part, values in clean.channels.items()}
     found = {**clean.found, **({CUT: 1} if table.ends_within_line else {})}
-    return _in_si(path, channels, units, (grid, usable, rate), wanted, DriveLog(None, chosen, None, found))  # type: ignore[arg-type]
+    # Between samples that lie off the grid there are values finer than a count.
+    counts = {part: resolution(np.unique(values)) for part, values in clean.channels.items()}
+    log = DriveLog(None, chosen, None, found)  # type: ignore[arg-type]
+    return _in_si(path, channels, counts, units, (grid, usable, rate), wanted, log)
 
 
 def _in_si(
     path: Path,
     channels: dict[str, Array],
+    counts: Mapping[str, float],
     units: Mapping[str, str],
     grid: tuple[Array, Mask, float],
     wanted: DriveColumns,
     log: DriveLog,
 ) -> DriveLog:
     """Convert all positions to those of the load, and the command to a force where its scale is known."""
-    count = resolution(np.unique(channels["motor"])) * _POSITIONS[units["motor"]]
+    _check_kinds(path, units, log.columns)
     for part in ("motor", "reference", "load"):
         if part in channels:
             channels[part] = channels[part] * _POSITIONS[units[part]]
     output = units.get("load", units.get("reference", units["motor"]))
-    load_count = resolution(np.unique(channels["load"])) if "load" in channels else 0.0
-    rotary, motor = output in _ANGLES, channels["motor"]
+    rotary, motor, turned = output in ANGLES, channels["motor"], units["motor"] in ANGLES
     time, usable, rate = grid
     travel, lost = wanted.travel, None
     if "load" in channels:
         lost = estimate_lost_motion(EncoderRecording(time, motor, channels["load"], None, "rad", "", f"log {path}"))
-        travel = lost.ratio if travel is None and math.isfinite(lost.ratio) else travel
-    turned = (units["motor"] in _ANGLES) and (travel is not None)
-    if units["motor"] in _ANGLES and not rotary and travel is None:
+        # Of two lengths the ratio is no travel per radian.
+        travel = abs(lost.ratio) if turned and travel is None and math.isfinite(lost.ratio) else travel
+    if turned and not rotary and travel is None:
         raise InvalidInput(
             f"log {path}: column {log.columns['motor']!r} is an angle and {output!r} is a length: give --lead-mm, the "
             "travel per turn of the motor"
         )
-    if turned and travel is not None:
-        motor, count = motor * travel, count * abs(travel)
+    ratio = travel if turned and travel is not None else 1.0
+    against = lost is not None and lost.ratio < 0.0
+    motor = motor * (-ratio if against else ratio)
+    if "reference" in channels and ratio != 1.0:
+        _check_side(path, log.columns["reference"], channels["reference"], motor, ratio)
     scale = _force_scale(path, units["command"], rotary, travel if turned or not rotary else None, wanted)
+    scale = -scale if scale is not None and against and wanted.force_per_command is None else scale
     recording = DriveRecording(
         rate=rate,
         position=motor,
@@ -179,12 +186,34 @@ def _in_si(
         load=channels.get("load"),
         rotary=rotary,
         force_per_command=scale,
-        resolution=count,
-        load_resolution=load_count,
+        resolution=counts["motor"] * _POSITIONS[units["motor"]] * ratio,
+        load_resolution=counts["load"] * _POSITIONS[units["load"]] if "load" in counts else 0.0,
         command_unit=units["command"],
         source=f"log {path}",
     )
     return replace(log, recording=recording, travel=travel, lost_motion=lost)
+
+
+def _check_kinds(path: Path, units: Mapping[str, str], columns: Mapping[str, str]) -> None:
+    """Refuse an angle where the others are lengths; only the motor's may be one."""
+    lengths = [part for part in ("motor", "load", "reference") if units.get(part) in LENGTHS]
+    angles = [part for part in ("reference", "load") if units.get(part) in ANGLES]
+    if lengths and angles:
+        raise InvalidInput(
+            f"log {path}: column {columns[angles[0]]!r} is an angle ({units[angles[0]]}) and "
+            f"{columns[lengths[0]]!r} is a length ({units[lengths[0]]}): reference and load must be of one kind, and "
+            f"of a motor that counts lengths; give --{angles[0]}-unit or --{lengths[0]}-unit where a header is wrong"
+        )
+
+
+def _check_side(path: Path, column: str, reference: Array, position: Array, ratio: float) -> None:
+    """Refuse a reference that moves as the motor does, and not as the load (`position`)."""
+    moved = float(np.ptp(reference)) / max(float(np.ptp(position)), np.finfo(float).tiny)
+    if moved > 0.0 and abs(math.log(moved * ratio)) < _SAME and abs(math.log(moved)) > _SAME:
+        raise InvalidInput(
+            f"log {path}: column {column!r} moves as far as the motor, {moved:.4g} times as far as the load: convert "
+            "it to the load, or leave out --ratio and --lead-mm, and all parameters count at the motor"
+        )
 
 
 def _force_scale(path: Path, unit: str, rotary: bool, travel: float | None, wanted: DriveColumns) -> float | None:
@@ -221,7 +250,8 @@ def _chosen(path: Path, names: tuple[str, ...], wanted: DriveColumns) -> dict[st
         raise InvalidInput(f"log {path}: --time {wanted.time!r} and --rate {wanted.rate:g}: give one of the two")
     result: dict[str, str] = {}
     for part in _PARTS:
-        name = _found(path, part, getattr(wanted, part), names)
+        given: str | None = getattr(wanted, part)
+        name = guessed_column(_GUESSES[part], names) if given is None else given_column(path, part, given, names)
         if name is not None:
             result[part] = name
         elif part in ("motor", "command"):
@@ -235,17 +265,6 @@ def _chosen(path: Path, names: tuple[str, ...], wanted: DriveColumns) -> dict[st
         if used.count(name) > 1:
             raise InvalidInput(f"log {path}: column {name!r} is named twice, once as --{part}: each part needs its own")
     return result
-
-
-def _found(path: Path, part: str, given: str | None, names: tuple[str, ...]) -> str | None:
-    if given is None:
-        bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
-        return next((bare[guess] for guess in _GUESSES[part] if guess in bare), None)
-    fitting = [name for name in names if given in (name, bare_name(name))]
-    if not fitting:
-        hint = did_you_mean(given, names)
-        raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
-    return fitting[0]
 
 
 def _unit(path: Path, part: str, chosen: Mapping[str, str], wanted: DriveColumns) -> str:

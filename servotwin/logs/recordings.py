@@ -163,7 +163,7 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
         raise InvalidInput(f"log {path}: --time {wanted.time!r} and --rate {wanted.rate:g}: give one of the two")
     for part in ("time", "motor", "load", "command"):
         given = getattr(wanted, part)
-        name = _given(path, part, given, names) if given is not None else _guessed(part, names)
+        name = given_column(path, part, given, names) if given is not None else guessed_column(_GUESSES[part], names)
         if part == "time" and wanted.rate is not None:
             continue
         if name is not None:
@@ -178,8 +178,14 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
     return result
 
 
-def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
-    """The column of that name, with its unit or without."""
+def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str:
+    """The column of that name, with its unit or without.
+
+    Raises
+    ------
+    InvalidInput
+        There is none.
+    """
     fitting = [name for name in names if given in (name, bare_name(name))]
     if not fitting:
         hint = did_you_mean(given, names)
@@ -187,9 +193,10 @@ def _given(path: Path, part: str, given: str, names: Sequence[str]) -> str:
     return fitting[0]
 
 
-def _guessed(part: str, names: Sequence[str]) -> str | None:
+def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
+    """The column with the first of the guessed names that occurs."""
     bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
-    return next((bare[guess] for guess in _GUESSES[part] if guess in bare), None)
+    return next((bare[guess] for guess in guesses if guess in bare), None)
 
 
 def bare_name(name: str) -> str:

@@ -1,6 +1,7 @@
 """`servotwin commission`: an axis file from a log of command and position; one sentence for every invalid log."""
 
 import json
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -150,8 +151,11 @@ def test_two_encoders_give_the_shaft_and_the_gap(tmp_path):
     header = "t [s],motor [m],force [N],reference [m],load [m]"
     log = tmp_path / "log.csv"
     np.savetxt(log, np.column_stack([*table, recording.load]), delimiter=",", header=header, comments="", fmt="%.12g")
-    result = run(log, "-o", tmp_path / "axis.toml", "--json")
+    twin = ("--scenario", tmp_path / "scenario.toml", "--largest-gap", 0.1, "--feedback", "load")
+    result = run(log, "-o", tmp_path / "axis.toml", *twin, "--json")
     assert result.exit_code == 0, result.output
+    known = tomllib.loads((tmp_path / "scenario.toml").read_text(encoding="utf-8"))["twin"]["uncertainty"]
+    assert 3.0 < known["m_percent"] < known["k_percent"] < known["c_percent"]
     found = json.loads(result.stdout)
     axis = st.Axis.from_file(tmp_path / "axis.toml")
     assert axis.transmission.in_gap == "free"
@@ -160,6 +164,77 @@ def test_two_encoders_give_the_shaft_and_the_gap(tmp_path):
     assert axis.transmission.k_d == pytest.approx(2e5, rel=0.15)
     assert found["shaft"]["stiffness"] == pytest.approx(axis.transmission.k_d)
     assert found["gap"]["status"]
+
+
+def with_load(path, motor=1.0, command=1.0, unit="mm"):
+    """A rigid axis with a gap of 0.1 mm, its motor in mm or in rad at 10 mm per turn."""
+    recording, gap = simulated(), 1e-4
+    load, now = np.empty(recording.position.size), 0.0
+    for place, each in enumerate(recording.position):
+        now = min(max(now, each - 0.5 * gap), each + 0.5 * gap)
+        load[place] = now
+    scale = 1.0 if unit == "mm" else 1e-3 * 2.0 * np.pi / 0.01
+    columns = {"motor": 1e3 * scale * motor * recording.position, "force": command * recording.force}
+    header = f"t [s],motor [{unit}],torque [N m],reference [mm],load [mm]"
+    return written(path, header=header, **columns, load=1e3 * load)
+
+
+def test_a_gap_on_a_rigid_shaft_is_no_elasticity(tmp_path):
+    found = st.commission(with_load(tmp_path / "log.csv", unit="rad"))
+    assert found.drive.split is None
+    assert found.axis.transmission == st.Transmission(found.axis.p)
+
+
+def test_the_ratio_of_two_lengths_is_no_travel_per_radian(tmp_path):
+    """A torque on a linear axis has no force without a lead."""
+    found = st.commission(with_load(tmp_path / "log.csv"))
+    assert found.force_per_command is None
+    assert found.best["inertia"] == pytest.approx(PARAMETERS["inertia"], rel=0.01)
+
+
+def test_a_motor_that_counts_against_its_load_is_turned(tmp_path):
+    found = st.commission(with_load(tmp_path / "log.csv", -1.0, -1.0, "rad"))
+    assert found.axis.p == pytest.approx(0.01 / (2.0 * np.pi), rel=1e-3)
+    assert found.drive.law.position_gain == pytest.approx(GAINS["position_gain"], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (lambda r: r + 0.02 * np.random.default_rng(1).standard_normal(r.size), "explains the command"),
+        (lambda r: 1.1 * r, "gains would be negative"),
+    ],
+)
+def test_a_controller_that_does_not_explain_the_log_is_not_written(tmp_path, change, says):
+    log = written(tmp_path / "log.csv", reference=1e3 * change(simulated().reference))
+    result = run(log, "-o", tmp_path / "axis.toml")
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert not (tmp_path / "axis.toml").exists()
+    assert st.commission(log).axis is None
+
+
+def test_a_reference_of_another_kind_or_side_is_told(tmp_path):
+    kinds = written(tmp_path / "kinds.csv", header="t [s],motor [m],force [N],reference [deg]")
+    assert "'reference [deg]' is an angle (deg) and 'motor [m]' is a length" in run(kinds).stderr
+    side = written(tmp_path / "side.csv", header="t [s],motor [deg],torque [N m],reference [deg]")
+    assert "moves as far as the motor" in run(side, "--ratio", 17).stderr
+
+
+def test_counts_are_those_of_the_samples(tmp_path):
+    """Not those of values between samples that came at uneven times."""
+    recording, random = simulated(), np.random.default_rng(3)
+    time = (np.arange(recording.position.size) + random.uniform(-0.2, 0.2, recording.position.size)) / recording.rate
+    found = st.commission(written(tmp_path / "log.csv", t=time))
+    assert found.logs[0].recording.resolution == pytest.approx(1e-7, rel=0.01)
+
+
+def test_the_largest_gap_of_a_rotary_axis_is_in_degrees(tmp_path):
+    log = written(tmp_path / "log.csv", header="t [s],motor [rad],torque [N m],reference [rad]")
+    scenario = tmp_path / "scenario.toml"
+    twin = ("--scenario", scenario, "--largest-gap", 0.1, "--feedback", "load", "--crossover", 120)
+    assert run(log, "-o", tmp_path / "axis.toml", *twin).exit_code == 0
+    assert tomllib.loads(scenario.read_text(encoding="utf-8"))["gap"]["to_deg"] == pytest.approx(0.1)
 
 
 @pytest.mark.skipif(not EMPS.exists(), reason="the EMPS data set is not beside this checkout (shared/data)")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -28,7 +29,7 @@ class IdentifiedDrive:
     bands : tuple of RegressionBand
         One for each recording.
     law : FittedCascade or None
-        Of the first recording; None: no reference, and no gains were given.
+        Of the first recording; None: neither were its gains given, nor does its reference show them.
     refinement : Refinement or None
         By closed-loop simulation of the first recording; None where it is not possible.
     doubts : tuple of str
@@ -107,9 +108,18 @@ def _refined(
     law = fitted_cascade(recording, gains)
     if not law.explains:
         checks.check_reference(recording, gains)
-        left = f"{100.0 * law.left:.0f} %"
-        return law, None, (f"no position controller with velocity loop explains the command ({left} are left)",)
+        return (law if gains.complete else None), None, (_unexplained(law),)
     found = refine(fit, law, recording, *filtering, p)
     if found is None:
         return law, None, ("the simulated loop does not follow the log",)
     return law, found, () if found.settled else ("the fit to the simulated motion did not come to rest",)
+
+
+def _unexplained(law: FittedCascade) -> str:
+    """Why a law is not the one that ran."""
+    if math.isfinite(law.left):
+        return f"no position controller with velocity loop explains the command ({100.0 * law.left:.0f} % are left)"
+    return (
+        "no position controller with velocity loop explains the command (its gains would be negative): is the "
+        "reference late, or in another unit or scale than the position?"
+    )

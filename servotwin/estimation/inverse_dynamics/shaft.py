@@ -25,7 +25,6 @@ _SEGMENTS = 16  # half overlapping, of the average
 _LEAST = 8  # frequencies
 _LEAKAGE = 0.02  # of the response: what the segments' window smears
 _BEYOND = 1.5  # of the resonance: corner of the filter that shows both inertias
-_REACH = 0.15  # of the resonance: frequencies up to there show it
 _EVIDENT = 4.0  # standard deviations by which the compliance must differ from none
 
 
@@ -117,7 +116,8 @@ def _fitted(frequency: Array, response: Array, spread: Array) -> tuple[float, fl
     covariance = scale * np.linalg.pinv(best.jac.T @ best.jac)
     deviations = np.sqrt(np.diag(covariance))
     delay, delay_std = float(delay / top), float(deviations[2] / top)
-    if compliance < max(_EVIDENT * deviations[0], _REACH**2):
+    # A resonance beyond the frequencies that count is extrapolated: a gap's response looks like its beginning.
+    if compliance < max(_EVIDENT * deviations[0], 1.0):
         return math.inf, math.inf, math.nan, math.inf, delay, delay_std
     omega = top / math.sqrt(compliance)
     zeta = 0.5 * loss * omega / top
@@ -132,7 +132,10 @@ def _fitted(frequency: Array, response: Array, spread: Array) -> tuple[float, fl
 
 
 def split_inertia(recording: DriveRecording, band: RegressionBand, shaft: ShaftResponse) -> ParameterFit | None:
-    """Fit the inertias before and behind the shaft, from both accelerations; None: no resonance, or it is too fast."""
+    """Fit the inertias before and behind the shaft, from both accelerations.
+
+    None: there is no resonance, it is too fast, or an inertia is not positive for sure.
+    """
     corner = _BEYOND * shaft.resonance
     if recording.load is None or not corner < 0.2 * recording.rate:
         return None
@@ -145,4 +148,6 @@ def split_inertia(recording: DriveRecording, band: RegressionBand, shaft: ShaftR
     # A controller holds its command for a sample: around the position's instant acts the mean of two.
     held = 0.5 * (recording.force + np.concatenate([recording.force[:1], recording.force[:-1]]))
     rows = rows_of(replace(recording, force=held), motor, wide, cycle_time(motor), behind)
-    return least_squares(SPLIT, rows.design[:, : len(SPLIT)], rows)
+    fit = least_squares(SPLIT, rows.design[:, : len(SPLIT)], rows)
+    sure = all(fit[name] > fit.half_width(name) for name in ("load_inertia", "motor_inertia"))
+    return fit if sure else None

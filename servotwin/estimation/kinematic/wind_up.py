@@ -13,8 +13,10 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.shown import position_unit
 
-_ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "°": math.pi / 180.0, "rev": 2.0 * math.pi}
-_LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
+ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "°": math.pi / 180.0, "rev": 2.0 * math.pi}
+"""Radians per unit."""
+LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
+"""Metres per unit."""
 _RATIO = 0.05  # by which the recording's load per motor may differ from the machine's
 _DOUBT = 1.0  # of the wind-up: friction changes, and a load that swings leaves less of it
 _SHARE = 0.5  # of the lost motion: a larger wind-up leaves no gap that is known
@@ -136,10 +138,10 @@ def gap_of_machine(recording: EncoderRecording, lost: LostMotion, machine: Plant
 
 def _units(recording: EncoderRecording, machine: Plant) -> tuple[float, float]:
     """SI units in one unit of the motor and of the load."""
-    loads = _ANGLES if position_unit(machine).si == "rad" else _LENGTHS
-    for part, unit, known in (("motor", recording.motor_unit, _ANGLES), ("load", recording.load_unit, loads)):
+    loads = ANGLES if position_unit(machine).si == "rad" else LENGTHS
+    for part, unit, known in (("motor", recording.motor_unit, ANGLES), ("load", recording.load_unit, loads)):
         if unit not in known:
             raise InvalidInput(
                 f"{recording.source}: {part} in {unit!r}: with --axis give --{part}-unit, one of {', '.join(known)}"
             )
-    return _ANGLES[recording.motor_unit], loads[recording.load_unit]
+    return ANGLES[recording.motor_unit], loads[recording.load_unit]
