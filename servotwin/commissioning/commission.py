@@ -35,7 +35,7 @@ _BY_NAME, _FITTED = DriveColumns(), GivenGains()
 
 @dataclass(frozen=True, eq=False)
 class CommissionedAxis:
-    """What recordings say of a drive.
+    """Parameters, controller and axis of a drive, from recordings.
 
     Attributes
     ----------

@@ -35,7 +35,7 @@ class LastWindow:
 
 @dataclass(frozen=True)
 class FleetRow:
-    """What is known of a servo now.
+    """Present knowledge of a servo.
 
     Attributes
     ----------

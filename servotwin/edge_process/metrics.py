@@ -85,7 +85,7 @@ def _lines(metric: _Metric, status: Mapping[str, Any], servo: Mapping[str, str])
 
 
 def _link_lines(status: Mapping[str, Any], servo: Mapping[str, str]) -> Iterator[str]:
-    """Whether the twin is reached, in each direction; nothing for an edge without a twin."""
+    """Lines that tell whether the twin is reached, in each direction; nothing for an edge without a twin."""
     ways = {name: status[name] for name in ("up", "down") if isinstance(status.get(name), Mapping)}
     samples = [Sample(not way.get("trouble"), {**servo, "way": name}) for name, way in ways.items()]
     if samples:

@@ -111,7 +111,7 @@ class _Feedback(NamedTuple):
 
 
 def _feedback(plant: Plant, law: Law) -> _Feedback:
-    """What a continuous law makes of the two measurements."""
+    """Command of a continuous law, from the two measurements."""
     if isinstance(law, LinearLaw):
         matrices = law_matrices(law)
         return _Feedback(matrices.A, matrices.B[:, 1:], matrices.C, matrices.D[1:])

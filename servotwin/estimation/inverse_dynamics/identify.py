@@ -116,7 +116,7 @@ def _refined(
 
 
 def _unexplained(law: FittedCascade) -> str:
-    """Why a law is not the one that ran."""
+    """Say why a law is not the one that ran."""
     if math.isfinite(law.left):
         return f"no position controller with velocity loop explains the command ({100.0 * law.left:.0f} % are left)"
     return (

@@ -1,1 +1,1 @@
-"""What windows teach across time: gap and wear, and the numbers of machine and motor; `wear.Wear` is the entry."""
+"""Knowledge from windows across time: gap and wear, and the numbers of machine and motor; `wear.Wear` is the entry."""

@@ -1,4 +1,4 @@
-"""What the windows of a servo have taught, from one to the next: gap and wear, the machine's and the motor's numbers.
+"""Knowledge of a servo from its windows, from one to the next: gap and wear, the machine's and the motor's numbers.
 
 `Wear.update` takes one window's estimate, and `Wear.expect` says what is known before the next one. The parts are in
 this package: the trend of the gap (`trend`), the machine's stiffness, damping, pitch and mass ratio (`machine`), and
