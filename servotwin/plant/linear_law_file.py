@@ -138,14 +138,32 @@ def _read_system(path: Path) -> _System:
         if name not in arrays:
             found = ", ".join(arrays) or "nothing"
             raise InvalidInput(f"law system = {path}: has no {name}{did_you_mean(name, arrays)}; it has {found}")
-    try:
-        A, B, C, D = (np.atleast_2d(np.asarray(arrays[name], dtype=float)) for name in "ABCD")
-        dt = float(np.asarray(arrays.get("dt", 0.0), dtype=float).item())
-    except (TypeError, ValueError):
-        raise InvalidInput(f"law system = {path}: A, B, C and D must be matrices of numbers, and dt a number") from None
+    A, B, C, D = (_matrix(path, name, arrays[name]) for name in "ABCD")
     if A.size == 0:
         A, B, C = np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((1, 0))
-    return _System(A, B, C, D, dt or None)
+    return _System(A, B, C, D, _sample_time(path, arrays.get("dt", 0.0)))
+
+
+def _matrix(path: Path, name: str, given: Any) -> Array:
+    values = np.asarray(given)
+    if values.ndim > 2 or not (np.issubdtype(values.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)):
+        raise InvalidInput(
+            f"law system = {path}: {name} has {values.ndim} dimensions of {values.dtype}; "
+            "it must be a matrix of real numbers"
+        )
+    return np.atleast_2d(values.astype(float))
+
+
+def _sample_time(path: Path, given: Any) -> float | None:
+    """Sample time, s; None: continuous, which a dt of 0 stands for."""
+    values = np.asarray(given)
+    # True is python-control's "discrete, at a rate that nobody stated".
+    real = np.issubdtype(values.dtype, np.floating) or np.issubdtype(values.dtype, np.integer)
+    if values.size != 1 or not real or not 0.0 <= float(values.item()) < np.inf:
+        raise InvalidInput(
+            f"law system = {path}: dt = {given!r}: must be the sample time in s, or 0 of a continuous system"
+        )
+    return float(values.item()) or None
 
 
 def _arrays(path: Path) -> Mapping[str, Any]:
@@ -155,10 +173,18 @@ def _arrays(path: Path) -> Mapping[str, Any]:
         if path.suffix == ".npz":
             with np.load(path, allow_pickle=False) as file:
                 return dict(file)
-        from scipy.io import loadmat
-
-        return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+        return _mat_arrays(path)
     except OSError as error:
         raise InvalidInput(f"law system = {path}: cannot be read ({error.strerror or error})") from None
     except (ValueError, NotImplementedError, zipfile.BadZipFile, EOFError) as error:
         raise InvalidInput(f"law system = {path}: is no {path.suffix} file of matrices ({error})") from None
+
+
+def _mat_arrays(path: Path) -> Mapping[str, Any]:
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatReadError
+
+    try:
+        return {name: value for name, value in loadmat(path).items() if not name.startswith("__")}
+    except (MatReadError, TypeError) as error:  # TypeError: what damaged files of MATLAB 5 end in
+        raise ValueError(error) from None

@@ -100,3 +100,29 @@ def test_a_wrong_law_is_refused_in_one_sentence(tmp_path: Path, keys: str, messa
         drive_with(keys, tmp_path)
     assert "axis.toml" in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"dt": True}, "dt = .*must be the sample time in s, or 0 of a continuous system"),
+        ({"dt": -1e-3}, "dt = .*must be the sample time in s"),
+        ({"B": np.ones((1, 1, 1))}, "B has 3 dimensions of float64; it must be a matrix of real numbers"),
+        ({"A": np.array([[-50.0 + 1.0j]])}, "A has 2 dimensions of complex128; it must be a matrix of real numbers"),
+    ],
+)
+def test_matrices_that_are_none_are_refused(tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    # As docs/controllers.md shows it: scipy's continuous systems have no dt.
+    recipe = {"A": LEAD.A, "B": LEAD.B, "C": LEAD.C, "D": LEAD.D, "dt": LEAD.dt or 0}
+    np.savez(tmp_path / "law.npz", **recipe)
+    assert drive_with('system = "law.npz"\ntorque_limit_n_m = 60.0\n', tmp_path).controller.sample_rate is None
+    np.savez(tmp_path / "law.npz", **{**recipe, **changes})
+    with pytest.raises(InvalidInput, match=message):
+        drive_with('system = "law.npz"\ntorque_limit_n_m = 60.0\n', tmp_path)
+
+
+@pytest.mark.parametrize("content", [bytes(500), b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM" + b"\xff" * 64])
+def test_a_damaged_mat_file_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "law.mat").write_bytes(content)
+    with pytest.raises(InvalidInput, match=r"is no \.mat file of matrices"):
+        drive_with('system = "law.mat"\n', tmp_path)
