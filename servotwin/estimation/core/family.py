@@ -12,12 +12,11 @@ from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import matrix_balance
+from scipy.linalg.lapack import dgebal
 
 from servotwin.hybrid.compiled import compiled
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
-from servotwin.plant.structure import chain
 
 _TERMS = 18  # of the series, for a norm below 1/4
 MOTOR = ("J", "L", "R", "k_T", "k_B")
@@ -63,11 +62,8 @@ class Family:
 
     def sampled(self, sample_rate: float, hold: InputHold = InputHold.LINEAR) -> Sampled:
         """Discretise at a sample rate (Hz)."""
-        interval = 1.0 / sample_rate
-        parts = [_discretised(self.system, one, interval, hold) for one in (self.system, *self.by)]
-        steps = [parts[0][0], *(derivative for _, derivative in parts[1:])]
-        size = self.system.B.size
-        F, G, H = (np.array([step[:size, part] for step in steps]) for part in (slice(size), size, size + 1))
+        steps, size = _discretised(self.system, self.by, 1.0 / sample_rate, hold), self.system.B.size
+        F, G, H = (np.ascontiguousarray(steps[:, :size, part]) for part in (slice(size), size, size + 1))
         rows = (self.system, *self.by)
         return Sampled(F, G - H, H, np.array([one.C for one in rows]), np.array([one.D for one in rows]))
 
@@ -110,19 +106,26 @@ class Sampled:
 
     def free(self, samples: int) -> Array:
         """(N, n) outputs of the unforced system from each unit state."""
-        bare = Sampled(self.F[:1], self.now[:1], self.after[:1], self.C[:1], self.D[:1])
-        silence, states = np.zeros(samples), np.eye(self.C.shape[1])
-        return np.array([bare.respond(silence, state)[0] for state in states])
+        rows, jump = np.empty((samples, self.C.shape[1])), self.F[0]
+        rows[:1], known = self.C[0], 1
+        # Row i is C F^i: those known, moved on by as many samples, are the next ones.
+        while known < samples:
+            more = min(known, samples - known)
+            rows[known : known + more] = rows[:more] @ jump
+            known, jump = known + more, jump @ jump
+        return np.ascontiguousarray(rows.T)
 
 
-def _discretised(system: Matrices, by: Matrices, interval: float, hold: InputHold) -> tuple[Array, Array]:
-    """exp of the system with its input's value and slope as states, over an interval, and its derivative."""
-    flow, change = _flow(system, interval, hold), _flow(by, interval, hold, constant=False)
-    _, (scale, _) = matrix_balance(flow, permute=False, separate=True)
+def _discretised(system: Matrices, by: Sequence[Matrices], interval: float, hold: InputHold) -> Array:
+    """(P + 1, N + 2, N + 2) exp of the system with its input's value and slope as states, over an interval, and its
+    derivatives."""
+    flow = _flow(system, interval, hold)
+    changes = np.array([_flow(one, interval, hold, constant=False) for one in by]).reshape(len(by), *flow.shape)
+    scale = dgebal(flow, scale=1)[3]
     ratio = scale[None, :] / scale[:, None]
-    step = np.zeros((2, *flow.shape))
-    _exponential(flow * ratio, change * ratio, step)
-    return step[0] / ratio, step[1] / ratio
+    steps = np.zeros((len(by) + 1, *flow.shape))
+    _exponential(flow * ratio, changes * ratio, steps)
+    return steps / ratio
 
 
 @compiled
@@ -138,8 +141,8 @@ def multiplied(one: Array, other: Array) -> Array:
 
 
 @compiled
-def _exponential(flow: Array, change: Array, step: Array) -> None:
-    """exp(flow) into step[0], its derivative in the direction `change` into step[1]: Taylor, then squaring.
+def _exponential(flow: Array, changes: Array, steps: Array) -> None:
+    """exp(flow) into steps[0], its derivatives in the directions `changes` into the others: Taylor, then squaring.
 
     Compiled, because the libraries' threads can lose milliseconds over a small matrix on a busy machine.
     """
@@ -148,18 +151,20 @@ def _exponential(flow: Array, change: Array, step: Array) -> None:
     for a in range(size):
         largest = max(largest, np.sum(np.abs(flow[a])))
     halvings = max(0, int(np.ceil(np.log2(max(largest, 1e-300)))) + 2)
-    small, turn = flow / 2.0**halvings, change / 2.0**halvings
-    term, slope = np.eye(size), np.zeros((size, size))
-    step[0] = np.eye(size)
+    small, turns = flow / 2.0**halvings, changes / 2.0**halvings
+    term, slopes = np.eye(size), np.zeros(changes.shape)
+    steps[0] = np.eye(size)
     for order in range(1, _TERMS):
-        slope = (multiplied(slope, small) + multiplied(term, turn)) / order
+        for p in range(len(changes)):
+            slopes[p] = (multiplied(slopes[p], small) + multiplied(term, turns[p])) / order
+            steps[p + 1] += slopes[p]
         term = multiplied(term, small) / order
-        step[0] += term
-        step[1] += slope
+        steps[0] += term
     for _ in range(halvings):
-        # The derivative of a square, before the square itself replaces its factor.
-        step[1] = multiplied(step[0], step[1]) + multiplied(step[1], step[0])
-        step[0] = multiplied(step[0], step[0])
+        # The derivatives of a square, before the square itself replaces its factor.
+        for p in range(1, len(steps)):
+            steps[p] = multiplied(steps[0], steps[p]) + multiplied(steps[p], steps[0])
+        steps[0] = multiplied(steps[0], steps[0])
 
 
 def _flow(system: Matrices, interval: float, hold: InputHold, constant: bool = True) -> Array:
@@ -215,13 +220,15 @@ def structure_family(servo: Servo) -> Family:
     "k/m" scales every stiffness, "c/m" every damping, "pitch" the screw. The state is z = x - B_velocity d, whose
     derivative does not contain the input's. Only a rigid screw is a function of its angle alone.
     """
-    m, k, c, p = servo.masses, servo.stiffnesses, servo.dampings, servo.p
-    whole, bare = servo.chain(), chain(m, 0.0 * k, 0.0 * c).A
-    by_k, by_c = chain(m, k, 0.0 * c).A - bare, chain(m, 0.0 * k, c).A - bare
+    p, whole = servo.p, servo.chain()
+    by_k, by_c = np.zeros((2, *whole.A.shape))
+    # The accelerations (lower half) are linear in the stiffnesses (by the positions) and the dampings (by the speeds).
+    masses = len(whole.A) // 2
+    by_k[masses:, :masses], by_c[masses:, masses:] = whole.A[masses:, :masses], whole.A[masses:, masses:]
     velocity, row = whole.B_velocity, whole.C_last
     B, D = p * (whole.A @ velocity + whole.B_position), p * float(row @ velocity + whole.D[-1])
     none = np.zeros_like(B)
     stiffness = Matrices(by_k, p * (by_k @ velocity + whole.B_position), none, 0.0)
     damping = Matrices(by_c, p * (by_c @ velocity + whole.A @ velocity), none, p * float(row @ velocity))
-    pitch = Matrices(np.zeros_like(bare), B, none, D)
+    pitch = Matrices(np.zeros_like(by_k), B, none, D)
     return Family(STRUCTURE, Matrices(whole.A, B, row, D), (stiffness, damping, pitch))

@@ -123,8 +123,7 @@ def _step(here: FitPoint, known: ParameterPrior, damping: float) -> Array:
 def scan(model: JointModel, values: Mapping[str, float], gaps: Array, keep: int, reduce: Reduce) -> list[Array]:
     """The `keep` best starts (P,) of a grid of gaps (rad) and places, the other parameters as in `values`."""
     grid = [{**values, "gap": float(gap), "place": place} for gap in gaps for place in (-1.0, 0.0, 1.0)]
-    costs = [model.cost(one, reduce) for one in grid]
-    best = np.argsort(costs, kind="stable")[:keep]
+    best = np.argsort(model.costs(values, grid, reduce), kind="stable")[:keep]
     return [np.array([grid[i][name] for name in model.names]) for i in best]
 
 

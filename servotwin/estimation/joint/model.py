@@ -8,8 +8,9 @@ offset are linear unknowns, solved for on the way.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -83,9 +84,13 @@ class JointModel:
 
     def adapted(self, values: Mapping[str, float]) -> Servo:
         """The servo with the parameters' factors."""
-        k, c, p, k_B = (math.exp(values.get(name, 0.0)) for name in (*STRUCTURE, "k_B"))
-        one = self.servo
-        return one.replace(k=tuple(k * one.stiffnesses), c=tuple(c * one.dampings), p=p * one.p, k_B=k_B * one.k_B)
+        names = zip(("k", "c", "p", "k_B"), (*STRUCTURE, "k_B"), strict=True)
+        return self._apart.scaled({name: math.exp(values.get(parameter, 0.0)) for name, parameter in names})
+
+    @cached_property
+    def _apart(self) -> Servo:
+        """The servo with a number for each mass."""
+        return self.servo.replace(k=tuple(self.servo.stiffnesses), c=tuple(self.servo.dampings))
 
     def motor(self, servo: Servo, values: Mapping[str, float]) -> tuple[Array, dict[str, Array]]:
         """Angle of the motor from its first sample on (n,), and its derivatives by the parameters it depends on."""
@@ -118,13 +123,21 @@ class JointModel:
 
     def cost(self, values: Mapping[str, float], reduce: Reduce) -> float:
         """Squared length of the residual, nuisances projected out."""
-        servo, theta_m, at = self.screw(values)
+        return self.costs(values, [values], reduce)[0]
+
+    def costs(self, values: Mapping[str, float], gaps: Sequence[Mapping[str, float]], reduce: Reduce) -> list[float]:
+        """The same at points that differ from `values` in "gap", "place" and "gap rate" alone."""
+        servo = self.adapted(values)
+        theta_m, _ = self.motor(servo, values)
         structure = structure_family(servo).select(()).sampled(self.rate)
-        forced = structure.plain(contacts(theta_m, at)[:1])
         shift = values.get("delay", 0.0) * self.rate
-        rows = reduce(np.vstack([self.measured - self.delayed(forced, shift), self.nuisances(structure, shift)]))
-        remainder = project_out(orthonormal(rows[1:]), rows[:1])[0]
-        return float(remainder @ remainder)
+        basis = orthonormal(reduce(self.nuisances(structure, shift)))
+        result = []
+        for one in gaps:
+            forced = structure.plain(contacts(theta_m, self.gap_at(theta_m, one))[:1])
+            remainder = project_out(basis, reduce(self.measured - self.delayed(forced, shift)))[0]
+            result.append(float(remainder @ remainder))
+        return result
 
     def slopes(self, values: Mapping[str, float], reduce: Reduce) -> JointSlopes:
         """Residual and derivatives; those of the nuisances by the parameters are included."""
