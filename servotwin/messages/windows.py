@@ -76,8 +76,12 @@ def pack_channel(name: str, unit: str, samples: Iterable[float]) -> Channel:
     require(isfinite(scale), f"channel {name}: the range from {lowest} to {highest} {unit} is too large")
     if scale == 0.0:
         return Channel(name, unit, 0.0, lowest, bytes(2 * len(values)))
-    codes = array("h", [_code((value - lowest) / scale) for value in values])
-    return Channel(name, unit, scale, lowest - _LOWEST * scale, _little_endian(codes).tobytes())
+    codes = [round((value - lowest) / scale) + _LOWEST for value in values]
+    most = _STEPS + _LOWEST
+    # A scale near the smallest float is so coarse that the quotient can exceed the last step.
+    if max(codes) > most:
+        codes = [min(code, most) for code in codes]
+    return Channel(name, unit, scale, lowest - _LOWEST * scale, _little_endian(array("h", codes)).tobytes())
 
 
 def pack_finely(name: str, unit: str, samples: Iterable[float]) -> tuple[Channel, Channel]:
@@ -97,11 +101,6 @@ def unpack_channel(channel: Channel) -> "array[float]":
     codes.frombytes(channel.data)
     scale, offset = channel.scale, channel.offset
     return array("d", [offset + scale * code for code in _little_endian(codes)])
-
-
-def _code(steps: float) -> int:
-    # A scale near the smallest float is so coarse that the quotient can exceed the last step.
-    return min(round(steps), _STEPS) + _LOWEST
 
 
 def _little_endian(codes: "array[int]") -> "array[int]":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
@@ -148,7 +148,7 @@ class ShaftModel:
         """Slower fits see more of the load's slow motion."""
         return 0.5, 0.15
 
-    @property
+    @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
         """Half gap, offset of the motor's encoder, delay, ratio; factors; first positions and speeds of the masses."""
         load, known = self.axis.load, self.priors

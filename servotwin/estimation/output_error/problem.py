@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel
+from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
 LARGEST = 4.0  # standard deviations by which an unknown may move
@@ -127,8 +128,19 @@ def delayed(drive: Array, samples: float) -> Array:
     """A signal (N,) that is late by a number of samples, by cubics through four neighbours; its ends last."""
     if samples == 0.0:
         return drive
-    at = np.arange(drive.size) - samples
-    whole = np.floor(at).astype(int)
-    t = at - whole
-    a, b, c, d = (drive[np.clip(whole + shift, 0, drive.size - 1)] for shift in (-1, 0, 1, 2))
-    return np.asarray(b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a))))
+    out = np.empty(drive.size)
+    delay(np.ascontiguousarray(drive), samples, out)
+    return out
+
+
+@bare
+def delay(drive: Array, samples: float, out: Array) -> None:
+    """`delayed` into `out` (N,)."""
+    last = drive.size - 1
+    for i in range(drive.size):
+        at = i - samples
+        whole = int(np.floor(at))
+        t = at - whole
+        a, b = drive[min(max(whole - 1, 0), last)], drive[min(max(whole, 0), last)]
+        c, d = drive[min(max(whole + 1, 0), last)], drive[min(max(whole + 2, 0), last)]
+        out[i] = b + 0.5 * t * (c - a + t * (2.0 * a - 5.0 * b + 4.0 * c - d + t * (3.0 * (b - c) + d - a)))
