@@ -61,8 +61,9 @@ def test_a_swap_does_not_move_the_voltage_on_identical_inputs(rate: float | None
 
 
 @pytest.mark.slow
+@pytest.mark.random
 def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -> None:
-    for seed in range(500, 510):
+    for seed in range(500, 500 + extent(3, 20)):
         assert hostile.endured(seed, TwinFault.NONE, QUICK).worst < 1.0
 
 
@@ -71,22 +72,22 @@ def test_the_fallback_set_keeps_to_its_band_on_other_machines_than_the_model() -
 def test_a_wrong_gap_alone_does_not_take_the_loop_out_of_the_band() -> None:
     """What the policy may propose for some gap, on machines of every gap, the input bias cancelled as it would be.
 
-    The suite tries every fourth candidate on four plants, which have the same worst error as all on eight.
+    The suite has twins that state a third and three times the gap, below.
     """
     policy = CertifiedPolicy(hostile.model())
     candidates = candidates_of(
         policy.servo, policy.uncertainty, policy.demands_within_band(), disturbed=True, noisy=False
     )
     known = policy.uncertainty.replace(input_bias=(-policy.bias_floor, policy.bias_floor))
-    number = extent(4, 8)
-    machines = members_of(policy.servo, known, number, number, seed=3)
-    for outcome in assess(candidates[:: extent(4, 1)], machines, policy.simulations):
+    machines = members_of(policy.servo, known, 8, 8, seed=3)
+    for outcome in assess(candidates, machines, policy.simulations):
         assert outcome.tail.max() < hostile.band().error
 
 
 @cache
 def endured(kind: TwinFault) -> hostile.HostileOutcome:
-    return hostile.endured(20, kind, QUICK)
+    """Five steps; silence needs more, for it to end in the fallback set, and costs nothing."""
+    return hostile.endured(20, kind, QUICK, duration=100.0 if kind is TwinFault.SILENT else 50.0)
 
 
 @pytest.mark.slow

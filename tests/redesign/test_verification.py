@@ -167,7 +167,7 @@ def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 @pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
 def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
