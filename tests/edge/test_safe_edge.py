@@ -8,6 +8,7 @@ from functools import cache
 
 import pytest
 from exploration import extent
+from few_machines import FEW
 
 from benchmarks import hostile
 from benchmarks.hostiletwin import HONEST, HostileTwin, TwinFault
@@ -17,15 +18,13 @@ from servotwin.messages import Cause, Gains, Reason
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import draw as members_of
 from servotwin.simulation import Simulation
 from servotwin.twin.settings import TwinSettings
 
-QUICK = TwinSettings(demands=Demands(machines=64, screened=4, scales=(0.5, 0.7), settled=0.95))
-"""Settings verified on fewer machines than usual."""
+QUICK = TwinSettings(demands=FEW)
 
 
 def drawn(own: Controller, draw: random.Random) -> Controller:

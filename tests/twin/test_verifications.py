@@ -9,6 +9,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from few_machines import FEW
 
 from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
@@ -36,7 +37,7 @@ SERVO = Servo.preset("paper")
 def scenario() -> Scenario:
     certified = Scenario.preset("certified")
     # Its windows stand for those of other settings too: they must not tell the laws apart.
-    twin = certified.twin.replace(demands=replace(certified.twin.demands, notch=False))
+    twin = certified.twin.replace(demands=replace(FEW, notch=False))
     return certified.replace(gap=12.0 * DEG, duration=45.0, name="axis", twin=twin)
 
 
