@@ -20,7 +20,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
 from servotwin.runtime.service_manager import ServiceManager
 from servotwin.twin_service.config import ServiceConfig
-from servotwin.twin_service.http_app import HttpApp
+from servotwin.twin_service.http_app import ABORT, HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 from servotwin.twin_service.strangers import Stranger, StrangerLimit
 
@@ -90,6 +90,7 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         self._unreported = 0
         super().on_message_begin()
+        self.scope["extensions"] = {ABORT: self.transport.abort}  # type: ignore[typeddict-item]
         self._head = 0
         self._start_timer()
 

@@ -5,6 +5,7 @@ import os
 import signal
 import time
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import httpx
 import pytest
@@ -220,6 +221,51 @@ def serious_faults(page):
     found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
     faults = [each for each in found["violations"] if each["impact"] in ("serious", "critical")]
     return [(each["id"], [node["html"][:120] for node in each["nodes"][:3]]) for each in faults]
+
+
+def watchers(twin):
+    text = httpx.get(f"{twin.url}/metrics").text
+    return next(int(float(line.split()[1])) for line in text.splitlines() if line.startswith("servotwin_watchers "))
+
+
+def reaches(look, wanted):
+    end = time.monotonic() + WAIT_MS / 1000
+    while look() != wanted:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_a_page_that_nobody_sees_leaves_its_stream_to_others(open_page, twin):
+    reaches(lambda: watchers(twin), 0)
+    page = open_page()
+    reaches(lambda: watchers(twin), 1)
+    see = "hidden => { Object.defineProperty(document, 'hidden', { get: () => hidden, configurable: true });"
+    see += " document.dispatchEvent(new Event('visibilitychange')); }"
+    page.evaluate(see, True)
+    reaches(lambda: watchers(twin), 0)
+    page.evaluate(see, False)
+    reaches(lambda: watchers(twin), 1)
+
+
+def test_numbers_are_readable_and_long_windows_complete(open_page):
+    page = open_page()
+    text = "([gap, low, high]) => import('/static/format.js').then((f) => f.gapText(gap, [low, high], 1))"
+    assert page.evaluate(text, [4.5, 4.4, 4.6]) == "4.50 ± 0.10"
+    assert page.evaluate(text, [4.5e-8, 4.4e-8, 4.6e-8]) == "(4.50 ± 0.10) × 10^−8"
+    samples, rate = 200_000, 1000.0
+
+    def answer(route):
+        asked = {key: float(value[0]) for key, value in parse_qs(urlsplit(route.request.url).query).items()}
+        part = range(int(asked["from"] * rate), min(samples, int(asked["to"] * rate) + 2))
+        assert len(part) <= 4 * asked["points"]
+        channel = {"name": "position", "time": [k / rate for k in part], "values": list(part)}
+        route.fulfill(json={"channels": [channel]})
+
+    page.route("**/channels?*", answer)
+    whole = """window => import('/static/machine.js').then(({ MachinePage }) => MachinePage.prototype.everySample.call(
+        { name: "m", windowNote: document.createElement("p") }, window, "b", 1))"""
+    shown = {"samples": samples, "rate": rate, "channels": [{"name": "position", "time": [], "values": []}]}
+    assert page.evaluate(whole, shown)["channels"][0]["values"] == list(range(samples))
 
 
 def test_a_new_window_appears_by_itself(open_page, twin):

@@ -8,7 +8,7 @@ import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, p
 import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
-const REFRESH_MS = 1500, EVERY = 20000;
+const REFRESH_MS = 1500, EVERY = 20000, PART = 4 * EVERY; // samples that one answer holds undecimated
 const scaled = (values, factor) => values.map((value) => (value === null ? null : value * factor));
 
 export class MachinePage {
@@ -242,7 +242,8 @@ export class MachinePage {
     this.windowFile.href = `${api.windowPath(this.name, boot, sequence)}/channels.csv`;
     this.shown = key;
     try {
-      const window = await api.channels(this.name, boot, sequence, points);
+      let window = await api.channels(this.name, boot, sequence, points);
+      if (points === EVERY && window.samples > PART) window = await this.everySample(window, boot, sequence);
       if (this.closed || this.shown !== key) return;
       this.showWindow(window);
     } catch (error) {
@@ -252,6 +253,26 @@ export class MachinePage {
       for (const plot of [this.positionPlot, this.motorPlot, this.voltagePlot]) if (plot.data) plot.show([[], ...plot.data.slice(1).map(() => [])], "no samples");
       if (error.status === 401) this.live.end(error.message);
     }
+  }
+
+  // A long window comes in parts, each of which holds every sample; those at the seams come twice.
+  async everySample(window, boot, sequence) {
+    const channels = new Map(window.channels.map((each) => [each.name, { ...each, time: [], values: [] }]));
+    for (let first = 0; first < window.samples - 1; first += PART - 2) {
+      setText(this.windowNote, `Reading sample ${first} of ${window.samples} …`);
+      const last = Math.min(first + PART - 3, window.samples - 1);
+      const part = await api.channels(this.name, boot, sequence, EVERY, first / window.rate, last / window.rate);
+      if (this.closed) return window;
+      for (const { name, time, values } of part.channels) {
+        const whole = channels.get(name), after = whole.time.at(-1) ?? -1;
+        const skip = time.findIndex((each) => each > after);
+        for (let i = skip; i >= 0 && i < time.length; i++) {
+          whole.time.push(time[i]);
+          whole.values.push(values[i]);
+        }
+      }
+    }
+    return { ...window, channels: [...channels.values()] };
   }
 
   showWindow(window) {
