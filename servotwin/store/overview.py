@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
@@ -152,8 +152,13 @@ def gaps(
 
 def decisions(connection: sa.Connection, servo: str, limit: int) -> list[StoredEvidence]:
     """Updates, receipts, fallbacks and starts of the edge, oldest first: the newest `limit` of each kind."""
+    return evidence_of_kinds(connection, servo, ("update", *_VERSIONED), limit)
+
+
+def evidence_of_kinds(connection: sa.Connection, servo: str, kinds: Iterable[str], limit: int) -> list[StoredEvidence]:
+    """Evidence of some kinds, oldest first: the newest `limit` of each kind."""
     rows: list[StoredEvidence] = []
-    for kind in ("update", *_VERSIONED):
+    for kind in kinds:
         query = sa.select(*_COLUMNS).where(evidence.c.servo == servo, evidence.c.kind == kind)
         rows += [evidence_of_row(row) for row in connection.execute(query.order_by(evidence.c.id.desc()).limit(limit))]
     return sorted(rows, key=lambda row: row.id)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
@@ -90,7 +90,7 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         self._unreported = 0
         super().on_message_begin()
-        self.scope["extensions"] = {ABORT: self.transport.abort}  # type: ignore[typeddict-item]
+        cast(dict[str, Any], self.scope)["extensions"] = {ABORT: self.transport.abort}
         self._head = 0
         self._start_timer()
 

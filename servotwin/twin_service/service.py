@@ -28,6 +28,7 @@ from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
 from servotwin.twin_service.fleet_feed import FleetFeed
 from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
+from servotwin.twin_service.http_acts import ActsApi
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_dashboard import DashboardApi
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
@@ -163,7 +164,11 @@ class TwinService:
             self.operators, self.store, self._readers, self._reader, self.feed, self.config.machine_metrics
         )
         what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
-        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes()]
+        acts = ActsApi(
+            self.operators, self.store, self._readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
+            self.clocks.monotonic,
+        )  # fmt: skip
+        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes(), *acts.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()

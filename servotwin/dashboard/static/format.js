@@ -36,7 +36,7 @@ export function gapText(gap, interval, scale = DEG) {
 // A value and its interval with a common power of ten.
 function smallText(value, low, high) {
   const power = Math.floor(Math.log10(Math.max(Math.abs(low), Math.abs(high))));
-  return `(${gapText(value, [low, high], 10 ** -power)}) × 10^${String(power).replace("-", "−")}`;
+  return `(${gapText(value / 10 ** power, [low / 10 ** power, high / 10 ** power], 1)}) × 10^${String(power).replace("-", "−")}`;
 }
 
 // The gap in a row of the fleet: in brackets where the estimate was not accepted.

@@ -2,6 +2,7 @@
 // One machine: what is known, its gap over time, its last windows, the updates and what they were verified on.
 
 import * as api from "./api.js";
+import { ActsPanel } from "./acts.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
@@ -67,6 +68,7 @@ export class MachinePage {
       return this.plots.at(-1);
     };
     this.whatIf = new WhatIfPanel(name, () => this.start());
+    this.acts = new ActsPanel(name, () => this.later());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", {},
@@ -87,6 +89,7 @@ export class MachinePage {
         legend(["blue", "of each window"], ["orange", "version applied"]),
         element("div", { class: "two" }, places.tail, places.residual)),
       panel("Updates", [], this.chain),
+      panel("Oversight", [], ...this.acts.content),
       panel("Behind the last update", [], this.proof),
       panel("Events", [], this.events));
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
@@ -124,9 +127,9 @@ export class MachinePage {
 
   async refresh() {
     try {
-      const [gaps, updates, happened] = await Promise.all([api.gaps(this.name), api.updates(this.name), api.events(this.name)]);
+      const [gaps, updates, happened, oversight] = await Promise.all([api.gaps(this.name), api.updates(this.name), api.events(this.name), api.oversight(this.name)]);
       if (this.closed) return;
-      Object.assign(this, { gaps, updates, happened, error: "" });
+      Object.assign(this, { gaps, updates, happened, oversight, error: "" });
     } catch (error) {
       if (this.closed) return;
       this.error = error.message;
@@ -210,6 +213,7 @@ export class MachinePage {
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
     this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
     this.proof.replaceChildren(simulated(this.updates, unit));
+    this.acts.show(this.oversight, this.gaps.versions, unit);
     this.events.replaceChildren(eventList(this.happened));
     await this.chooseWindows();
   }
