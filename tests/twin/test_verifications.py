@@ -277,10 +277,10 @@ def test_an_earlier_setting_is_verified_again_before_it_is_sent(
     assert sent(outcome).verification is not None
     (reason,) = (row.status for row in outcome.evidence if row.kind == "redesign")
     assert reason == "rolled back by eva: it hums; the fallback set is sent"
+    queue, update, _ = begun(fleet)
     queue.act(act)
     failing(monkeypatch)
-    later = {"sequence": 3, "start": windows()[2].start + 20.0}
-    refused = queue.window(2, version=again.version, **later)
+    refused = queue.window(1, version=update.version)
     assert refused.outgoing == ()
     (reason,) = (row.status for row in refused.evidence if row.kind == "redesign")
     assert reason.startswith(f"version {update.version} is not sent again: the setting settles on 3.0 %")
