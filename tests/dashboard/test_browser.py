@@ -277,7 +277,7 @@ def test_numbers_are_readable_and_long_windows_complete(open_page):
     page = open_page()
     text = "([gap, low, high]) => import('/static/format.js').then((f) => f.gapText(gap, [low, high], 1))"
     assert page.evaluate(text, [4.5, 4.4, 4.6]) == "4.500 ± 0.100"
-    assert page.evaluate(text, [4.5e-8, 4.4e-8, 4.6e-8]) == "(4.500 ± 0.100) × 10^−8"
+    assert page.evaluate(text, [4.5e-8, 4.4e-8, 4.6e-8]) == "(4.50 ± 0.10) × 10^−8"
     samples, rate = 200_000, 1000.0
 
     def answer(route):
