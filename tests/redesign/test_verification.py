@@ -11,7 +11,7 @@ import pytest
 from exploration import extent
 from scipy import stats
 
-from servotwin.commissioning.edge_settings import guarding
+from servotwin.commissioning.guarding import guarding
 from servotwin.control.retuning import unfed
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
@@ -22,7 +22,7 @@ from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
-from servotwin.redesign.certified.bounds import share_at_least
+from servotwin.redesign.certified.attempt import share_at_least
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify, confirm
 from servotwin.redesign.certified.margins import loop_margins, widened
