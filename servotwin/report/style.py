@@ -23,7 +23,6 @@ Complex = NDArray[np.complex128]
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 GREY = "#7F7F7F"
-CYCLE = (BLUE, ORANGE, GREEN, RED, PINK, SKY)  # for series that are alike
 MM, DEG = 1e3, float(np.degrees(1.0))  # from m and rad
 
 _LOOK: Any = {
@@ -120,6 +119,7 @@ def save(figure: Figure, directory: Path, name: str) -> Path:
     vector = directory / f"{name}.svg"
     with files.atomic_output(vector) as temporary:
         temporary.write_bytes(svg(figure, name))
+    figure.set_layout_engine("none")  # what was laid out for the first file stays: it takes longer than drawing
     with files.atomic_output(directory / f"{name}.png") as temporary, look():
         figure.savefig(temporary, format="png", dpi=200)
     return vector

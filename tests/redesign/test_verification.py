@@ -11,7 +11,7 @@ import pytest
 from exploration import extent
 from scipy import stats
 
-from servotwin.commissioning.edge_settings import guarding
+from servotwin.commissioning.guarding import guarding
 from servotwin.control.retuning import unfed
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
@@ -19,10 +19,10 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
-from servotwin.redesign.certified.bounds import share_at_least
+from servotwin.redesign.certified.attempt import share_at_least
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify, confirm
 from servotwin.redesign.certified.margins import loop_margins, widened
@@ -167,13 +167,15 @@ def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
-@pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
-def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
+@pytest.mark.parametrize(
+    ("preset", "count"),
+    [("paper", 128), *(pytest.param(each, 1024, marks=pytest.mark.exploration) for each in PRESETS)],
+)
+def test_fresh_machines_settle_as_the_certificate_says(preset: str, count: int) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
     found = certify(servo, known)
     assert isinstance(found, Certificate), found
-    members = draw_independently(servo, known, extent(256, 1024), 99)
+    members = draw_independently(servo, known, count, 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
 
@@ -343,7 +345,6 @@ def test_the_certificate_says_what_was_tried_and_what_leaving_out_integral_actio
     assert (found.beyond.machines, found.beyond.settled) == (4, 1.0)
     assert found.error_per_volt == pytest.approx(1.0 / law.Kp)
     assert "verified on 16 simulated machines in continuous time" in found.tried
-    assert found.not_tried.startswith("not tried: measurement noise")
     assert found.ramp is not None
     assert found.ramp.settled == 1.0
     # A loop that lags by so much of a second is off by that on a ramp of twelve periods; the gap adds to it.
