@@ -107,7 +107,7 @@ def test_friction_that_falls_with_the_speed_is_refused(window: Window) -> None:
 
 
 def test_a_window_needs_command_and_samples(window: Window) -> None:
-    with pytest.raises(InvalidInput, match="has no voltage"):
+    with pytest.raises(InvalidInput, match="has no command: method 'motor_side' needs the drive"):
         estimate_gap(Window(theta_m=window.theta_m, sample_rate=RATE), SCREW)
     with pytest.raises(InvalidInput, match="needs at least 400"):
         estimate_gap(window.slice(BEGIN, 0.1), SCREW)
