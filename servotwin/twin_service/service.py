@@ -186,6 +186,7 @@ class TwinService:
         self._spawn(self.what_if.run())
         if self.webhook is not None:
             self._spawn(self.webhook.run())
+            self._spawn(self._announce_damage(self.webhook))
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -282,8 +283,21 @@ class TwinService:
                 figures = {"lag": round(backlog.lag, 1), "waiting": backlog.messages}
                 if lagging and not before:
                     log.warning("updates lag", extra=figures)
+                    if self.webhook is not None:
+                        # Always in the same words, so that a lag that comes and goes is not posted each time.
+                        longest = (
+                            f"new messages of a servo wait for longer than lag_limit_s = {self.config.lag_limit_s:g} s"
+                        )
+                        self.webhook.announce("lag", longest)
                 if before and not lagging:
                     log.info("updates lag no longer", extra=figures)
+
+    async def _announce_damage(self, webhook: AlarmWebhook) -> None:
+        """Post that the store is damaged, once it is."""
+        while not self.watch.fault:
+            await asyncio.sleep(_REFRESH_S)
+        webhook.announce("store damaged", f"it is not written any more: {self.watch.fault}")
+        await asyncio.Event().wait()
 
     async def _apply_retention(self) -> None:
         """Delete the bodies of windows that are too old: never at the start, where a wrong clock is set right."""
