@@ -106,6 +106,12 @@ def identify(
         bool,
         typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
     ] = False,
+    dynamics: Annotated[
+        bool,
+        typer.Option(
+            "--dynamics", help="Fit the load's frequency, damping and friction where its motion alone shows no gap."
+        ),
+    ] = False,
     dates: Annotated[
         str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")
     ] = None,
@@ -146,14 +152,14 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
-    without_model = columns != RecordingColumns() or axis is not None or stiff or dates is not None
+    without_model = columns != RecordingColumns() or axis is not None or stiff or dynamics or dates is not None
     if without_model or (servo is None and not describes_its_machine(logs[0])):
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(
                 "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
                 "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
             )
-        show_lost_motion(logs, columns, json, page, axis, dates, stiff)
+        show_lost_motion(logs, columns, json, page, axis, dates, stiff, dynamics)
         return
     if len(logs) > 1 or page is not None:
         raise InvalidInput(
