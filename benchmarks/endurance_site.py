@@ -119,6 +119,12 @@ class Member:
                 self._command, cwd=self._folder, stdout=log, stderr=log, env=environment, start_new_session=True
             )
 
+    def revive(self) -> None:
+        """Start it again where it has ended without a fault, as a service manager would."""
+        if self._running and not self.pid:
+            self.kill()
+            self.start()
+
     def kill(self) -> None:
         """Kill it and its children."""
         if self.process is not None:
@@ -177,6 +183,16 @@ class Site:
         finally:
             for each in members:
                 each.kill()
+
+    def revive(self) -> None:
+        """Start the twin and the edges again that have ended without a fault."""
+        for each in (self.twin, *self.edges.values()):
+            each.revive()
+
+    def settled(self) -> bool:
+        """True where no window waits; what has ended without a fault is started again."""
+        self.revive()
+        return not self.waiting()
 
     def outbox(self, servo: str) -> Path:
         """File of an edge's outbox."""

@@ -168,7 +168,8 @@ class TwinService:
         await self.watch.start()
         if not self._shared and not self.watch.fault:
             # The store is locked for this process, so that every lease is one of a process that has ended.
-            await self.executor.run(partial(self.store.release, self._owner))
+            with suppress(StoreUnavailable):  # a full disk: the leases end by themselves
+                await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self.feed.run(), vital=False)
