@@ -182,6 +182,7 @@ class LinkProcess:
         if self._receiver is not None:
             self._troubles.update("to the twin", self._session.trouble)
             self._troubles.update("from the twin", self._receiver.trouble)
+            self._troubles.update("windows", self._window_trouble)
         if (dropped := self._dropped_unintended()) != self._dropped:
             self._dropped = dropped
             log("windows dropped", **dropped)
@@ -262,6 +263,26 @@ class LinkProcess:
         """Reason for which something is not on the disk; empty: all is."""
         return self._status_trouble if self.outbox.flushed else self.outbox.trouble or "not written yet"
 
+    def _limits(self) -> dict[str, int]:
+        """Limits of the twin, as it has told them; 0: it has not."""
+        twin = self._transport.twin if self._transport is not None else None
+        if twin is None:
+            return {"samples_per_window": 0, "bytes_per_day": 0}
+        return {"samples_per_window": twin.samples_per_window, "bytes_per_day": twin.bytes_per_day}
+
+    @property
+    def _window_trouble(self) -> str:
+        """Key of the edge's file by which the twin will refuse windows for their length; empty: there is none."""
+        twin = self._transport.twin if self._transport is not None else None
+        if twin is None or not twin.samples_per_window:
+            return ""
+        agent, most = self._config.agent, twin.samples_per_window
+        lengths = {"window_s": agent.window_s, "longest_window_s": agent.longest_window_s or 0.0}
+        for name, seconds in lengths.items():
+            if (samples := round(seconds * agent.sample_rate)) > most:
+                return f"{name} = {seconds!r} s has {samples} samples; the twin takes at most {most} and refuses longer"
+        return ""
+
     def _status(self) -> dict[str, Any]:
         control, box = self._control, self.outbox
         status: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
@@ -282,6 +303,7 @@ class LinkProcess:
         if self._receiver is not None:
             status["up"] = {"trouble": self._session.trouble, **self._session.counts}
             status["conflict"] = self._conflict
+            status["limits"] = self._limits()
             status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
 

@@ -131,7 +131,15 @@ class TwinService:
             paused=lambda: bool(self.watch.fault),
         )
         self.claims = EdgeClaims(
-            store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
+            store,
+            self.executor,
+            self.polls.evict,
+            self.metrics,
+            self.clocks,
+            self._shared,
+            __version__,
+            samples_per_window=config.samples_per_window,
+            bytes_per_day=0 if math.isinf(config.megabytes_per_day) else round(config.megabytes_per_day * 1e6),
         )
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)

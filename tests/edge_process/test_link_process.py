@@ -201,3 +201,24 @@ def test_windows_that_an_earlier_link_process_has_dropped_are_not_logged_again(
         process._end_all([])
         ours.close()
     assert capfd.readouterr().err.count('"event":"windows dropped","bad_checksum":1') == 1
+
+
+def test_an_edge_says_which_window_is_longer_than_its_twin_takes(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9") + "[window]\nlongest_window_s = 3.0\n")
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    ours, theirs = socket.socketpair()
+    process = LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa")
+    assert process._transport is not None
+    for samples in (0, 300, 299, 99):
+        process._transport.twin = Standing("ax-1", samples_per_window=samples, bytes_per_day=5)
+        process._check()
+    assert (read_status(tmp_path / "status.json") or {})["limits"] == {"samples_per_window": 99, "bytes_per_day": 5}
+    process._end_all([])
+    ours.close()
+    told = [line for line in capfd.readouterr().err.splitlines() if '"where":"windows"' in line]
+    assert "longest_window_s = 3.0 s has 300 samples; the twin takes at most 299" in told[0]
+    assert '"why":"window_s = 1.0 s has 100 samples; the twin takes at most 99' in told[1]
+    assert len(told) == 2
