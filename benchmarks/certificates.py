@@ -20,7 +20,7 @@ from servotwin.control.retuning import unfed, without_integral
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.bounds import share_at_least
+from servotwin.redesign.certified.attempt import share_at_least
 from servotwin.redesign.certified.certificate import Demands, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.margins import widened

@@ -15,7 +15,7 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Run, Simulation, simulate
 from servotwin.simulation.continuous import ContinuousEngine
-from servotwin.simulation.ensemble import simulate_ensemble
+from servotwin.simulation.ensemble import Cases, simulate_members
 
 NAME = "servotwin"
 REFINED = 4  # factor by which the reference runs search finer for events
@@ -93,9 +93,8 @@ def sweeping(workload: SweepWorkload, threads: int) -> Contestant:
     servo, duration = workload.servo, workload.duration
 
     def job() -> Array:
-        return simulate_ensemble(
-            servo, duration, workload.step, gaps, tolerances, sample_rate=workload.sample_rate, threads=threads
-        )
+        cases = Cases(workload.step, gaps, tolerances)
+        return simulate_members(servo, None, duration, cases, ("position",), workload.sample_rate, threads)["position"]
 
     return Contestant(f"{NAME}, {threads} thread{'s' * (threads > 1)}", lambda: job)
 
@@ -168,7 +167,9 @@ def comparable(workload: SweepWorkload) -> NDArray[np.bool_]:
     """(K,) members of W2 that a perturbation of the step leaves where they are."""
     gaps, tolerances = workload.members
     runs = [
-        simulate_ensemble(workload.servo, workload.duration, step, gaps, tolerances, sample_rate=workload.sample_rate)
+        simulate_members(
+            workload.servo, None, workload.duration, Cases(step, gaps, tolerances), ("position",), workload.sample_rate
+        )["position"]
         for step in (workload.step, workload.step * (1.0 + PERTURBATION))
     ]
     moved = np.max(np.abs(runs[1] - runs[0]), axis=1)

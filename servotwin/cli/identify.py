@@ -27,7 +27,6 @@ from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 WINDOW = 1.0  # s of the servo's own
-_ROUNDING = 1e-6  # of a sample
 
 
 @dataclass(frozen=True)

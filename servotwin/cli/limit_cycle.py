@@ -14,7 +14,7 @@ from rich.table import Table
 from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
 from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
-from servotwin.analysis.limit_cycles.prediction import Prediction
+from servotwin.analysis.limit_cycles.shaft import Prediction
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import Plant, resolve_plant
 from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit

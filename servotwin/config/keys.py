@@ -35,6 +35,7 @@ from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
 _Class = TypeVar("_Class", bound=type)
+_Described = TypeVar("_Described", bound=Any)
 Maker = Callable[..., Any]
 """A class, or a function, whose parameters a table declares."""
 _ITEMS: dict[Any, tuple[Item, ...]] = {}
@@ -248,6 +249,20 @@ def check(described: Any, but: Collection[str] = ()) -> None:
             shown, given, words = f"{item.name}[{index}]", given[index], str(item.key.range)
         unit = f" {item.unit}" if item.unit else ""
         raise InvalidInput(f"{name_of(described)} {shown} = {given!r}{unit}: must be {words}".lstrip())
+
+
+def replaced(described: _Described, name: str, changes: Mapping[str, Any]) -> _Described:
+    """Copy a dataclass with some values changed, checked again; `name` says what it is.
+
+    Raises
+    ------
+    InvalidInput
+        A value does not exist, or is out of its range.
+    """
+    known = [each.name for each in dataclasses.fields(described)]
+    if unknown := sorted(set(changes) - set(known)):
+        raise InvalidInput(f"{name} has no value named {unknown[0]!r}: allowed are {', '.join(known)}")
+    return dataclasses.replace(described, **changes)
 
 
 def allowed(item: Item) -> str:

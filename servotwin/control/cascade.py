@@ -1,10 +1,10 @@
 """The cascade of industrial drives, as a description: position loop around a velocity loop on the motor's speed."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from math import expm1, pi
 from typing import Annotated, Any
 
-from servotwin.config.keys import check, items_of, key, settings
+from servotwin.config.keys import check, key, replaced, settings
 from servotwin.control.controller import notch_step
 from servotwin.control.linear_law import INPUTS, LOAD, MOTOR, LinearLaw
 from servotwin.errors import InvalidInput
@@ -159,10 +159,7 @@ class Cascade:
         InvalidInput
             A name is unknown, or a value is out of its range.
         """
-        allowed = [item.name for item in items_of(type(self))]
-        if unknown := sorted(set(changes) - set(allowed)):
-            raise InvalidInput(f"cascade has no value named {unknown[0]!r}: allowed are {', '.join(allowed)}")
-        return replace(self, **changes)
+        return replaced(self, "cascade", changes)
 
     def linear(self) -> LinearLaw:
         """The linear law that this cascade is: continuous, or with discrete matrices at its sample rate.

@@ -1,10 +1,10 @@
 """The controller as a description: gains, dead zone, limits; frozen and validated."""
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, pi, sin, sqrt
 from typing import Annotated, TypedDict, Unpack
 
-from servotwin.config.keys import check, items_of, key, settings
+from servotwin.config.keys import check, items_of, key, replaced, settings
 from servotwin.control.law import LawParameters
 from servotwin.errors import InvalidInput
 from servotwin.runtime.notebook import html_table
@@ -178,10 +178,7 @@ class Controller:
         InvalidInput
             A name is unknown, or a value is out of its range.
         """
-        allowed = [field.name for field in fields(self)]
-        if unknown := sorted(set(changes) - set(allowed)):
-            raise InvalidInput(f"controller has no value named {unknown[0]!r}: allowed are {', '.join(allowed)}")
-        return replace(self, **changes)
+        return replaced(self, "controller", changes)
 
     @property
     def tracking(self) -> float:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from math import expm1, inf, isfinite
 from typing import Any
 
+from servotwin.config.keys import replaced
 from servotwin.control.linear_tick import LinearParameters, LinearState, linear_transfer
 from servotwin.control.matrices import Rows, at_rest, zero_order_held
 from servotwin.errors import InvalidInput
@@ -123,8 +124,8 @@ class LinearLaw:
                 raise InvalidInput(f"law {name} = {value!r} tolerances: must be finite and 0 or more")
         if self.leave < self.enter:
             raise InvalidInput(f"law leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
-        if not (isfinite(self.ratio) and self.ratio != 0.0):
-            raise InvalidInput(f"law ratio = {self.ratio!r} m/rad: must be finite and not 0")
+        if not (isfinite(self.ratio) and self.ratio > 0.0):
+            raise InvalidInput(f"law ratio = {self.ratio!r} m/rad: must be finite and greater than 0")
         if not (isfinite(self.integral_share) and self.integral_share >= 0.0):
             raise InvalidInput(f"law integral_share = {self.integral_share!r}: must be finite and 0 or more")
         if not isfinite(self.feedforward):
@@ -192,10 +193,7 @@ class LinearLaw:
         InvalidInput
             A name is unknown, or a value is out of its range.
         """
-        allowed = [field.name for field in fields(self)]
-        if unknown := sorted(set(changes) - set(allowed)):
-            raise InvalidInput(f"law has no value named {unknown[0]!r}: allowed are {', '.join(allowed)}")
-        return replace(self, **changes)
+        return replaced(self, "law", changes)
 
     @property
     def n(self) -> int:

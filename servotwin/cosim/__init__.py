@@ -3,16 +3,13 @@
 from servotwin.cosim.driver import Cosimulation, cosimulate
 from servotwin.cosim.loop import Loop, MessageCopy
 from servotwin.cosim.machine import Machine, SimulatedMachine, simulation_of
-from servotwin.cosim.quantisation import Quantisation, quantisation
 
 __all__ = [
     "Cosimulation",
     "Loop",
     "Machine",
     "MessageCopy",
-    "Quantisation",
     "SimulatedMachine",
     "cosimulate",
-    "quantisation",
     "simulation_of",
 ]

@@ -41,21 +41,6 @@ class StoredParameters(Struct, frozen=True, tag="parameters/2"):
         return Parameters(self.version, self.setting, fallback=self.fallback)
 
 
-class MemoryParameterStore:
-    """A parameter store in memory, for simulation and tests."""
-
-    def __init__(self) -> None:
-        self._stored: StoredParameters | None = None
-
-    def save(self, parameters: Parameters) -> None:
-        """Replace the stored parameters."""
-        self._stored = StoredParameters.of(parameters)
-
-    def load(self) -> Parameters | None:
-        """Return the stored parameters; None: nothing was ever stored."""
-        return None if self._stored is None else self._stored.parameters()
-
-
 class FileParameterStore:
     """A parameter store in one file, replaced as a whole: a crash leaves the old file or the new one.
 

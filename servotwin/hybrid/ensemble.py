@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,10 +18,11 @@ from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
 from servotwin.hybrid.output import empty_outputs, new_output_workspace
 from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables, nothing_pending
-from servotwin.hybrid.threads import on_threads
 from servotwin.hybrid.trajectory import ZenoError
 
 _PARTS_PER_WORKER = 8
+
+_Result = TypeVar("_Result")
 
 
 class Members(NamedTuple):
@@ -274,3 +276,22 @@ def _checked_starts(
     limits = np.zeros((len(modes), results.traces.shape[1])) if options is None else options.limits
     # Sorted by automaton, so that its tables are filled once for all of its members.
     return MemberStarts(np.argsort(which, kind="stable"), which, modes, states, limits)
+
+
+def on_threads(work: Callable[[], _Result], workers: int) -> list[_Result]:
+    """Do the same work so many times at once, and return all results.
+
+    The calling thread takes part: ensembles are mostly so short that the start of a thread counts.
+
+    Parameters
+    ----------
+    work : callable
+    workers : int
+        1 or more.
+    """
+    if workers == 1:
+        return [work()]
+    with ThreadPoolExecutor(workers - 1) as pool:
+        others = [pool.submit(work) for _ in range(workers - 1)]
+        own = work()
+        return [own, *(other.result() for other in others)]

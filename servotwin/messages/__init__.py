@@ -8,7 +8,7 @@ JSON too. SI units throughout. Values that are not known, or bounds that do not 
 
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
 from servotwin.messages.claims import PROTOCOL, EdgeClaim, Standing
-from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, decode_json, encode, encode_json
+from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, encode
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
 from servotwin.messages.setting import AnyGains, Band, CascadeGains, Gains, LinearGains, Setting
@@ -74,9 +74,7 @@ __all__ = [
     "WindowMessage",
     "checksum",
     "decode",
-    "decode_json",
     "encode",
-    "encode_json",
     "finite",
     "needed_fields",
     "pack_channel",

@@ -4,7 +4,7 @@ The sizes of a message and of a decompressed body are bounded before anything is
 """
 
 import zlib
-from typing import TypeVar, get_args
+from typing import cast, get_args
 
 import msgspec
 
@@ -41,7 +41,6 @@ ParameterMessage = (
     | Standing
 )
 Message = WindowMessage | ParameterMessage
-_Decoded = TypeVar("_Decoded")
 
 
 class _Tagged(msgspec.Struct):
@@ -54,8 +53,6 @@ _UNREADABLE = (msgspec.MsgspecError, ValueError, RecursionError, OverflowError)
 _SCHEMAS = frozenset(kind.__struct_config__.tag for kind in get_args(Message))
 _encoder = msgspec.msgpack.Encoder()
 _decoder: msgspec.msgpack.Decoder[Message] = msgspec.msgpack.Decoder(Message)
-_json_encoder = msgspec.json.Encoder()
-_json_decoder: msgspec.json.Decoder[ParameterMessage] = msgspec.json.Decoder(ParameterMessage)
 
 
 def encode(message: Message) -> bytes:
@@ -71,22 +68,10 @@ def decode(data: bytes, limit: int = MAX_BYTES) -> Message:
     InvalidMessage
         Too large (seen before anything is parsed), not MessagePack, unknown tag, bad field, wrong checksum.
     """
-    message = _as_read(_guarded(_decoder, data, limit))
+    message = _as_read(_guarded(data, limit))
     if isinstance(message, WindowMessage):
         whole = message.crc == checksum(message.channels)
         require(whole, "window checksum does not match its channels", Refusal.BAD_CHECKSUM)
-    return message
-
-
-def encode_json(message: ParameterMessage) -> bytes:
-    """Encode a parameter message as JSON."""
-    return _json_encoder.encode(_as_sent(message))
-
-
-def decode_json(data: bytes, limit: int = MAX_BYTES) -> ParameterMessage:
-    """Decode a parameter message from JSON; raises InvalidMessage as `decode` does."""
-    message = _as_read(_guarded(_json_decoder, data, limit))
-    assert not isinstance(message, WindowMessage)
     return message
 
 
@@ -103,22 +88,19 @@ def _as_read(message: Message) -> Message:
     return message
 
 
-def _guarded(
-    decoder: "msgspec.msgpack.Decoder[_Decoded] | msgspec.json.Decoder[_Decoded]", data: bytes, limit: int
-) -> _Decoded:
+def _guarded(data: bytes, limit: int) -> Message:
     """Decode; anything wrong with the bytes raises InvalidMessage."""
     require(len(data) <= limit, f"message of {len(data)} bytes: at most {limit} are allowed", Refusal.TOO_LARGE)
     try:
-        return decoder.decode(data)
+        return _decoder.decode(data)
     except InvalidMessage:
         raise
     except _UNREADABLE as error:
         # The slow path: only bytes that no present schema decodes can be a message of the version before.
-        read = msgspec.json.decode if decoder is _json_decoder else msgspec.msgpack.decode
         try:
-            tag = read(data, type=_Tagged).type
+            tag = msgspec.msgpack.decode(data, type=_Tagged).type
             if tag in LEGACY_TAGS and len(data) <= MAX_LEGACY_BYTES:
-                return msgspec.convert(upgrade(read(data)), decoder.type)
+                return cast(Message, msgspec.convert(upgrade(msgspec.msgpack.decode(data)), Message))
         except _UNREADABLE as again:
             raise InvalidMessage(f"message not understood: {again}") from None
         refusal = Refusal.NOT_UNDERSTOOD if tag in _SCHEMAS else Refusal.UNKNOWN_SCHEMA

@@ -24,7 +24,6 @@ from servotwin.novelty.settings import NoveltyModel, NoveltyRules, NoveltySettin
 
 PROBE, FIRST, PERIODIC = "probe", "first", "periodic"
 LOST_MOTION, SCORE, CUSUM = "novelty: lost motion", "novelty: score", "novelty: cusum"
-NEWS = LOST_MOTION, SCORE, CUSUM
 
 # Names under which the states of earlier versions are stored.
 _STORED = {

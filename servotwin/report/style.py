@@ -23,7 +23,6 @@ Complex = NDArray[np.complex128]
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 YELLOW, BLUE, RED, PINK = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
 GREY = "#7F7F7F"
-CYCLE = (BLUE, ORANGE, GREEN, RED, PINK, SKY)  # for series that are alike
 MM, DEG = 1e3, float(np.degrees(1.0))  # from m and rad
 
 _LOOK: Any = {

@@ -100,19 +100,19 @@ class EnsembleMembers:
     controllers: list[Controller]
     constants: dict[str, Array]
 
-    def groups(self, outputs: Sequence[str], dead_zone: bool | None = None) -> list[Group]:
-        """Members by structure; `dead_zone` gives all of them a dead zone, or none; None: by their tolerance."""
+    def groups(self, outputs: Sequence[str]) -> list[Group]:
+        """Members by structure."""
         # One group shares states, modes and guards, so one call of the compiled kernel runs it on all threads.
         by_structure: dict[object, list[int]] = {}
-        shapes = [self._shape_of(member, dead_zone) for member in range(len(self.servos))]
+        shapes = [self._shape_of(member) for member in range(len(self.servos))]
         for member, shape in enumerate(shapes):
             key = (shape, *_structure_of(self.servos[member], self.controllers[member]))
             by_structure.setdefault(key, []).append(member)
         return [self._group(np.array(which), shapes[which[0]], outputs) for which in by_structure.values()]
 
-    def _shape_of(self, member: int, dead_zone: bool | None) -> Shape:
+    def _shape_of(self, member: int) -> Shape:
         return Shape(
-            dead_zone=self.constants["tolerance"][member] > 0.0 if dead_zone is None else dead_zone,
+            dead_zone=self.constants["tolerance"][member] > 0.0,
             bias=self.constants["input_bias"][member] != 0.0,
             friction=self.constants["friction"][member] > 0.0,
             feedforward=self.controllers[member].feedforward != 0.0,
@@ -143,55 +143,11 @@ class EnsembleMembers:
         return Group(which, loops.automata, rows, Members(automaton, modes, states), loops, enter)
 
 
-def simulate_ensemble(
-    servo: Plant,
-    duration: float,
-    reference: ArrayLike = 0.0,
-    gap: ArrayLike = 0.0,
-    tolerance: ArrayLike = 0.0,
-    theta_d0: ArrayLike = 0.0,
-    controller: Controller | None = None,
-    sample_rate: float = 100.0,
-    threads: int | None = None,
-) -> Array:
-    """Position of the last mass in many runs of one servo from rest.
-
-    Parameters
-    ----------
-    servo : Servo or Axis
-    duration : float
-        s.
-    reference, gap, tolerance, theta_d0 : array_like
-        m, rad (total), m, rad: constants of each run, broadcast against each other to shape S. A tolerance of 0 is a
-        dead zone of no width, a gap of 0 no backlash.
-    controller : Controller, optional
-        Continuous; the servo's own by default.
-    sample_rate : float
-        Hz, of the output; events are searched for on a step of their own.
-    threads : int, optional
-        As many as there are processors by default.
-
-    Returns
-    -------
-    (*S, N) array
-        m, ``N = round(duration * sample_rate) + 1``.
-    """
-    members = members_of(servo, controller, Cases(reference, gap, tolerance, theta_d0))
-    return _traces(members, ("position",), duration, sample_rate, threads, dead_zone=True)[:, 0].reshape(
-        *members.shape, -1
-    )
-
-
 def simulate_members(
     servos: Any,
     controllers: Any,
     duration: float,
-    reference: ArrayLike = 0.0,
-    gap: ArrayLike = 0.0,
-    tolerance: ArrayLike = 0.0,
-    theta_d0: ArrayLike = 0.0,
-    input_bias: ArrayLike = 0.0,
-    friction: ArrayLike = 0.0,
+    cases: Cases,
     outputs: Sequence[str] = ("error", "voltage"),
     sample_rate: float = 100.0,
     threads: int | None = None,
@@ -205,9 +161,8 @@ def simulate_members(
         Continuous; None: the servo's own.
     duration : float
         s.
-    reference, gap, tolerance, theta_d0, input_bias, friction : array_like
-        m, rad (total), m, rad, V, N m: constants of each run. They, `servos` and `controllers` are broadcast against
-        each other to shape S. A tolerance of 0 is no dead zone, a gap of 0 no backlash.
+    cases : Cases
+        Constants of each run. They, `servos` and `controllers` are broadcast against each other to shape S.
     outputs : sequence of str
         Rows of `ServoAutomaton`: error, voltage, position, theta_m, theta_d, q1, ...
     sample_rate : float
@@ -225,8 +180,12 @@ def simulate_members(
     InvalidInput
         A controller that is not continuous, a constant out of its range, an output that does not exist.
     """
-    members = members_of(servos, controllers, Cases(reference, gap, tolerance, theta_d0, input_bias, friction))
-    traces = _traces(members, outputs, duration, sample_rate, threads)
+    members, samples = members_of(servos, controllers, cases), samples_of(duration, sample_rate)
+    traces = np.empty((len(members.servos), len(outputs), samples))
+    for group in members.groups(outputs):
+        traces[group.which] = run_family(
+            group.automata, group.rows, group.members, 1.0 / sample_rate, samples, threads
+        )[0]
     return {name: traces[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
 
 
@@ -292,28 +251,6 @@ def samples_of(duration: float, sample_rate: float) -> int:
     if not (0.0 < duration < np.inf and 0.0 < sample_rate < np.inf):
         raise InvalidInput(f"duration = {duration} s at sample_rate = {sample_rate} Hz: must be positive and finite")
     return round(duration * sample_rate) + 1
-
-
-def _traces(
-    members: EnsembleMembers,
-    outputs: Sequence[str],
-    duration: float,
-    sample_rate: float,
-    threads: int | None,
-    dead_zone: bool | None = None,
-) -> Array:
-    """(K, O, N) outputs of all members."""
-    groups, samples = members.groups(outputs, dead_zone), samples_of(duration, sample_rate)
-    runs = [
-        run_family(group.automata, group.rows, group.members, 1.0 / sample_rate, samples, threads)[0]
-        for group in groups
-    ]
-    if len(runs) == 1:
-        return runs[0]
-    traces = np.empty((len(members.servos), len(outputs), samples))
-    for group, run in zip(groups, runs, strict=True):
-        traces[group.which] = run
-    return traces
 
 
 def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:

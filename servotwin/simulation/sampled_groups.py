@@ -13,11 +13,11 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.control.laws import Law, filtered_pid
 from servotwin.hybrid.automaton import Array, shared_flows, speeds
+from servotwin.hybrid.ensemble import on_threads
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
 from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
-from servotwin.hybrid.threads import on_threads
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.plants import Plant, structure_of

@@ -6,8 +6,9 @@ from functools import cache
 
 import numpy as np
 import pytest
+from quantisation import quantisation
 
-from servotwin.cosim import Loop, cosimulate, quantisation
+from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.edge.guard import Limits
 from servotwin.estimation.estimate import GapStatus

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from servotwin.edge.parameters import Parameters
-from servotwin.edge.store import FileParameterStore, MemoryParameterStore, ParameterStore
+from servotwin.edge.store import FileParameterStore
 from servotwin.errors import InvalidInput
 from servotwin.messages import Band, Gains, Setting
 
@@ -20,12 +20,12 @@ GOOD = Parameters(
 )
 
 
-@pytest.fixture(params=["memory", "file"])
-def store(request: pytest.FixtureRequest, tmp_path: Path) -> ParameterStore:
-    return MemoryParameterStore() if request.param == "memory" else FileParameterStore(tmp_path / "axis-1.json")
+@pytest.fixture
+def store(tmp_path: Path) -> FileParameterStore:
+    return FileParameterStore(tmp_path / "axis-1.json")
 
 
-def test_a_new_store_is_empty(store: ParameterStore) -> None:
+def test_a_new_store_is_empty(store: FileParameterStore) -> None:
     assert store.load() is None
 
 
@@ -39,7 +39,7 @@ def test_the_file_of_the_version_before_is_read(tmp_path: Path) -> None:
     assert FileParameterStore(path).load() == Parameters(7, GOOD.setting, fallback=True)
 
 
-def test_version_setting_and_fallback_outlive_a_boot(store: ParameterStore) -> None:
+def test_version_setting_and_fallback_outlive_a_boot(store: FileParameterStore) -> None:
     store.save(Parameters(3, Setting(2e-4)))
     store.save(GOOD)
     assert store.load() == Parameters(7, GOOD.setting, fallback=True)

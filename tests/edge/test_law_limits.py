@@ -17,7 +17,7 @@ from servotwin.control.retuning import scaled
 from servotwin.edge.guard import Instant, Limits, judge
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.store import FileParameterStore, MemoryParameterStore
+from servotwin.edge.store import FileParameterStore
 from servotwin.edge.supervisor import Rules, Switch, offer
 from servotwin.edge_process.startup import permitted
 from servotwin.errors import InvalidInput
@@ -122,8 +122,8 @@ def test_an_update_of_which_the_law_cannot_be_made_is_refused() -> None:
 
 
 @pytest.mark.parametrize("fallback", [False, True])
-def test_stored_gains_of_another_law_do_not_end_the_edge(fallback: bool) -> None:
-    store = MemoryParameterStore()
+def test_stored_gains_of_another_law_do_not_end_the_edge(fallback: bool, tmp_path: Path) -> None:
+    store = FileParameterStore(tmp_path / "kept.json")
     store.save(Parameters(version=7, setting=Setting.of(2e-4, Gains(1.0, 0.0, 0.0, 1.0)), fallback=fallback))
     agent = SendingAgent(AgentSettings("axis-1", "b1", 1e3, 1.0, controller=CASCADE), store=store)
     assert agent.controller == CASCADE

@@ -2,6 +2,7 @@
 
 import math
 from array import array
+from pathlib import Path
 
 import pytest
 from exploration import examples
@@ -16,7 +17,7 @@ from servotwin.edge.agent import ScheduledMessage
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import AgentSettings, Supervision
-from servotwin.edge.store import MemoryParameterStore
+from servotwin.edge.store import FileParameterStore
 from servotwin.edge.watch import WatchSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox
@@ -129,8 +130,8 @@ def test_a_twin_without_a_window_to_answer_is_not_silent() -> None:
     assert agent.parameters.version == 0
 
 
-def test_only_parameters_under_which_the_loop_kept_its_band_are_stored() -> None:
-    store = MemoryParameterStore()
+def test_only_parameters_under_which_the_loop_kept_its_band_are_stored(tmp_path: Path) -> None:
+    store = FileParameterStore(tmp_path / "kept.json")
     agent = SendingAgent(agent_settings(), store=store)
     agent.receive(update(1, 0, 0.0))
     feed(agent, 2.9)

@@ -11,9 +11,9 @@ from scipy.stats import multivariate_normal
 
 from benchmarks.estimator_windows import cut
 from servotwin.estimation import whitened
-from servotwin.estimation.whitened.cyclic import cyclic_motions
 from servotwin.estimation.whitened.doubt import spread_over
 from servotwin.estimation.whitened.fit import WhitenedFit
+from servotwin.estimation.whitened.sensor_errors import cyclic_motions
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SquareWave
 from servotwin.simulation import simulate

@@ -15,8 +15,8 @@ from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.learning.machine import LearningSettings, nameplate
 from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.whitened.free_model import COMPLIANCE, FactorPrior, FreeProblem
-from servotwin.estimation.whitened.lag import lag_motion
 from servotwin.estimation.whitened.learning import WindowSoftness
+from servotwin.estimation.whitened.sensor_errors import lag_motion
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate

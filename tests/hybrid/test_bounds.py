@@ -45,7 +45,7 @@ test_hybrid_automaton.test_any_part_of_the_samples()
 test_hybrid_automaton.test_set_between_advances()
 
 import servotwin as st
-from servotwin.simulation.ensemble import simulate_ensemble
+from servotwin.simulation.ensemble import Cases, simulate_members
 servo = st.Servo.preset("table1").replace(n=2)
 knots = [0.0, 0.1001, 0.10013, 0.15]
 worn = st.PiecewiseCubic(knots, [[0.1, 0.2, 0, 0], [0.2, 0, 0, 0], [0.05, 0, 0, 0], [0, 0, 1, 1]])
@@ -55,7 +55,8 @@ sampled = [limited.replace(sample_rate=1000.0), servo.controller.replace(sample_
 for law in (limited, *sampled):
     run = st.simulate(servo, 0.15, controller=law, reference=wave, gap=worn, tolerance=tolerance, noise=st.Noise(1e-5))
     assert len(run.events) > 5 and np.isfinite(run.q).all() and np.isfinite(run.voltage).all()
-assert simulate_ensemble(servo, 0.15, 1e-3, gap=[0.0, 0.1, 0.2], tolerance=[0.0, tolerance, tolerance]).shape == (3, 16)
+cases = Cases(1e-3, [0.0, 0.1, 0.2], [0.0, tolerance, tolerance])
+assert simulate_members(servo, None, 0.15, cases)["error"].shape == (3, 16)
 # Long enough for the vast scale of sampled loops in blocks.
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 calm = sampled[1].replace(Ki=0.0, voltage_limit=24.0)

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from servotwin.hybrid.threads import on_threads
+from servotwin.hybrid.ensemble import on_threads
 
 
 @pytest.mark.parametrize("workers", [1, 2, 5])

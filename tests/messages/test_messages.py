@@ -1,6 +1,5 @@
 """Messages of the link: round trips, quantisation, and nothing but InvalidMessage for invalid bytes."""
 
-import json
 import math
 from array import array
 from dataclasses import dataclass
@@ -32,9 +31,7 @@ from servotwin.messages import (
     checksum,
     codec,
     decode,
-    decode_json,
     encode,
-    encode_json,
     pack_channel,
     unpack_channel,
 )
@@ -70,13 +67,6 @@ MESSAGES = [window(), UPDATE, FULL_UPDATE, RECEIPT, FALLBACK, HELLO, ACKNOWLEDGE
 @pytest.mark.parametrize("message", MESSAGES)
 def test_messages_survive_the_bytes(message: Message) -> None:
     assert decode(encode(message)) == message
-
-
-@pytest.mark.parametrize("message", MESSAGES[1:])
-def test_parameter_messages_are_json_too(message: Any) -> None:
-    text = encode_json(message)
-    assert decode_json(text) == message
-    assert json.loads(text)["type"] == type(message).__struct_config__.tag
 
 
 def test_a_window_names_a_response_only_where_its_filter_takes_one() -> None:
@@ -156,9 +146,8 @@ def test_what_cannot_be_packed_is_named(samples: list[float], words: str) -> Non
 
 @given(st.binary(max_size=300))
 def test_garbage_is_refused_and_nothing_else(data: bytes) -> None:
-    for function in (decode, decode_json):
-        with pytest.raises(InvalidMessage):
-            function(data)
+    with pytest.raises(InvalidMessage):
+        decode(data)
 
 
 @dataclass
@@ -173,15 +162,14 @@ DAMAGE = st.builds(Damage, st.floats(0, 1, exclude_max=True), st.integers(0, 255
 
 @given(st.sampled_from(MESSAGES), st.lists(DAMAGE, min_size=1, max_size=6))
 def test_damaged_messages_decode_or_are_refused(message: Message, damages: list[Damage]) -> None:
-    for encoder, decoder in ((encode, decode), (msgspec.json.encode, decode_json)):
-        data = bytearray(encoder(message))
-        for damage in damages:
-            data[int(damage.position * len(data))] = damage.value
-        try:
-            result = decoder(bytes(data[: len(data) - damages[0].cut]))
-        except InvalidMessage:
-            continue
-        assert isinstance(result, Message)
+    data = bytearray(encode(message))
+    for damage in damages:
+        data[int(damage.position * len(data))] = damage.value
+    try:
+        result = decode(bytes(data[: len(data) - damages[0].cut]))
+    except InvalidMessage:
+        return
+    assert isinstance(result, Message)
 
 
 @given(st.recursive(st.none() | st.integers(-9, 9) | st.text(max_size=4), lambda x: st.lists(x, max_size=3)))
@@ -320,7 +308,6 @@ def flat(message: Update | Fallback | Hello) -> dict[str, Any]:
 def test_messages_of_the_version_before_are_read(message: Update | Fallback | Hello) -> None:
     document = flat(message)
     assert decode(msgspec.msgpack.encode(document)) == message
-    assert decode_json(msgspec.json.encode(document)) == message
 
 
 def test_a_message_of_the_version_before_is_checked_like_a_new_one() -> None:

@@ -23,7 +23,7 @@ from servotwin.edge.outlet import FILTERED
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.messages import WindowMessage
-from servotwin.novelty.detector import FIRST, NEWS, PERIODIC
+from servotwin.novelty.detector import CUSUM, FIRST, LOST_MOTION, PERIODIC, SCORE
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.servo import Servo
@@ -57,7 +57,7 @@ def test_one_is_sent_every_period() -> None:
 @pytest.mark.slow
 def test_fast_wear_has_every_window_sent_and_the_same_estimates() -> None:
     every, news = (looped("fig15", 10.0, 200.0, rules) for rules in (None, NoveltyRules()))
-    assert {window.reason for window in news.windows[1:]} <= set(NEWS)
+    assert {window.reason for window in news.windows[1:]} <= {LOST_MOTION, SCORE, CUSUM}
     assert [e.gap for e in news.estimates] == [e.gap for e in every.estimates]
     assert len(news.applied) == len(every.applied) == 10
 

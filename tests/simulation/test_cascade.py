@@ -21,7 +21,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Simulation, simulate
-from servotwin.simulation.ensemble import simulate_ensemble
+from servotwin.simulation.ensemble import Cases, simulate_members
 
 P = 1e-3 / math.pi
 # Axis with its cascade, amplitude (m or rad) and gap (rad).
@@ -272,7 +272,7 @@ def test_the_limit_cycle_of_a_cascade_is_where_its_simulation_ends() -> None:
     spectrum = np.abs(np.fft.rfft((tail - tail.mean()) * np.hanning(tail.size)))
     assert np.argmax(spectrum) / 40.0 == pytest.approx(result.orbit.frequency, abs=0.03)
     with pytest.raises(InvalidInput, match=r"controller = Cascade\(.*must be a Controller, a filtered PID"):
-        simulate_ensemble(axis, 1.0, reference=0.1, gap=gap, controller=law)
+        simulate_members(axis, law, 1.0, Cases(0.1, gap))
 
 
 def test_a_continuous_cascade_is_replaced_within_rounding() -> None:

@@ -12,7 +12,6 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation import simulate
 from servotwin.simulation.ensemble import (
     Cases,
-    simulate_ensemble,
     simulate_members,
     summarise_members,
 )
@@ -25,11 +24,11 @@ TABLE1 = Servo.preset("table1")
 def test_members_are_runs() -> None:
     gaps = np.array([0.0, 0.3, 10.0, 33.0, 60.0])[:, None] * DEGREE
     tolerances = np.array([0.0, 0.7, 2.0]) * TABLE1.tolerance_for(10.0 * DEGREE)
-    members = simulate_ensemble(TABLE1, 20.0, reference=1e-3, gap=gaps, tolerance=tolerances, theta_d0=0.02)
+    members = simulate_members(TABLE1, None, 20.0, Cases(1e-3, gaps, tolerances, 0.02), ("position",))["position"]
     assert members.shape == (5, 3, 2001)
     for i, gap in enumerate(gaps[:, 0].tolist()):
         for j, tolerance in enumerate(tolerances.tolist()):
-            options = {"reference": 1e-3, "gap": gap, "tolerance": tolerance, "theta_d0": 0.02}
+            options = {"reference": 1e-3, "gap": gap, "tolerance": tolerance or None, "theta_d0": 0.02}
             alone = simulate(TABLE1, 20.0, sample_rate=100.0, **options).position
             assert np.abs(members[i, j] - alone).max() < 1e-12, (gap, tolerance)
 
@@ -43,9 +42,7 @@ def test_members_with_servos_and_controllers_of_their_own_are_runs() -> None:
         np.array(servos)[:, None, None, None],
         np.array(laws)[:, None, None],
         5.0,
-        reference=1e-3,
-        gap=gaps[:, None],
-        tolerance=tolerances,
+        Cases(1e-3, gaps[:, None], tolerances),
         outputs=("voltage", "theta_m", "position"),
     )
     assert {values.shape for values in outputs.values()} == {(2, 2, 2, 2, 501)}
@@ -76,12 +73,7 @@ def test_disturbed_members_of_any_structure_are_runs(plant: dict[str, float], la
         servo,
         controller,
         3.0,
-        -1e-3,
-        gap=8.0 * DEGREE,
-        tolerance=tolerances,
-        theta_d0=0.03,
-        input_bias=np.array(biases)[:, None],
-        friction=np.array(frictions)[:, None, None],
+        Cases(-1e-3, 8.0 * DEGREE, tolerances, 0.03, np.array(biases)[:, None], np.array(frictions)[:, None, None]),
         outputs=("error", "voltage"),
     )
     for k, b, t in np.ndindex(len(frictions), 2, 2):
@@ -97,7 +89,7 @@ def test_figures_are_those_of_the_samples() -> None:
     paper, rng = Servo.preset("paper"), np.random.default_rng(5)
     servos = np.array([paper.replace(k=1e4 * rng.uniform(0.85, 1.15)) for _ in range(5)])[:, None]
     cases = Cases(np.array([0.3e-3, 2e-3]), np.array([4.0, 20.0]) * DEGREE, np.array([0.0, 1e-5]))
-    samples = simulate_members(servos, None, 6.0, *cases, outputs=("error", "theta_m"))
+    samples = simulate_members(servos, None, 6.0, cases, outputs=("error", "theta_m"))
     figures = summarise_members(servos, None, 6.0, cases, 2.0, {"error": 1e-4}, outputs=("error", "theta_m"))
     for name, y in samples.items():
         found, last = figures[name], y[..., -200:]
@@ -123,21 +115,22 @@ def test_figures_are_those_of_the_samples() -> None:
 
 def test_threads_change_no_bit() -> None:
     gaps = np.linspace(0.0, 40.0, 17) * DEGREE
-    one, three = (simulate_ensemble(TABLE1, 5.0, 1e-3, gap=gaps, tolerance=1e-5, threads=k) for k in (1, 3))
+    cases = Cases(1e-3, gaps, 1e-5)
+    one, three = (simulate_members(TABLE1, None, 5.0, cases, threads=k)["error"] for k in (1, 3))
     assert np.array_equal(one, three)
 
 
 def test_wrong_members_are_refused() -> None:
     with pytest.raises(InvalidInput, match="gap"):
-        simulate_ensemble(TABLE1, 1.0, gap=[0.1, -0.1])
+        simulate_members(TABLE1, None, 1.0, Cases(gap=[0.1, -0.1]))
     with pytest.raises(InvalidInput, match="tolerance"):
-        simulate_ensemble(TABLE1, 1.0, tolerance=np.nan)
+        simulate_members(TABLE1, None, 1.0, Cases(tolerance=np.nan))
     with pytest.raises(InvalidInput, match="continuous controller"):
-        simulate_ensemble(TABLE1, 1.0, controller=TABLE1.controller.replace(sample_rate=1e3))
+        simulate_members(TABLE1, TABLE1.controller.replace(sample_rate=1e3), 1.0, Cases())
     with pytest.raises(InvalidInput, match="friction"):
-        simulate_members(TABLE1, None, 1.0, friction=-0.1)
+        simulate_members(TABLE1, None, 1.0, Cases(friction=-0.1))
     with pytest.raises(InvalidInput, match="no output 'speed'"):
-        simulate_members(TABLE1, None, 1.0, outputs=("speed",))
+        simulate_members(TABLE1, None, 1.0, Cases(), outputs=("speed",))
     with pytest.raises(InvalidInput, match="limits name 'voltage'"):
         summarise_members(TABLE1, None, 1.0, Cases(), 0.5, {"voltage": 1.0}, outputs=("error",))
     with pytest.raises(InvalidInput, match="last 201 of 101"):

@@ -130,7 +130,7 @@ def test_members_of_ensembles_are_runs() -> None:
     sizes, screw = np.array([SIZE, -SIZE, 0.1 * SIZE]), 0.5 * GAP
     laws = np.array([PD, FED, FED.replace(feedforward=0.01, velocity_feedforward=100.0)])[:, None]
     cases = Cases(sizes, GAP, 0.0, screw, 0.005, FRICTION)
-    continuous = simulate_members(PAPER, laws, 2.0, *cases, outputs=("position",), sample_rate=100.0)["position"]
+    continuous = simulate_members(PAPER, laws, 2.0, cases, outputs=("position",), sample_rate=100.0)["position"]
     fast = np.array([[law.replace(sample_rate=1000.0)] for law in laws[:, 0]])
     ramp = PiecewiseCubic([0.0, 0.7], [[0.0, 1.0, 0.0, 0.0], [0.7, 0.0, 0.0, 0.0]])
     for shape in (1.0, ramp):

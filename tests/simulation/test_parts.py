@@ -12,7 +12,7 @@ from servotwin.plant.sensors import Sensors
 from servotwin.plant.signals import SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
-from servotwin.simulation.ensemble import simulate_members
+from servotwin.simulation.ensemble import Cases, simulate_members
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled
 from servotwin.simulation.simulate import Simulation
 
@@ -94,7 +94,7 @@ AXES = {"friction that falls, limit": STICKY, "hanging": FREE}
 @pytest.mark.parametrize("name", AXES)
 def test_members_of_an_ensemble_are_runs(name: str) -> None:
     axes = [AXES[name], AXES[name].scaled({"k": 1.2, "m": 0.9})]
-    together = simulate_members(axes, LAW, 2.0, 0.2, GAP, outputs=("position",))["position"]
+    together = simulate_members(axes, LAW, 2.0, Cases(0.2, GAP), outputs=("position",))["position"]
     sampled = LAW.replace(sample_rate=1000.0)
     ticked = simulate_sampled(axes, sampled, 2.0, SampledCases(0.2, GAP), ("position",), sample_rate=100.0)["position"]
     for i, axis in enumerate(axes):

@@ -13,7 +13,7 @@ import servotwin as st
 from servotwin.control.controller import ControllerChanges
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import ServoChanges
-from servotwin.simulation.ensemble import simulate_ensemble
+from servotwin.simulation.ensemble import Cases, simulate_members
 
 ROOT = Path(__file__).parents[2]
 TEN_DEGREES = math.radians(10.0)
@@ -92,7 +92,7 @@ def test_a_gap_in_degrees_is_refused_everywhere(servo):
     for call in (
         lambda: servo.tolerance_for(10.0),
         lambda: st.limit_cycle(servo, 10.0),
-        lambda: simulate_ensemble(servo, 1.0, gap=[0.1, 10.0]),
+        lambda: simulate_members(servo, None, 1.0, Cases(gap=[0.1, 10.0])),
     ):
         with pytest.raises(InvalidInput, match=r"573 deg.*math\.radians\(10\)"):
             call()

@@ -7,7 +7,8 @@ import msgspec
 import pytest
 from scaling import Units, scaled
 
-from servotwin.commissioning.edge_settings import Commissioning, Recording, supervision_of
+from servotwin.commissioning.edge_settings import Commissioning, Recording
+from servotwin.commissioning.guarding import supervision_of
 from servotwin.control.gains import gains_of
 from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision

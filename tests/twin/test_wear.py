@@ -7,8 +7,9 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
+from quantisation import quantisation
 
-from servotwin.cosim import Loop, cosimulate, quantisation
+from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened

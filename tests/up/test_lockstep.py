@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import msgspec
 import pytest
+from lock_step import HttpTwin, LockStep, lock_step
 from machines import machine
 from services import service
 
@@ -19,7 +20,6 @@ from servotwin.drives.simulated.client import SimulatedSupervised
 from servotwin.errors import InvalidInput
 from servotwin.messages import Update, decode, encode
 from servotwin.twin.evidence import plain
-from servotwin.up.lock_step import HttpTwin, LockStep, lock_step
 
 SCENARIO = """
 servo = "paper"

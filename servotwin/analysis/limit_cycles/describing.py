@@ -12,9 +12,8 @@ from numpy.polynomial import polynomial as poly
 from servotwin.analysis.limit_cycles.cycle import CycleResult, CycleStatus, limit_cycle
 from servotwin.analysis.limit_cycles.orbit import closed_orbit
 from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section
-from servotwin.analysis.limit_cycles.prediction import Prediction
 from servotwin.analysis.limit_cycles.scaled import ScaledLoop, scaled_loop
-from servotwin.analysis.limit_cycles.shaft import shaft_predictions
+from servotwin.analysis.limit_cycles.shaft import Prediction, shaft_predictions
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.errors import InvalidInput

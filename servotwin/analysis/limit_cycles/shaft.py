@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.analysis.limit_cycles.prediction import Prediction
 from servotwin.control.laws import Law
 from servotwin.control.linear_law import LinearLaw
 from servotwin.hybrid.automaton import Array
@@ -26,6 +25,29 @@ from servotwin.plant.plants import Plant
 _PER_DECADE, _DECADES = 400, 3.0
 # Of a frequency, for the slope of a response.
 _STEP = 1e-6
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A limit cycle by a describing function: a solution of N(A) L(j omega) = -1.
+
+    Attributes
+    ----------
+    frequency : float
+        Hz.
+    motor_amplitude : float
+        rad, of the first harmonic of the input of the backlash, A: the motor's angle, or of a free shaft the angle
+        across backlash and shaft.
+    amplitude : float
+        m (rotary: rad), of the first harmonic of the position.
+    stable : bool
+        True when a larger amplitude would decay and a smaller one grow, by the describing function.
+    """
+
+    frequency: float
+    motor_amplitude: float
+    amplitude: float
+    stable: bool
 
 
 def dead_zone_function(amplitude: float, gap: float) -> float:

@@ -22,7 +22,6 @@ from servotwin.plant.linear import Complex
 
 # Filter time times crossover of types without a filter: the law needs one, so fast that it costs half a degree at most.
 FASTEST_FILTER = 0.01
-_ROUNDING = 8.0 * float(np.finfo(float).eps)
 
 
 class ControllerType(NamedTuple):
@@ -83,47 +82,6 @@ def _gains(factors: Factors) -> tuple[float, float, float, float]:
         return constant, 0.0, linear - constant * time, time
     Kp = linear - constant * time
     return Kp, constant, square - Kp * time, time
-
-
-def factored(controller: Controller, wc: float) -> Factors:
-    """The factors of given gains (the inverse of `Factors.controller`) at a crossover wc, rad/s.
-
-    Raises
-    ------
-    InvalidInput
-        The controller has no integral action, or its zeros are not real and stable.
-    """
-    c = controller
-    if c.Ki == 0.0:
-        raise InvalidInput("controller Ki = 0: the factorisation needs integral action")
-    zeros = _zeros(c)
-    if not all(zero < 0.0 for zero in zeros):
-        shown = "complex" if math.isnan(zeros[0]) else f"{', '.join(f'{zero:.6g}' for zero in zeros)} 1/s"
-        raise InvalidInput(f"the controller's zeros are {shown}: they must be real and negative to be factored")
-    angles = sorted((math.atan2(wc, -zero) for zero in zeros), reverse=True)
-    angles += [0.0] * (2 - len(angles))
-    K = abs(complex(c.Kp + c.Ki / (1j * wc) + c.Kd * 1j * wc / (c.Tf * 1j * wc + 1.0)))
-    return Factors(math.copysign(K, c.Ki), wc, angles[0], angles[1], math.atan(wc * c.Tf), True)
-
-
-def _zeros(c: Controller) -> list[float]:
-    """Real zeros of a controller with integral action, 1/s; NaN for two that are complex.
-
-    What cancels but for rounding is zero: the highest coefficient of a controller with one zero only, and the
-    discriminant of two equal ones.
-    """
-    square, linear, constant = c.Kp * c.Tf + c.Kd, c.Kp + c.Ki * c.Tf, c.Ki
-    linear_rounding = _ROUNDING * (abs(c.Kp) + abs(c.Ki) * c.Tf)
-    square_rounding = _ROUNDING * (abs(c.Kp) * c.Tf + abs(c.Kd))
-    if abs(square) <= square_rounding:
-        return [-constant / linear] if abs(linear) > linear_rounding else []
-    discriminant = linear**2 - 4.0 * square * constant
-    if abs(discriminant) <= 2.0 * abs(linear) * linear_rounding + 4.0 * abs(constant) * square_rounding:
-        discriminant = 0.0
-    if discriminant < 0.0:
-        return [math.nan, math.nan]
-    larger = -0.5 * (linear + math.copysign(math.sqrt(discriminant), linear))
-    return [larger / square, constant / larger]
 
 
 # Angles of a grid, and how often it is repeated, each time a quarter as wide, about the best.

@@ -19,7 +19,6 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.linear import LinearSystem, realised, series
 from servotwin.plant.plants import Plant
-from servotwin.plant.signals import Samples
 
 
 def prefilter(controller: Controller, b: float, c: float) -> LinearSystem:
@@ -56,12 +55,6 @@ def prefilter(controller: Controller, b: float, c: float) -> LinearSystem:
     if np.any(above[order + 1 :] != 0.0):
         raise InvalidInput(f"setpoint weights b = {b:g}, c = {c:g}: Kp Tf = -Kd, so only c = b gives a proper filter")
     return realised(above[: order + 1], below[: order + 1])
-
-
-def shaped(controller: Controller, b: float, c: float, size: float, duration: float, rate: float) -> Samples:
-    """A reference step of a size (m) behind the prefilter, piecewise constant at a rate (Hz), for a simulation."""
-    times = np.arange(round(duration * rate) + 1) / rate
-    return Samples(times.tolist(), (size * prefilter(controller, b, c).step(times)).tolist())
 
 
 def overshoot(servo: Plant, controller: Controller, b: float = 1.0, c: float = 1.0) -> float:

@@ -1,1 +1,1 @@
-"""Joint estimation of gap and model parameters, and the identifiability of the motor's parameters."""
+"""Joint estimation of gap and model parameters."""

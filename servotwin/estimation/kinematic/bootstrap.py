@@ -6,8 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.kinematic.profile import least_gap
-from servotwin.estimation.kinematic.regression import solved
+from servotwin.estimation.kinematic.regression import least_gap, solved
 from servotwin.plant.signals import Array
 
 DRAWS = 300

@@ -16,7 +16,6 @@ from servotwin.estimation.kinematic.breaks import check_one_machine
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
 from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
-from servotwin.estimation.kinematic.profile import least_gap
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import (
     INERTIA,
@@ -25,6 +24,7 @@ from servotwin.estimation.kinematic.regression import (
     Regression,
     Solution,
     columns,
+    least_gap,
     products,
     regression,
     solved,

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from servotwin.estimation.kinematic.profile import interpolated, least_gap
 from servotwin.estimation.kinematic.regression import (
     INERTIA,
     LAG,
@@ -15,6 +14,8 @@ from servotwin.estimation.kinematic.regression import (
     RATIO,
     WIND_UP,
     Regression,
+    interpolated,
+    least_gap,
     solved,
     squares_of,
 )

@@ -84,7 +84,6 @@ class Priors(NamedTuple):
     delay: float
 
 
-_COMMON = ("half gap", "offset", "delay", "ratio")
 HALF, OFFSET, DELAY, RATIO = range(4)
 
 

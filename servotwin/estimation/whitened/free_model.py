@@ -21,11 +21,10 @@ from servotwin.estimation.core.contacts import BY_RATE
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
-from servotwin.estimation.whitened.cyclic import cyclic_motions
-from servotwin.estimation.whitened.lag import lag_motion
 from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
 from servotwin.estimation.whitened.search import PLACES
+from servotwin.estimation.whitened.sensor_errors import cyclic_motions, lag_motion
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 

@@ -12,11 +12,11 @@ import numpy as np
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.retuning import answer, filter_time, integrates, unfed
+from servotwin.errors import InvalidInput
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
-from servotwin.redesign.certified.bounds import share_at_least
 from servotwin.redesign.certified.certificate import (
     BeyondResult,
     Certificate,
@@ -266,3 +266,28 @@ def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) ->
     rest = with_feedforward(setting, 0.0), uncertainty.replace(input_bias=(0.0, 0.0))
     question = repr((servo.version, rest, left, seed))
     return int.from_bytes(hashlib.sha256(question.encode()).digest()[:7], "big")
+
+
+def share_at_least(successes: int, trials: int, confidence: float) -> float:
+    """Lower bound of a share (Clopper-Pearson): with that confidence at least so much of all succeeds.
+
+    Parameters
+    ----------
+    successes, trials : int
+        Of independent trials.
+    confidence : float
+        Within 0 .. 1.
+
+    Raises
+    ------
+    InvalidInput
+        The numbers are no sample.
+    """
+    if not 0 <= successes <= trials or trials == 0:
+        raise InvalidInput(f"{successes} successes in {trials} trials: must be 0 to all of at least 1")
+    if successes == 0:
+        return 0.0
+    from scipy.special import betaincinv
+
+    # The quantile of a beta distribution; without a failure it is (1 - confidence)^(1 / trials).
+    return float(betaincinv(successes, trials - successes + 1, 1.0 - confidence))

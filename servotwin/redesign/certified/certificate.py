@@ -366,14 +366,6 @@ class Certificate:
             text += f", up to {extra.delay} samples late" if self.rate else ""
         return text
 
-    @property
-    def not_tried(self) -> str:
-        """Sentence on what no simulation contained."""
-        return (
-            "not tried: measurement noise, a gap that grows while the loop moves, compliance other than the model's, "
-            "several axes, and a sensor or drive that fails"
-        )
-
 
 @dataclass(frozen=True)
 class NotVerified:

@@ -56,11 +56,6 @@ class Identifiability:
         """(P, P) Fisher information of the logarithms."""
         return np.asarray(self.directions.T @ np.diag(self.strengths**2) @ self.directions)
 
-    @property
-    def hidden(self) -> Array:
-        """(P - rank, P) orthonormal exponents of the products that nothing shows: the null space."""
-        return self.directions[self.rank :]
-
     def relative_std(self, exponents: Mapping[str, float]) -> float:
         """Standard deviation of the logarithm of a product of powers; inf where the data do not determine it.
 

@@ -1,8 +1,13 @@
-"""A sensor that lags in place of one that is late: both delay its channel, and the lag rounds it off besides.
+"""Errors of sensors and screws as changes of the fitted position: one that lags, one that errs once per turn.
 
-A fit takes off the delay between the channels, whatever its cause. A first-order lag of that time constant leaves half
-of its square times the acceleration. In the motor's angle this clips the crests, at which contacts end, so that the gap
-seems to have another size.
+A sensor that lags in place of one that is late delays its channel, and rounds it off besides. A fit takes off the delay
+between the channels, whatever its cause. A first-order lag of that time constant leaves half of its square times the
+acceleration. In the motor's angle this clips the crests, at which contacts end, so that the gap seems to have another
+size.
+
+An encoder that sits off its axis, and a screw whose pitch wobbles, err by a sine of the motor's angle. Within a part of
+a turn this looks like another pitch, and in the motor's angle like another gap: the two contacts lie at different
+angles. A whole turn would show it.
 """
 
 from __future__ import annotations
@@ -39,3 +44,19 @@ def lag_motion(reduction: Reduction, point: Point, screw: Array, delay: float) -
     clipped = np.interp(time - late, time, angle) - lagged
     moved = through_gap(clipped[None], angle, point.screw(0.0, reduction.rate))
     return np.asarray(reduction.reduced.respond(moved)[0])
+
+
+def cyclic_motions(reduction: Reduction, point: Point) -> Array:
+    """(4, m) changes of the fitted position (m) per rad of a cyclic error: two of the position's, two of the angle's.
+
+    Parameters
+    ----------
+    reduction : Reduction
+    point : Point
+        The fit's gap and place.
+    """
+    angle = reduction.theta_m
+    waves = np.vstack([np.sin(angle), np.cos(angle)])
+    own = reduction.response.static_gain * reduction.decimation.rows(waves)
+    moved = through_gap(waves, angle, point.screw(0.0, reduction.rate))
+    return np.vstack([own, reduction.reduced.respond(moved)])
