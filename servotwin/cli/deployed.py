@@ -94,6 +94,10 @@ def enroll(
         str | None, typer.Option(help="Address at which the edge reaches the twin; the twin's own by default.")
     ] = None,
     operator: Annotated[Path | None, typer.Option(help="Enroll an operator instead; file for the token.")] = None,
+    engineer: Annotated[
+        Path | None,
+        typer.Option(help="Enroll an engineer instead, who may hold, approve and roll back; file for the token."),
+    ] = None,
     again: Annotated[bool, typer.Option("--again", help="Replace an existing token.")] = False,
     noise_um: Annotated[
         float, typer.Option(min=0.0, help="Noise on the measured position that the watch allows, rms, um.")
@@ -105,10 +109,13 @@ def enroll(
     from servotwin.up import enrolment
     from servotwin.up.bulk_enrolment import enroll_all, read_enrolments
 
-    if (name is None) == (csv is None) or (csv is not None and (edge or operator)):
-        raise InvalidInput("give a name, or --csv with a file; --edge and --operator are for one name")
-    if operator is not None:
-        written = enrolment.enroll_operator(twin, name or "", operator, replace_token=again)
+    if (name is None) == (csv is None) or (csv is not None and (edge or operator or engineer)):
+        raise InvalidInput("give a name, or --csv with a file; --edge, --operator and --engineer are for one name")
+    if operator is not None and engineer is not None:
+        raise InvalidInput("give --operator or --engineer: a name has one role")
+    if operator is not None or engineer is not None:
+        file = operator or engineer or Path()
+        written = enrolment.enroll_operator(twin, name or "", file, again, engineer=engineer is not None)
     else:
         request = enrolment.Enrolment(
             servo=name or "",

@@ -61,7 +61,7 @@ class FleetRow:
     travel_unit, command_unit : str
         As in `MachineFacts`.
     version_sent, version_in_force : int or None
-        Of the newest update; as the edge reported last.
+        Of the newest update; as the edge reported in its present boot.
     receipt : str
         Reason in the newest receipt.
     windows, waiting : int
@@ -127,7 +127,7 @@ def fleet_row(facts: ServoFacts, contexts: Mapping[str, str], connected: bool | 
         travel_unit=machine.travel_unit,
         command_unit=machine.command_unit,
         version_sent=summary.version,
-        version_in_force=version_in_force(newest),
+        version_in_force=version_in_force(newest, "" if window is None else window.boot),
         receipt=summary.receipt,
         windows=summary.windows,
         waiting=summary.waiting,
@@ -174,15 +174,34 @@ def _passage(left: float, rate: float) -> float | None:
     return left / rate if rate > 0.0 and math.isfinite(left / rate) else None
 
 
-def version_in_force(newest: Mapping[str, StoredEvidence]) -> int | None:
-    """Version that the edge reported last: with a window, a receipt, a fallback or a hello."""
-    known = [newest[kind] for kind in ("window", "hello", "receipt", "fallback") if kind in newest]
-    last = max(known, key=lambda record: record.id, default=None)
-    if last is None or last is newest.get("window") or last is newest.get("hello"):
-        return None if last is None else last.version
-    body = body_of(last)
+def version_in_force(newest: Mapping[str, StoredEvidence], window_boot: str = "") -> int | None:
+    """Highest version that the edge reported in its present boot, with a window, a receipt, a fallback or a hello.
+
+    Within a boot versions only rise, whatever the order in which the reports came. The present boot is that of the
+    newest hello; without one, of the newest report.
+    """
+    reports = {kind: newest[kind] for kind in ("window", "hello", "receipt", "fallback") if kind in newest}
+    if not reports:
+        return None
+    boots = {kind: _boot_of(record, kind, window_boot) for kind, record in reports.items()}
+    present = boots["hello"] if "hello" in reports else boots[max(reports, key=lambda kind: reports[kind].id)]
+    versions = (_version_of(record, kind) for kind, record in reports.items() if boots[kind] in (present, ""))
+    return max((version for version in versions if version is not None), default=None)
+
+
+def _boot_of(report: StoredEvidence, kind: str, window_boot: str) -> str:
+    """Boot of a report; empty: unknown."""
+    if kind in ("hello", "window"):
+        return report.status if kind == "hello" else window_boot
+    body = body_of(report)
+    return str(body.get("boot", "")) if isinstance(body, dict) else ""
+
+
+def _version_of(report: StoredEvidence, kind: str) -> int | None:
+    """Version in force after a report."""
+    body = body_of(report) if kind in ("receipt", "fallback") else None
     version = body.get("parameter_version") if isinstance(body, dict) else None
-    return version if isinstance(version, int) else last.version
+    return version if isinstance(version, int) else report.version
 
 
 def _summary_interval(facts: ServoFacts) -> Interval | None:

@@ -70,9 +70,9 @@ def tail(time: Array, end: float, length: float = TAIL) -> slice:
     return between(time, end - length, end)
 
 
-def has_settled(values: Array, scale: float, share: float = SETTLED) -> bool:
-    """Decide: the amplitude of `values` is below `share` of `scale`."""
-    return amplitude(values) < share * scale
+def has_settled(values: Array, scale: float) -> bool:
+    """Decide: the amplitude of `values` is below `SETTLED` of `scale`."""
+    return amplitude(values) < SETTLED * scale
 
 
 def settling_time(time: Array, values: Array, target: float, band: float) -> float:

@@ -211,9 +211,9 @@ class Runs:
         """Measures of a step."""
         return self.get(StepMeasureJob(StepJob(self.preset, gap_deg, dead_zone_deg, **more)))
 
-    def sweep(self, gaps_deg: Iterable[float], dead_zone_deg: float | None = ESTIMATE_DEG) -> tuple[MeasuredStep, ...]:
-        """Measures of 1 mm steps over gaps."""
-        return tuple(self.settle(float(gap), dead_zone_deg) for gap in gaps_deg)
+    def sweep(self, gaps_deg: Iterable[float]) -> tuple[MeasuredStep, ...]:
+        """Measures of 1 mm steps over gaps, with the dead zone made for `ESTIMATE_DEG`."""
+        return tuple(self.settle(float(gap), ESTIMATE_DEG) for gap in gaps_deg)
 
     def ensemble(self, gap_deg: float, dead_zone_deg: float) -> tuple[MeasuredStep, ...]:
         """81 members over reference amplitudes (0.5 to 2 mm) and initial screw angles (the whole gap), erratum E17."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import sqlalchemy as sa
@@ -40,7 +40,7 @@ class ServoFacts(NamedTuple):
     ----------
     summary : ServoSummary
     window : StoredWindow or None
-        The newest one.
+        The newest one, by boot and number.
     newest : dict of str to StoredEvidence
         Newest evidence of the kinds trend, hello, receipt and fallback, and in "window" the estimate or glance of the
         newest window.
@@ -91,11 +91,11 @@ def facts(connection: sa.Connection, servos: Collection[str], alarms_since: floa
     if not names:
         return []
     summaries = servo_summaries(connection, names)
-    windows = {row.servo: StoredWindow(*row) for row in connection.execute(_LAST_WINDOWS, {"_servos": names})}
     newest: dict[str, dict[str, StoredEvidence]] = {name: {} for name in names}
     for kind, query in _NEWEST_OF.items():
         for row in connection.execute(query, {"_servos": names}):
             newest[row.servo][kind] = evidence_of_row(row)
+    windows = _newest_windows(connection, names, newest)
     of_windows = [window.id for window in windows.values()]
     query = sa.select(*_COLUMNS, evidence.c.servo).where(evidence.c.message.in_(of_windows))
     for row in connection.execute(query.where(evidence.c.kind.in_(_ESTIMATES)).order_by(evidence.c.id)):
@@ -107,6 +107,25 @@ def facts(connection: sa.Connection, servos: Collection[str], alarms_since: floa
         ServoFacts(each, windows.get(each.servo), newest[each.servo], tuple(alarms.get(each.servo, ())))
         for each in summaries
     ]
+
+
+def _newest_windows(
+    connection: sa.Connection, names: Sequence[str], newest: Mapping[str, Mapping[str, StoredEvidence]]
+) -> dict[str, StoredWindow]:
+    """Newest window of each servo by boot and number: after an outage, or a reordering link, it is not the last one."""
+    found = {row.servo: StoredWindow(*row) for row in connection.execute(_LAST_WINDOWS, {"_servos": names})}
+    for servo, window in found.items():
+        hello = newest[servo].get("hello")
+        if hello is not None and hello.status != window.boot:
+            bound = {"_servo": servo, "_boot": hello.status, "_since": hello.message}
+            row = connection.execute(_LAST_OF_BOOT, bound).one_or_none()
+            found[servo] = window if row is None else StoredWindow(*row)
+    ids = [window.id for window in found.values()]
+    for _ in range(_REORDERED):
+        following = [StoredWindow(*row) for row in connection.execute(_FOLLOWING, {"_ids": ids})] if ids else []
+        found.update({window.servo: window for window in following})
+        ids = [window.id for window in following]
+    return found
 
 
 def gaps(
@@ -133,8 +152,13 @@ def gaps(
 
 def decisions(connection: sa.Connection, servo: str, limit: int) -> list[StoredEvidence]:
     """Updates, receipts, fallbacks and starts of the edge, oldest first: the newest `limit` of each kind."""
+    return evidence_of_kinds(connection, servo, ("update", *_VERSIONED), limit)
+
+
+def evidence_of_kinds(connection: sa.Connection, servo: str, kinds: Iterable[str], limit: int) -> list[StoredEvidence]:
+    """Evidence of some kinds, oldest first: the newest `limit` of each kind."""
     rows: list[StoredEvidence] = []
-    for kind in ("update", *_VERSIONED):
+    for kind in kinds:
         query = sa.select(*_COLUMNS).where(evidence.c.servo == servo, evidence.c.kind == kind)
         rows += [evidence_of_row(row) for row in connection.execute(query.order_by(evidence.c.id.desc()).limit(limit))]
     return sorted(rows, key=lambda row: row.id)
@@ -158,6 +182,25 @@ def _last_windows() -> sa.Select[Any]:
     return sa.select(*_WINDOW_COLUMNS).where(messages.c.id.in_(sa.select(last).where(twins.c.servo.in_(_SERVOS))))
 
 
+def _last_of_boot() -> sa.Select[Any]:
+    """Query of the last window of a servo's boot that came after a message."""
+    of_boot = sa.and_(messages.c.servo == sa.bindparam("_servo"), messages.c.boot == sa.bindparam("_boot"), WINDOWS)
+    later = messages.c.id > sa.bindparam("_since", type_=sa.BigInteger)
+    return sa.select(*_WINDOW_COLUMNS).where(of_boot, later).order_by(messages.c.id.desc()).limit(1)
+
+
+def _following() -> sa.Select[Any]:
+    """Query of the windows whose numbers follow those of some."""
+    before = messages.alias("before")
+    number = sa.cast(before.c.sequence + 1, sa.Text)
+    follows = sa.and_(messages.c.servo == before.c.servo, messages.c.key == before.c.boot + "/" + number)
+    ids: sa.BindParameter[Any] = sa.bindparam("_ids", expanding=True)
+    return sa.select(*_WINDOW_COLUMNS).select_from(before.join(messages, follows)).where(before.c.id.in_(ids))
+
+
+_REORDERED = 64
+"""Windows at most by which a later one may come before an earlier one."""
+_LAST_OF_BOOT, _FOLLOWING = _last_of_boot(), _following()
 _NEWEST_OF = {kind: _newest_of(kind) for kind in (*_NEWEST, *_VERSIONED)}
 _LAST_WINDOWS = _last_windows()
 _ALARMS_OF_A_SERVO = 50

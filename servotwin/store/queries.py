@@ -23,8 +23,8 @@ from servotwin.store.schema import contexts as context_table
 
 _ESTIMATES = ("glance", "estimate")
 _ANSWERS = ("receipt", "fallback")
-_EVENTS = ("hello", "fallback", "answer")
-"""Kinds of evidence that an edge reports by itself, not about a window."""
+_EVENTS = ("hello", "fallback", "answer", "act")
+"""Kinds of evidence that an edge reports by itself, not about a window, and acts of engineers."""
 _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
 
 

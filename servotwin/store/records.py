@@ -11,6 +11,7 @@ class MessageKind(StrEnum):
 
     WINDOW = "window"
     LETTER = "letter"
+    ACT = "act"
     VERIFICATION = "verification"
 
 
@@ -21,7 +22,8 @@ class Incoming(NamedTuple):
     ----------
     servo : str
     kind : MessageKind
-        A window; a letter (hello, receipt, fallback, answer); or a verification that the twin requests of itself.
+        A window; a letter (hello, receipt, fallback, answer); an engineer's act; or a verification that the twin
+        requests of itself.
     key : str
         Unique within the servo for ever: "boot/sequence" of a window, a digest of any other's body.
     body : bytes
@@ -98,7 +100,7 @@ class EvidenceRecord(NamedTuple):
     ----------
     kind : str
         glance, estimate, disturbance, trend, redesign, excitation, update, request, receipt, fallback, answer, hello,
-        verification, withdrawn.
+        verification, withdrawn, proposal, act.
     message : int
         Id of the message that led to it; 0: none.
     body : bytes

@@ -97,7 +97,7 @@ def due(connection: sa.Connection, servos: Collection[str], now: float) -> set[s
 def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[Any], float]]:
     """(query of the next servos in a queue, largest share of the limit that it may take); of `one` servo only."""
     queues: list[tuple[sa.Select[Any], float]] = []
-    if MessageKind.WINDOW in kinds or MessageKind.LETTER in kinds:
+    if kinds - {MessageKind.VERIFICATION}:
         due, ready = twins.c.wake <= _NOW, twins.c.ready.is_not(None)
         # Half of the places at most before those with messages, the rest after them: neither queue can starve the
         # other.
@@ -145,7 +145,7 @@ def _work_before_verifications(message: StoredMessage) -> tuple[bool, int]:
     return message.kind is MessageKind.VERIFICATION, message.id
 
 
-_OLDEST_FIRST = (frozenset({MessageKind.WINDOW, MessageKind.LETTER}), frozenset({MessageKind.VERIFICATION}))
+_OLDEST_FIRST = (frozenset(MessageKind) - {MessageKind.VERIFICATION}, frozenset({MessageKind.VERIFICATION}))
 _NEWEST_FIRST = tuple(frozenset({kind}) for kind in MessageKind)
 """Kinds that share the places of a lease: where a part of the windows stays behind, no letter may."""
 

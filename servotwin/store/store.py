@@ -39,7 +39,7 @@ from servotwin.store.records import (
 )
 from servotwin.store.schema import contexts
 
-WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER)
+WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER, MessageKind.ACT)
 _FLEET = "fleet"
 """Key of the fleet's name among the contexts, whose other keys are digests."""
 _RACES = 8

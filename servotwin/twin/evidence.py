@@ -34,11 +34,13 @@ from servotwin.messages import (
     encode,
     finite,
 )
+from servotwin.messages.acts import Act
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.store.records import EvidenceRecord
 from servotwin.twin.lookups import VerificationRequest
+from servotwin.twin.oversight import Proposal
 from servotwin.twin.triage import Glance
 
 MAX_STATUS = 300
@@ -125,9 +127,23 @@ class WithdrawalRecord(NamedTuple):
     why: str
 
 
+class ProposalRecord(NamedTuple):
+    """An update that waits for its approval."""
+
+    proposal: Proposal
+
+
+class ActRecord(NamedTuple):
+    """An engineer's act, and the reason for which it was refused; empty: it was carried out."""
+
+    act: Act
+    refused: str
+
+
 Record = (
     GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | AlarmRecord
     | RedesignRecord | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
+    | ProposalRecord | ActRecord
     | Update | Request | LearntResponse | Receipt | Fallback | Answer | Hello
 )  # fmt: skip
 """Evidence of one step; a message is its own record: an update or a request sent, a receipt received."""
@@ -160,6 +176,8 @@ class EvidenceLog:
     unverified: list[VerificationRequest] = field(default_factory=list)
     verifications: list[VerificationRecord] = field(default_factory=list)
     withdrawals: list[WithdrawalRecord] = field(default_factory=list)
+    proposals: list[Proposal] = field(default_factory=list)
+    acts: list[ActRecord] = field(default_factory=list)
 
     def add_window(self, window: WindowMessage) -> bool:
         """Store a window under its identity; False when it was stored already."""
@@ -196,6 +214,10 @@ class EvidenceLog:
                 self.verifications.append(record)
             case WithdrawalRecord():
                 self.withdrawals.append(record)
+            case ProposalRecord(proposal):
+                self.proposals.append(proposal)
+            case ActRecord():
+                self.acts.append(record)
             case VerificationRequest():
                 self.unverified.append(record)
             case Update():
@@ -263,7 +285,7 @@ def rows(records: Sequence[Record], message: int, context: str) -> list[Evidence
     ]
 
 
-_WITHOUT_CONTEXT = ("request", "receipt", "fallback", "answer", "hello")
+_WITHOUT_CONTEXT = ("request", "receipt", "fallback", "answer", "hello", "act")
 """Kinds that are not computed (the decision that led to a request has a row of its own)."""
 
 
@@ -302,6 +324,14 @@ def _row(record: Record) -> EvidenceRecord | None:
             return _computed("verification", body_of, reason, **_of_update(request))
         case WithdrawalRecord(request, why):
             return _computed("withdrawn", {"version": request.version, "why": why}, why, **_of_update(request))
+        case ProposalRecord(proposal):
+            draft = proposal.update
+            window_key = "{}/{}".format(*draft.window)
+            return _computed("proposal", draft, draft.status, gap=draft.gap, std=draft.std, window=window_key)
+        case ActRecord(act, refused):
+            status = f"{act.sentence} (refused: {refused})" if refused else act.sentence
+            window_key = "" if act.window is None else "{}/{}".format(*act.window)
+            return _computed("act", {"act": act, "refused": refused}, status, window=window_key)
         case Update():
             window_key = "{}/{}".format(*record.window)
             row = _sent("update", record, record.status, record.version)

@@ -22,6 +22,7 @@ from servotwin.redesign.certified.certificate import verification_of
 from servotwin.redesign.design import decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState
+from servotwin.twin.oversight import Oversight
 from servotwin.twin.requests import Attempts, RequestState
 from servotwin.twin.responses import ResponseState
 from servotwin.twin.triage import TriageState
@@ -204,6 +205,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         boots that ended before it and that the twin does not know.
     requests, triage, lookups, responses : RequestState, TriageState, LookupState, ResponseState, or None
         State of the optional parts; None: the twin has no such part.
+    oversight : Oversight
+        Effect of engineers' acts.
     """
 
     servo: str
@@ -221,6 +224,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     other_controller: int = 0
     newest: tuple[str, float] | None = None
     introduced: bool = False
+    oversight: Oversight = Oversight()
 
     def is_of_other_boot(self, window: WindowMessage) -> bool:
         """True for a window of a boot that has ended, or was not introduced though the edge introduces each."""

@@ -28,10 +28,13 @@ from servotwin.messages import (
     Receipt,
     Update,
     WindowMessage,
+    finite,
 )
+from servotwin.messages.acts import Act
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
+    ActRecord,
     AlarmRecord,
     DisturbanceRecord,
     ExcitationRecord,
@@ -39,6 +42,7 @@ from servotwin.twin.evidence import (
     GlanceRecord,
     MachineRecord,
     MotorRecord,
+    ProposalRecord,
     Record,
     RedesignRecord,
     TrendRecord,
@@ -47,6 +51,7 @@ from servotwin.twin.evidence import (
 )
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
+from servotwin.twin.oversight import Proposal, judge_act, sent_again
 from servotwin.twin.requests import Attempts
 from servotwin.twin.state import TwinState, draft_update, noted_setting
 from servotwin.twin.triage import Glance, no_glance
@@ -94,7 +99,7 @@ class Wake(NamedTuple):
     """Event: the time that `next_wake` returned has come."""
 
 
-Event = WindowArrival | ParameterMessage | VerificationRequest | Wake
+Event = WindowArrival | ParameterMessage | VerificationRequest | Act | Wake
 
 
 class StepResult(NamedTuple):
@@ -121,7 +126,7 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
     ----------
     model : TwinModel
     state : TwinState
-    event : WindowArrival, message, VerificationRequest or Wake
+    event : WindowArrival, message, VerificationRequest, Act or Wake
     now : float
         Time on the twin's own clock, s. It may jump: no wait becomes longer than one that begins at `now`.
 
@@ -153,6 +158,8 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
             return _take_hello(state, event)
         case Answer():
             return _take_answer(model, state, event, now)
+        case Act():
+            return _take_act(model, state, event, now)
         case Wake():
             return _wake(model, state, now)
     raise InvalidMessage(f"a twin does not receive {type(event).__name__} messages")
@@ -181,6 +188,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
     state, glance = _glance(model, state, decoded, arrived)
+    if state.oversight.again is not None and not event.overtaken:
+        glance = None  # the setting that is sent again needs the window's estimate
     if glance is None and event.overtaken and event.unseen:
         glance = no_glance(_OVERTAKEN)
     if not state.has_overtaken(message):
@@ -205,16 +214,24 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         redesign = Redesign(None, math.nan, why_none)
     else:
         state, redesign = _redesign(model, state, evidence, stale)
+    overseen = state.oversight
     if learnt.disturbance.known and not stale:
         state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
-    if not stale:
+    if not stale and not overseen.held:
         state, requested, decided = _ask(model, state, message, estimate, arrived, now)
         others, records = [*others, *requested], [*records, *decided]
     if redesign.setting is None:
         return StepResult(state, tuple(others), tuple(records))
-    versions = state.versions.with_update(draft_update(message, evidence, redesign, model.settings.validity))
-    state = replace(state, versions=versions, tuned_for=float(redesign.gap))
+    draft = draft_update(message, evidence, redesign, model.settings.validity)
+    if overseen.ask_first and not overseen.held:
+        if not overseen.proposes_anew(message):
+            return StepResult(state, tuple(others), tuple(records))
+        waiting = Proposal(draft, finite(redesign.gap))
+        state = replace(state, oversight=replace(overseen, proposal=waiting))
+        return StepResult(state, tuple(others), (*records, ProposalRecord(waiting)))
+    versions = state.versions.with_update(draft)
+    state = replace(state, versions=versions, tuned_for=None if overseen.held else float(redesign.gap))
     sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
@@ -332,7 +349,14 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     if state.other_controller >= OTHER_CONTROLLER and not stale:
         return state, Redesign(None, math.nan, _OTHER)
     needs_estimate = model.lookups is None and model.policy.needs_estimate
-    if stale or (evidence.why_not and needs_estimate):
+    if stale:
+        return state, Redesign(None, math.nan, evidence.why_not)
+    overseen = state.oversight
+    if overseen.again is not None:
+        return _send_again(model, state, evidence, overseen.again)
+    if overseen.held:
+        return state, Redesign(None, math.nan, overseen.held)
+    if evidence.why_not and needs_estimate:
         return state, Redesign(None, math.nan, evidence.why_not)
     try:
         if model.lookups is None or state.lookups is None:
@@ -341,6 +365,33 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
         return replace(state, lookups=lookups), redesign
     except InvalidInput as error:
         return state, Redesign(None, math.nan, str(error))
+
+
+def _send_again(model: TwinModel, state: TwinState, evidence: Evidence, act: Act) -> tuple[TwinState, Redesign]:
+    """Carry out a roll back; the machine stays held."""
+    state = replace(state, oversight=replace(state.oversight, again=None))
+    try:
+        return state, sent_again(model.policy, evidence, act, state.known)
+    except InvalidInput as error:
+        return state, Redesign(None, math.nan, str(error))
+
+
+def _take_act(model: TwinModel, state: TwinState, act: Act, now: float) -> StepResult:
+    """Carry out an engineer's act, and keep it with what became of it."""
+    judged = judge_act(state.oversight, act, state.newest, state.known, model.policy)
+    proposal, refused = judged.approved, judged.refused
+    if proposal is not None and proposal.update.data_time <= state.versions.data_time:
+        proposal, refused = None, "a newer version was sent meanwhile"
+    record = ActRecord(act, refused)
+    doubted = state.triage and state.triage.doubted(act.sentence)
+    state = replace(state, oversight=judged.oversight, triage=doubted)
+    if proposal is not None:
+        versions = state.versions.with_update(proposal.update)
+        return _send(replace(state, versions=versions, tuned_for=proposal.gap), versions.pending, now, (record,))
+    if state.oversight.held:
+        # What was sent already may still be applied; it is not sent again.
+        state = replace(state, versions=state.versions.without_pending(), tuned_for=None)
+    return StepResult(state, (), (record,))
 
 
 def _send(state: TwinState, update: Update | None, now: float, records: tuple[Record, ...]) -> StepResult:

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Hello, Message, WindowMessage
+from servotwin.messages.acts import Act, decode_act
 from servotwin.messages.codec import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
@@ -178,7 +179,10 @@ def _newest(events: Sequence[Event], state: TwinState) -> WindowArrival | None:
 def _urgent(
     events: Sequence[tuple[int, Event]], state: TwinState, validity: float, now: float, urgency: Urgency
 ) -> list[tuple[int, Event]]:
-    """Events with the receipts first, so that an update names the right base, and windows that come too late marked."""
+    """Events with receipts and acts first, and windows that come too late marked.
+
+    An update then names the right base, and nothing is sent that an act forbids.
+    """
     newest, done_at = _newest([event for _, event in events], state), 0.0
     if newest is not None:
         end = newest.window.start + (newest.window.samples - 1) / newest.window.rate
@@ -195,7 +199,7 @@ def _urgent(
         )
 
     # Stable: the order of the others stays.
-    ordered = sorted(events, key=lambda each: not isinstance(each[1], messages.Receipt))
+    ordered = sorted(events, key=lambda each: not isinstance(each[1], (messages.Receipt, Act)))
     return [(message, marked(event)) for message, event in ordered]
 
 
@@ -209,6 +213,8 @@ def _event(stored: StoredMessage) -> Event:
     """
     if stored.kind is MessageKind.VERIFICATION:
         return decode_request(stored.body)
+    if stored.kind is MessageKind.ACT:
+        return decode_act(stored.body)
     message = messages.decode(decompress(stored.body, stored.encoding, MAX_BYTES))
     return WindowArrival(message, stored.received) if isinstance(message, WindowMessage) else message
 

@@ -1,6 +1,7 @@
 """Authentication and authorisation: tokens, the file of their digests, and files that only their owner may read.
 
-A servo's token speaks for that servo; an operator's token reads everything.
+A servo's token speaks for that servo; an operator's token reads everything; an engineer's also holds machines,
+approves versions and rolls them back.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Verifiers:
 
     Attributes
     ----------
-    servos, operators : mapping of str to bytes
+    servos, operators, engineers : mapping of str to bytes
         Name to `link.seal.verifier_of` its token.
     fleet : str
         Name that `servotwin enroll` draws for the file, and that the twin's store keeps; empty: not named yet.
@@ -54,10 +55,17 @@ class Verifiers:
 
     servos: Mapping[str, bytes] = field(default_factory=dict)
     operators: Mapping[str, bytes] = field(default_factory=dict)
+    engineers: Mapping[str, bytes] = field(default_factory=dict)
     fleet: str = field(default="", compare=False)
 
     def __repr__(self) -> str:
-        return f"Verifiers({len(self.servos)} servos, {len(self.operators)} operators)"
+        counts = f"{len(self.servos)} servos, {len(self.operators)} operators, {len(self.engineers)} engineers"
+        return f"Verifiers({counts})"
+
+    @property
+    def readers(self) -> Mapping[str, bytes]:
+        """Operators and engineers: whoever reads everything."""
+        return {**self.operators, **self.engineers}
 
 
 class AccessControl:
@@ -75,8 +83,9 @@ class AccessControl:
     def replace(self, verifiers: Verifiers | None) -> None:
         """Replace the verifiers."""
         self._verifiers = verifiers
-        known = [] if verifiers is None else [*verifiers.servos.values(), *verifiers.operators.values()]
-        self._known = frozenset(known)
+        self._readers = {} if verifiers is None else verifiers.readers
+        servos = () if verifiers is None else verifiers.servos.values()
+        self._known = frozenset((*servos, *self._readers.values()))
 
     def check_servo(self, servo: str, token: bytes | None) -> None:
         """Check that a token is that of a servo.
@@ -93,12 +102,12 @@ class AccessControl:
             raise self._rejected(verifier, _WRONG)
 
     def check_operator(self, token: bytes | None) -> None:
-        """Check that a token is an operator's; raises RequestRejected as `check_servo` does."""
+        """Check that a token is an operator's or an engineer's; raises RequestRejected as `check_servo` does."""
         if self._verifiers is None:
             return
         verifier = _digest(token)
         # Every operator is compared: a loop that ended at a match would tell by its time which one it was.
-        matches = [hmac.compare_digest(verifier, known) for known in self._verifiers.operators.values()]
+        matches = [hmac.compare_digest(verifier, known) for known in self._readers.values()]
         if not any(matches):
             raise self._rejected(verifier, "the token is not an operator's")
 
@@ -115,17 +124,21 @@ class AccessControl:
         return self._verifiers is None
 
     def operator_of(self, token: bytes | None) -> str:
-        """Name of the operator with a token; empty: it is no operator's."""
+        """Name of the operator or engineer with a token; empty: it is nobody's of them."""
         verifier, found = _digest(token), ""
-        for name, known in (self._verifiers or Verifiers()).operators.items():
+        for name, known in self._readers.items():
             if hmac.compare_digest(verifier, known):
                 found = name
         return found
 
     def operator_key(self, name: str) -> bytes:
         """Key that only the service and the holder of an operator's token can make; random where there is none."""
-        known = None if self._verifiers is None else self._verifiers.operators.get(name)
+        known = self._readers.get(name)
         return secrets.token_bytes(32) if known is None else known
+
+    def is_engineer(self, name: str) -> bool:
+        """True for the name of an engineer."""
+        return self._verifiers is not None and name in self._verifiers.engineers
 
     def verifier(self, servo: str) -> bytes | None:
         """Verifier with which messages to a servo are sealed; None: its token was revoked."""
@@ -254,11 +267,13 @@ def read_tokens(path: Path) -> Verifiers:
     if not path.read_bytes().strip():
         return Verifiers()
     table = read_toml(path)
-    servos, operators = (_read_verifiers(table.table(name)) for name in ("servos", "operators"))
-    verifiers = Verifiers(servos, operators, _read_fleet(table))
+    servos, operators, engineers = (_read_verifiers(table.table(name)) for name in ("servos", "operators", "engineers"))
+    verifiers = Verifiers(servos, operators, engineers, _read_fleet(table))
     table.done()
+    if both := sorted(operators.keys() & engineers.keys()):
+        raise InvalidInput(f"{path}: {both[0]!r} is an operator and an engineer; keep one of the two")
     owner: dict[bytes, str] = {}
-    for name, verifier in [*verifiers.servos.items(), *verifiers.operators.items()]:
+    for name, verifier in [*servos.items(), *verifiers.readers.items()]:
         if verifier in owner:
             raise InvalidInput(f"{path}: {owner[verifier]!r} and {name!r} have the same token")
         owner[verifier] = name
@@ -268,6 +283,8 @@ def read_tokens(path: Path) -> Verifiers:
 def write_tokens(path: Path, verifiers: Verifiers) -> None:
     """Replace the file atomically, mode 0600; raises InvalidInput where that fails."""
     tables = {"servos": verifiers.servos, "operators": verifiers.operators}
+    if verifiers.engineers:  # a file without them stays one that earlier versions read
+        tables["engineers"] = verifiers.engineers
     parts = [
         f"[{name}]\n" + "".join(f'"{key}" = "{value.hex()}"\n' for key, value in sorted(entries.items()))
         for name, entries in tables.items()

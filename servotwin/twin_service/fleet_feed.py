@@ -23,8 +23,8 @@ log = logging.getLogger(__name__)
 
 _TICK_S, _QUIET_S = 1.0, 15.0
 """s between two looks at the store; s without an event after which a comment shows that the connection lives."""
-_MOST = 1000
-"""Rows of one event; where more changed, watchers are told to read the fleet anew."""
+_ROWS, _MOST = 1000, 8000
+"""Rows of one event, and of one look; where more changed, watchers are told to read the fleet anew."""
 _WAITING = 16
 """Events that wait for a slow watcher; then its stream ends, and it resumes."""
 _TICKS_BACK = 3
@@ -47,6 +47,8 @@ class FleetFeed:
 
     Attributes
     ----------
+    closing : asyncio.Event
+        Set once all streams are to end.
     watchers : int
     """
 
@@ -54,7 +56,7 @@ class FleetFeed:
         self, reader: FleetReader, executor: StoreExecutor, presence: EdgePresence, limit: int, shared: bool
     ) -> None:
         self._reader, self._executor, self._presence = reader, executor, presence
-        self._limit, self._closed = limit, False
+        self._limit, self.closing, self._open = limit, asyncio.Event(), 0
         self._queues: set[asyncio.Queue[bytes | None]] = set()
         self._positions: deque[StorePosition] = deque(maxlen=_TICKS_BACK if shared else 1)
         self._connected: frozenset[str] = frozenset()
@@ -62,18 +64,18 @@ class FleetFeed:
 
     @property
     def watchers(self) -> int:
-        """Number of streams."""
-        return len(self._queues)
+        """Number of streams, those included whose events are no longer taken."""
+        return self._open
 
     def close(self) -> None:
         """End all streams; new ones end at once."""
-        self._closed = True
+        self.closing.set()
         for queue in self._queues:
             queue.put_nowait(None)
 
     def admit(self) -> None:
         """Check that there is room for a watcher; raises RequestRejected."""
-        if len(self._queues) >= self._limit:
+        if self._open >= self._limit:
             raise RequestRejected(Refusal.TOO_MANY, f"{self._limit} pages watch the fleet already")
 
     async def watch(self, after: StorePosition | None, allowed: Callable[[], object]) -> AsyncGenerator[bytes, None]:
@@ -87,43 +89,49 @@ class FleetFeed:
         """
         queue: asyncio.Queue[bytes | None] = asyncio.Queue()
         self._queues.add(queue)
-        if self._closed:
+        self._open += 1
+        if self.closing.is_set():
             queue.put_nowait(None)
         try:
             yield b"retry: 2000\n\n"
+            # A link may have changed between the reader's look at the fleet and this one.
+            yield _event("links", None, self._presence.links())
             if after is not None:
                 await self._begin()  # before the changes are read: those that come meanwhile are the feed's to send
-                yield await self._since(after)
-            while (event := await _next(queue)) is not None:
+                for event in await self._since(after):
+                    yield event
+            while (waited := await _next(queue)) is not None:
                 allowed()
-                yield event
+                yield waited
         except RequestRejected:
             yield _event("ended", None, "the session has ended")
         finally:
             self._queues.discard(queue)
+            self._open -= 1
 
     async def run(self) -> None:
         """Look at the store once a second while there are watchers."""
         while True:
             if self._queues:
-                self._send(await self._look())
+                for event in await self._look():
+                    self._send(event)
             else:
                 self._positions.clear()
                 self._presence.refresh()  # for whoever reads the fleet without watching it
             await asyncio.sleep(_TICK_S)
 
-    async def _look(self) -> bytes:
-        """Event of one look; where it fails for whatever reason, watchers are told, and the next look repeats it."""
+    async def _look(self) -> list[bytes]:
+        """Events of one look; where it fails for whatever reason, watchers are told, and the next look repeats it."""
         try:
             return await self._changes()
         except Exception as error:
             first, self._unreadable = not self._unreadable, True
             if not first:
-                return b""
+                return []
             if isinstance(error, StoreUnavailable):
-                return _event("trouble", None, "the twin cannot read its store now")
+                return [_event("trouble", None, "the twin cannot read its store now")]
             log.exception("the feed of the fleet failed")
-            return _event("trouble", None, "the twin cannot follow the fleet now")
+            return [_event("trouble", None, "the twin cannot follow the fleet now")]
 
     async def _begin(self) -> None:
         """Begin at the present position, unless the feed has one."""
@@ -133,37 +141,40 @@ class FleetFeed:
                 if not self._positions:
                     self._positions.append(present)
 
-    async def _changes(self) -> bytes:
-        """Event with the rows that changed since the last look; empty: none did."""
+    async def _changes(self) -> list[bytes]:
+        """Events with the rows that changed since the last look."""
         connected, since = self._presence.refresh(), self._positions[0] if self._positions else None
         if since is None:
             since = await self._executor.run(self._reader.position)
         found, position = await self._executor.run(partial(self._reader.changed, since, _MOST + 1))
         names = {*found, *(self._connected ^ connected)}
-        event = await self._rows(names, position) if names or self._unreadable else b""
+        events = await self._rows(names, position) if names or self._unreadable else []
         # Only now: what fails is repeated from the same place.
         if not self._positions:
             self._positions.append(since)
         self._positions.append(position)
         self._connected, self._unreadable = connected, False
-        return event
+        return events
 
-    async def _since(self, after: StorePosition) -> bytes:
-        """Event with the rows that changed after a position."""
+    async def _since(self, after: StorePosition) -> list[bytes]:
+        """Events with the rows that changed after a position."""
         try:
             names, position = await self._executor.run(partial(self._reader.changed, after, _MOST + 1))
             return await self._rows(names, position)
         except StoreUnavailable:
-            return _event("trouble", None, "the twin cannot read its store now")
+            return [_event("trouble", None, "the twin cannot read its store now")]
 
-    async def _rows(self, names: Collection[str], position: StorePosition) -> bytes:
+    async def _rows(self, names: Collection[str], position: StorePosition) -> list[bytes]:
+        """Events with these rows; only the last one has the position, from which a broken stream resumes."""
         if len(names) > _MOST:
-            return _event("reload", position, "")
-        return _event("rows", position, await self._executor.run(partial(self._reader.rows, names)))
+            return [_event("reload", position, "")]
+        ordered = sorted(names)
+        parts = [ordered[first : first + _ROWS] for first in range(0, len(ordered), _ROWS)] or [[]]
+        rows = [await self._executor.run(partial(self._reader.rows, part)) for part in parts]
+        last = len(parts) - 1
+        return [_event("rows", position if i == last else None, part) for i, part in enumerate(rows)]
 
     def _send(self, event: bytes) -> None:
-        if not event:
-            return
         for queue in tuple(self._queues):
             if queue.qsize() < _WAITING:
                 queue.put_nowait(event)

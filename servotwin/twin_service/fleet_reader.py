@@ -52,6 +52,10 @@ class EdgePresence:
         self._seen.update(dict.fromkeys(self._waiting(), now))
         return frozenset(self._seen)
 
+    def links(self) -> dict[str, object]:
+        """Servos whose edges are connected, and `sole`: all others are not."""
+        return {"connected": sorted(self.refresh()), "sole": self._only_here}
+
     def __call__(self, servo: str) -> bool | None:
         """True, False, or None where it cannot be known."""
         here = self._monotonic() - self._seen.get(servo, -math.inf) < _GRACE_S or servo in self._waiting()

@@ -34,9 +34,17 @@ _Lifespan = Callable[[], AbstractAsyncContextManager[None]]
 
 _SAFE = ("GET", "HEAD")
 _DOMAIN = "host {!r}: a twin without tokens answers under localhost, an address or a name without a dot only"
+ABORT = "servotwin.abort"
+"""Extension of a scope: a callable that ends the connection at once."""
+_STALL_S, _LAST_S = 10.0, 1.0
+"""s that a part of a stream may take to be sent: then its client does not read; s for the rest when streams end."""
 _UNBUFFERED = (b"x-accel-buffering", b"no")
 """Header that keeps a proxy from collecting the parts of a stream."""
 _pack = msgspec.msgpack.Encoder().encode
+
+
+def _no_connection() -> None:
+    """End of a connection that this server does not hold itself."""
 
 
 def cookie_of(header: bytes | None, name: str) -> str | None:
@@ -58,12 +66,15 @@ class HttpRequest:
         Parameters in the path, percent-decoded.
     receive : callable
         ASGI's: the next event of the request, for `BodyReader`.
+    abort : callable
+        Ends the connection at once, whatever is still to be sent.
     """
 
-    __slots__ = ("_headers", "_query", "_query_string", "method", "path", "receive")
+    __slots__ = ("_headers", "_query", "_query_string", "abort", "method", "path", "receive")
 
     def __init__(self, scope: Scope, receive: Receive, path: dict[str, str]) -> None:
         self.method, self.path, self.receive = scope["method"], path, receive
+        self.abort: Callable[[], None] = scope.get("extensions", {}).get(ABORT, _no_connection)
         self._headers, self._query_string = scope["headers"], scope["query_string"]
         self._query: dict[str, str] | None = None
 
@@ -173,44 +184,57 @@ class HttpResponse:
 
 
 class HttpStream:
-    """Response whose body comes in parts, until they end or the client goes.
+    """Response whose body comes in parts, until they end, the client goes or no longer reads.
 
     Parameters
     ----------
     parts : asynchronous iterator of bytes
         Closed in the end, whatever happens.
     content_type : str
-    receive : callable
-        ASGI's: it tells when the client has gone.
+    request : HttpRequest
+        Its `receive` tells when the client has gone; a client that does not read is sent away by its `abort`.
+    ended : asyncio.Event
+        Set where the parts end soon, so that nobody waits long for a client that does not take the last ones.
     """
 
-    __slots__ = ("_content_type", "_parts", "_receive")
+    __slots__ = ("_content_type", "_ended", "_parts", "_request")
 
-    def __init__(self, parts: AsyncGenerator[bytes, None], content_type: str, receive: Receive) -> None:
-        self._parts, self._content_type, self._receive = parts, content_type, receive
+    def __init__(
+        self, parts: AsyncGenerator[bytes, None], content_type: str, request: HttpRequest, ended: asyncio.Event
+    ) -> None:
+        self._parts, self._content_type, self._request, self._ended = parts, content_type, request, ended
 
     async def send(self, send: Send) -> None:
         """Send the parts as they come."""
         headers = [(b"content-type", self._content_type.encode()), (b"cache-control", b"no-store"), _UNBUFFERED]
         await send({"type": "http.response.start", "status": 200, "headers": headers})
-        gone = asyncio.create_task(self._until_gone())
         sending = asyncio.create_task(self._send_parts(send))
+        tasks = sending, asyncio.create_task(self._until_gone()), asyncio.create_task(self._until_overdue())
         try:
-            await asyncio.wait((gone, sending), return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            for task in (gone, sending):
+            finished = sending.done() and sending.exception() is None
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(gone, sending, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
             await self._parts.aclose()
+            if not finished:
+                self._request.abort()
 
     async def _until_gone(self) -> None:
-        while (await self._receive())["type"] != "http.disconnect":
+        while (await self._request.receive())["type"] != "http.disconnect":
             pass
+
+    async def _until_overdue(self) -> None:
+        await self._ended.wait()
+        await asyncio.sleep(_LAST_S)
 
     async def _send_parts(self, send: Send) -> None:
         async for part in self._parts:
-            await send({"type": "http.response.body", "body": part, "more_body": True})
-        await send({"type": "http.response.body", "body": b""})
+            async with asyncio.timeout(_STALL_S):
+                await send({"type": "http.response.body", "body": part, "more_body": True})
+        async with asyncio.timeout(_STALL_S):
+            await send({"type": "http.response.body", "body": b""})
 
 
 def msgpack_response(value: object, status: int = 200) -> HttpResponse:

@@ -130,7 +130,7 @@ class DashboardApi:
             errors=QUERY_ERRORS,
         )
         events = operation(
-            "Changes of the fleet as server-sent events: rows, reload, trouble, ended",
+            "Changes of the fleet as server-sent events: links, rows, reload, trouble, ended",
             {200: ("Events without end; the id of each is the position after it.", EVENTS)},
             (
                 parameter("after", {"type": "string"}, "Position from which on changes are sent."),
@@ -235,7 +235,8 @@ class DashboardApi:
         self._feed.admit()
         last = (request.header(b"last-event-id") or b"").decode("latin-1")
         after = position_of(last) or position_of(request.argument("after"))
-        return HttpStream(self._feed.watch(after, partial(self._operators.check, request)), EVENTS, request.receive)
+        events = self._feed.watch(after, partial(self._operators.check, request))
+        return HttpStream(events, EVENTS, request, self._feed.closing)
 
     async def _get_histories(self, request: HttpRequest) -> HttpResponse:
         self._operators.check(request)

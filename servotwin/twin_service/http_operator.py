@@ -52,7 +52,8 @@ class OperatorApi:
     ----------
     operators : OperatorAccess
     store : Store
-    executor : StoreExecutor
+    executor, readers : StoreExecutor
+        For the backlog, which monitoring asks for; for all else, which may take long.
     health : callable
     metrics : Metrics
     wall : callable
@@ -64,11 +65,12 @@ class OperatorApi:
         operators: OperatorAccess,
         store: Store,
         executor: StoreExecutor,
+        readers: StoreExecutor,
         health: Health,
         metrics: Metrics,
         wall: Callable[[], float],
     ) -> None:
-        self._operators, self._store, self._executor = operators, store, executor
+        self._operators, self._store, self._executor, self._readers = operators, store, executor, readers
         self._health, self._metrics, self._wall = health, metrics, wall
         self._backlog_lock = asyncio.Lock()
         self._backlog: tuple[float, Backlog | None] = -math.inf, None
@@ -159,7 +161,7 @@ class OperatorApi:
 
     async def _get_window(self, request: HttpRequest) -> HttpResponse:
         """The stored bytes of a window, with their compression as content-encoding."""
-        window = await stored_window(self._operators, self._store, self._executor, request)
+        window = await stored_window(self._operators, self._store, self._readers, request)
         headers = {"content-encoding": window.encoding} if window.encoding else {}
         return HttpResponse(200, window.body, MSGPACK, headers)
 
@@ -199,7 +201,7 @@ class OperatorApi:
             return backlog
 
     async def _query(self, call: Callable[[], Any]) -> Any:
-        return await store_query(self._executor, call)
+        return await store_query(self._readers, call)
 
 
 def admitted_servo(operators: OperatorAccess, request: HttpRequest) -> str:

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import uvicorn
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
@@ -20,7 +20,7 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
 from servotwin.runtime.service_manager import ServiceManager
 from servotwin.twin_service.config import ServiceConfig
-from servotwin.twin_service.http_app import HttpApp
+from servotwin.twin_service.http_app import ABORT, HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 from servotwin.twin_service.strangers import Stranger, StrangerLimit
 
@@ -90,6 +90,7 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_message_begin(self) -> None:
         self._unreported = 0
         super().on_message_begin()
+        cast(dict[str, Any], self.scope)["extensions"] = {ABORT: self.transport.abort}
         self._head = 0
         self._start_timer()
 

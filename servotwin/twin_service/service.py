@@ -28,6 +28,7 @@ from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
 from servotwin.twin_service.fleet_feed import FleetFeed
 from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
+from servotwin.twin_service.http_acts import ActsApi
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_dashboard import DashboardApi
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
@@ -56,6 +57,8 @@ _LEAST_DELETED = 4096
 a mistake does not cost the past at once."""
 _UNHEALTHY_S = 60.0
 """s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
+_READERS = 2
+"""Threads that read the store for the dashboard and the operators."""
 _SOLE_OWNER = "twin"
 """Owner of all leases where one process has the store to itself: after a crash it releases its own."""
 
@@ -79,6 +82,8 @@ class TwinService:
         config = twin.service
         self.config, self.store, self.clocks = config, store, clocks or Clocks.of_machine()
         self.metrics, self.executor = Metrics(), StoreExecutor()
+        # What people read may take long: edges and acknowledgements do not wait behind it.
+        self._readers = StoreExecutor(_READERS, "readers")
         self.pool = pool or WorkerPool(config.workers, twin.start, config.job_timeout_s)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
@@ -144,7 +149,7 @@ class TwinService:
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)
-        self.feed = FleetFeed(self._reader, self.executor, presence, config.watchers, self._shared)
+        self.feed = FleetFeed(self._reader, self._readers, presence, config.watchers, self._shared)
         self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
@@ -160,12 +165,18 @@ class TwinService:
         """HTTP application, whose lifespan starts and stops the service."""
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
-        operator = OperatorApi(self.operators, self.store, self.executor, self.health, self.metrics, self.clocks.wall)
+        operator = OperatorApi(
+            self.operators, self.store, self.executor, self._readers, self.health, self.metrics, self.clocks.wall
+        )
         dashboard = DashboardApi(
-            self.operators, self.store, self.executor, self._reader, self.feed, self.config.machine_metrics
+            self.operators, self.store, self._readers, self._reader, self.feed, self.config.machine_metrics
         )
         what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
-        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes()]
+        acts = ActsApi(
+            self.operators, self.store, self._readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
+            self.clocks.monotonic,
+        )  # fmt: skip
+        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes(), *acts.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
@@ -218,6 +229,7 @@ class TwinService:
         with suppress(StoreUnavailable):
             if not self.watch.fault:
                 await asyncio.to_thread(self.watch.mark)
+        self._readers.close()
         self.executor.close()
 
     def health(self, backlog: Backlog | None = None) -> dict[str, Any]:

@@ -22,6 +22,8 @@ SESSION_S = 12 * 3600.0
 """s after which a browser has to give the token again."""
 _COOKIE = re.compile(r"([0-9a-f]{2,256})\.(\d{1,12})\.([0-9a-f]{64})")
 _LABEL = b"servotwin operator session 1\0"
+_NO_ENGINEER = "only an engineer's token may do this: `servotwin enroll NAME --engineer FILE` makes one"
+_NO_TOKENS = "this twin has no tokens, so that nobody could tell who did it: `servotwin enroll` makes them"
 _ENDED = "the session has ended, or its token was revoked: give the token again"
 
 
@@ -59,6 +61,17 @@ class OperatorAccess:
         name = self.session_name(cookie)
         if name is None:
             raise RequestRejected(Refusal.BAD_TOKEN, _ENDED, 401)
+        return name
+
+    def may_act(self, name: str) -> bool:
+        """True for the name of an engineer."""
+        return self._access.is_engineer(name)
+
+    def check_engineer(self, request: HttpRequest) -> str:
+        """Check that a request is an engineer's, and return the engineer's name; raises RequestRejected."""
+        name = self.check(request)
+        if not self.may_act(name):
+            raise RequestRejected(Refusal.BAD_TOKEN, _NO_ENGINEER if name else _NO_TOKENS, 403)
         return name
 
     def session_cookie(self, token: bytes) -> str:

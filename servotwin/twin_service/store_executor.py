@@ -16,14 +16,20 @@ _THREADS = 4
 class StoreExecutor:
     """Thread pool for calls of the store.
 
+    Parameters
+    ----------
+    threads : int
+    name : str
+        Of the threads.
+
     Attributes
     ----------
     fault : str
         Why the last call failed; empty: it succeeded.
     """
 
-    def __init__(self) -> None:
-        self._threads = ThreadPoolExecutor(_THREADS, "store")
+    def __init__(self, threads: int = _THREADS, name: str = "store") -> None:
+        self._threads = ThreadPoolExecutor(threads, name)
         self.fault = ""
 
     async def run(self, call: Callable[[], _Result]) -> _Result:

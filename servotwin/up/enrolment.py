@@ -114,37 +114,47 @@ def open_tokens(twin: TwinFile) -> Iterator[tuple[Path, Verifiers]]:
         yield tokens, _read_or_create(tokens)
 
 
-def enroll_operator(path: Path, name: str, file: Path, replace_token: bool = False) -> list[Path]:
-    """Enrol an operator with the twin of a file, and write the token to `file`; returns and raises as `enroll`."""
+def enroll_operator(
+    path: Path, name: str, file: Path, replace_token: bool = False, engineer: bool = False
+) -> list[Path]:
+    """Enrol an operator, or an engineer, with the twin of a file, and write the token to `file`.
+
+    Returns and raises as `enroll` does.
+    """
     twin = read_twin(path, models=False)
     with open_tokens(twin) as (tokens, known):
-        _check_name(name, known.operators, replace_token)
+        role, other = (known.engineers, known.operators) if engineer else (known.operators, known.engineers)
+        _check_name(name, role, replace_token)
+        if name in other:
+            raise InvalidInput(f"{name!r} has a token of the other role already; `servotwin revoke {name}` ends it")
         if file.exists() and not replace_token:
             raise InvalidInput(f"{file}: exists already; give another file, or --again to replace it by a new token")
         token = secrets.token_urlsafe(32)
         write_private(file, token + "\n")
-        write_tokens(tokens, replace(known, operators={**known.operators, name: verifier_of(token)}))
+        entries = {**role, name: verifier_of(token)}
+        write_tokens(tokens, replace(known, engineers=entries) if engineer else replace(known, operators=entries))
     return [file, tokens]
 
 
 def revoke(path: Path, name: str) -> Path:
-    """Revoke the token of a servo or an operator at the twin of a file, and return the file of tokens.
+    """Revoke the token of a servo, an operator or an engineer at the twin of a file, and return the file of tokens.
 
     Raises
     ------
     InvalidInput
-        No servo and no operator of that name has a token.
+        Nobody of that name has a token.
     """
     tokens = _tokens_file(read_twin(path, models=False))
     with tokens_locked(tokens):
         known = read_tokens(tokens)
-        names = [*known.servos, *known.operators]
+        names = [*known.servos, *known.readers]
         if name not in names:
             raise InvalidInput(f"{tokens}: {name!r} has no token{did_you_mean(name, names)}")
-        servos, operators = dict(known.servos), dict(known.operators)
-        servos.pop(name, None)
-        operators.pop(name, None)
-        write_tokens(tokens, replace(known, servos=servos, operators=operators))
+        servos, operators, engineers = (
+            {each: token for each, token in of.items() if each != name}
+            for of in (known.servos, known.operators, known.engineers)
+        )
+        write_tokens(tokens, Verifiers(servos, operators, engineers, known.fleet))
     return tokens
 
 

@@ -5,12 +5,13 @@ import os
 import signal
 import time
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import httpx
 import pytest
 from dashboard_fleet import SILENT, WEARING, wearing_fleet
 from servers import needed
-from service_system import OPERATOR, OTHER, TOKEN, bearer, place, process, window
+from service_system import ENGINEER, OPERATOR, OTHER, TOKEN, bearer, place, process, window
 
 from servotwin.link.seal import verifier_of
 from servotwin.messages import encode
@@ -66,7 +67,7 @@ def open_page(browser, twin):
     """Opens pages; in the end no script may have failed, and nothing may have been executed that came as a name."""
     contexts, faults = [], []
 
-    def opened(login=True, width=1280, height=900, theme="light", expected=()):
+    def opened(login=OPERATOR, width=1280, height=900, theme="light", expected=()):
         context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
         context.set_default_timeout(WAIT_MS)
         contexts.append(context)
@@ -79,7 +80,7 @@ def open_page(browser, twin):
 
         page.on("console", note)
         if login:
-            answer = context.request.post(f"{twin.url}/v1/session", data={"token": OPERATOR})
+            answer = context.request.post(f"{twin.url}/v1/session", data={"token": login})
             assert answer.status == 204
             page.goto(twin.url)
             page.wait_for_selector(".rows .row")
@@ -103,7 +104,7 @@ def open_machine(page, name):
 
 
 def test_a_token_is_given_once_and_kept_where_no_script_reads_it(open_page, twin):
-    page = open_page(login=False, expected=("status of 401", "status of 403"))
+    page = open_page(login="", expected=("status of 401", "status of 403"))
     page.goto(twin.url)
     for wrong in ("guess", TOKEN):
         page.fill("#token", wrong)
@@ -186,6 +187,32 @@ def test_a_step_is_tried_on_the_model(open_page):
     panel.locator(".soft", has_text=before).first.wait_for()
 
 
+def test_an_engineer_holds_a_machine_with_a_reason_and_an_operator_sees_who(open_page):
+    page = open_page(login=ENGINEER)
+    open_machine(page, WEARING)
+    panel = page.locator("[aria-label='Oversight']")
+    panel.locator("text=Nobody has acted on this machine").wait_for()
+    panel.locator("button", has_text="Hold").click()
+    has_text(page, "[aria-label='Oversight'] .error", "Give a reason")
+    panel.locator("input").fill(f"noise {MARKUP}")
+    panel.locator("button", has_text="Hold").click()
+    has_text(page, "[aria-label='Oversight'] [role=status]", "Held by eva since")
+    assert serious_faults(page) == []
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    (PICTURES / "oversight.png").write_bytes(panel.screenshot())
+    page.set_viewport_size({"width": 360, "height": 740})
+    assert page.evaluate("document.documentElement.scrollWidth") <= 360
+    (PICTURES / "oversight-phone.png").write_bytes(panel.screenshot())
+    reader = open_page()
+    open_machine(reader, WEARING)
+    has_text(reader, "[aria-label='Oversight'] [role=status]", "Held by eva since")
+    assert not reader.locator("[aria-label='Oversight'] button").first.is_visible()
+    panel.locator("input").fill("the noise was a loose cover")
+    panel.locator("button", has_text="Release").click()
+    has_text(reader, "[aria-label='Oversight'] [role=status]", "Updates are sent as soon as they are verified")
+    assert reader.locator("[aria-label='Oversight'] tbody tr").count() == 2
+
+
 def test_states_without_data_are_said_in_words(open_page):
     page = open_page(expected=("status of 404",))
     open_machine(page, SILENT)
@@ -220,6 +247,51 @@ def serious_faults(page):
     found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
     faults = [each for each in found["violations"] if each["impact"] in ("serious", "critical")]
     return [(each["id"], [node["html"][:120] for node in each["nodes"][:3]]) for each in faults]
+
+
+def watchers(twin):
+    text = httpx.get(f"{twin.url}/metrics").text
+    return next(int(float(line.split()[1])) for line in text.splitlines() if line.startswith("servotwin_watchers "))
+
+
+def reaches(look, wanted):
+    end = time.monotonic() + WAIT_MS / 1000
+    while look() != wanted:
+        assert time.monotonic() < end
+        time.sleep(0.1)
+
+
+def test_a_page_that_nobody_sees_leaves_its_stream_to_others(open_page, twin):
+    reaches(lambda: watchers(twin), 0)
+    page = open_page()
+    reaches(lambda: watchers(twin), 1)
+    see = "hidden => { Object.defineProperty(document, 'hidden', { get: () => hidden, configurable: true });"
+    see += " document.dispatchEvent(new Event('visibilitychange')); }"
+    page.evaluate(see, True)
+    reaches(lambda: watchers(twin), 0)
+    page.evaluate(see, False)
+    reaches(lambda: watchers(twin), 1)
+
+
+def test_numbers_are_readable_and_long_windows_complete(open_page):
+    page = open_page()
+    text = "([gap, low, high]) => import('/static/format.js').then((f) => f.gapText(gap, [low, high], 1))"
+    assert page.evaluate(text, [4.5, 4.4, 4.6]) == "4.500 ± 0.100"
+    assert page.evaluate(text, [4.5e-8, 4.4e-8, 4.6e-8]) == "(4.50 ± 0.10) × 10^−8"
+    samples, rate = 200_000, 1000.0
+
+    def answer(route):
+        asked = {key: float(value[0]) for key, value in parse_qs(urlsplit(route.request.url).query).items()}
+        part = range(int(asked["from"] * rate), min(samples, int(asked["to"] * rate) + 2))
+        assert len(part) <= 4 * asked["points"]
+        channel = {"name": "position", "time": [k / rate for k in part], "values": list(part)}
+        route.fulfill(json={"channels": [channel]})
+
+    page.route("**/channels?*", answer)
+    whole = """window => import('/static/machine.js').then(({ MachinePage }) => MachinePage.prototype.everySample.call(
+        { name: "m", windowNote: document.createElement("p") }, window, "b", 1))"""
+    shown = {"samples": samples, "rate": rate, "channels": [{"name": "position", "time": [], "values": []}]}
+    assert page.evaluate(whole, shown)["channels"][0]["values"] == list(range(samples))
 
 
 def test_a_new_window_appears_by_itself(open_page, twin):

@@ -35,13 +35,17 @@ def test_a_rate_that_may_be_zero_may_never_reach_the_limit():
     assert time_until_limit(WearRate(0.0, 0.1, 0.0, -0.01, 0.001), 0.3) == (None, None)
 
 
-def test_the_version_in_force_is_what_the_edge_reported_last():
-    window, receipt = evidence(5, "estimate", version=3), evidence(7, "receipt", {"parameter_version": 4}, 5)
-    hello = evidence(9, "hello", version=2)
+def test_the_version_in_force_is_what_the_edge_reported_in_its_present_boot():
+    window = evidence(5, "estimate", version=3)
+    receipt = evidence(7, "receipt", {"parameter_version": 4, "boot": "b"}, 5)
+    hello = evidence(9, "hello", version=2, status="c")
     assert version_in_force({}) is None
     assert version_in_force({"window": window}) == 3
     assert version_in_force({"window": window, "receipt": receipt}) == 4  # version 5 was refused
-    assert version_in_force({"window": window, "receipt": receipt, "hello": hello}) == 2
+    assert version_in_force({"window": window, "receipt": receipt, "hello": hello}, "b") == 2  # started again
+    late = window._replace(id=11)  # a window that was cut before the receipt and came after it
+    assert version_in_force({"window": late, "receipt": receipt}, "b") == 4
+    assert version_in_force({"window": late, "receipt": receipt, "hello": hello}, "c") == 3
 
 
 def test_a_machine_without_data_has_a_row_of_unknowns():

@@ -49,6 +49,19 @@ def test_facts_are_the_newest_of_each_servo(filled):
     assert (found["b"].newest, found["b"].alarms, found["b"].window.sequence) == ({}, (), 2)
 
 
+def test_the_newest_window_is_that_of_the_present_boot_with_the_highest_number(store):
+    def cut(boot, sequence):
+        return window("a", sequence)._replace(boot=boot, key=f"{boot}/{sequence}")
+
+    late_first = [cut("new", number) for number in (3, 2, 1)]
+    store.put([cut("old", 7), letter("a", b"hello"), *late_first, cut("old", 8)])
+    (lease,) = claim(store, servo="a")
+    number = next(message.id for message in lease.messages if message.body == b"hello")
+    store.commit([outcome(lease, EvidenceRecord("hello", number, b"", 0, status="new"))], 300.0)
+    newest = facts(store, ["a"])["a"].window
+    assert (newest.boot, newest.sequence) == ("new", 3)
+
+
 def test_old_alarms_are_left_out(filled):
     assert facts(filled, ["a"], since=301.0)["a"].alarms == ()
 

@@ -22,7 +22,7 @@ from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker import WorkerPool
 
-TOKEN, OTHER, OPERATOR = "token-of-ax-1", "token-of-ax-2", "token-of-the-operator"
+TOKEN, OTHER, OPERATOR, ENGINEER = "token-of-ax-1", "token-of-ax-2", "token-of-the-operator", "token-of-the-engineer"
 SERVO = '[models.axis]\nservo = "paper"\n[models.axis.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "axis"\n'
 MSGPACK = {"content-type": "application/msgpack"}
 
@@ -31,8 +31,9 @@ def twin_file(folder: Path, service: str = "", tokens: bool = True, servos: str 
     """A twin's file in a folder, and its tokens."""
     path = folder / "twin.toml"
     if tokens:
-        result = Verifiers({"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}, {"me": verifier_of(OPERATOR)})
-        write_tokens(folder / "tokens.toml", result)
+        edges = {"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}
+        people = {"me": verifier_of(OPERATOR)}, {"eva": verifier_of(ENGINEER)}
+        write_tokens(folder / "tokens.toml", Verifiers(edges, *people))
         service = f'tokens = "tokens.toml"\n{service}'
     path.write_text(f"[service]\nport = 0\nworkers = 1\n{service}\n{servos}")
     return path

@@ -14,6 +14,7 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update, WindowMessage, decode, encode
+from servotwin.messages.acts import Act, ActKind, encode_act
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as certified_module
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
@@ -78,6 +79,9 @@ class Queue:
 
     def window(self, number: int, version: int = 0, **changes) -> WorkResult:
         return self.give(msgspec.structs.replace(windows()[number], parameter_version=version, **changes))
+
+    def act(self, act: Act) -> WorkResult:
+        return self.give(Incoming("axis", MessageKind.ACT, "", encode_act(act), "", b"", 0.0))
 
     def applied(self, update: Update) -> WorkResult:
         sample = round(update.data_time * 5000.0) + 20000
@@ -254,3 +258,29 @@ def test_a_question_comes_back_from_its_bytes(fleet: ModelRegistry) -> None:
     assert msgspec.msgpack.encode(question) == queued.body
     policy = certified_policy(SERVO, fleet.models[0].settings)
     assert isinstance(policy.confirm(question.region, question.setting), Certificate)
+
+
+@pytest.mark.slow
+def test_an_earlier_setting_is_verified_again_before_it_is_sent(
+    fleet: ModelRegistry, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue, update, _ = begun(fleet)
+    act = Act("axis", ActKind.ROLL_BACK, "eva", "it hums", 1.0, version=update.version)
+    assert [row.status for row in queue.act(act).evidence] == ["rolled back by eva: it hums"]
+    again = sent(queue.window(1, version=update.version))
+    assert again.verification is not None
+    assert (again.version, again.base_version) == (update.version + 1, update.version)
+    assert again.setting.same_loop(update.setting)
+    queue.applied(again)
+    queue.act(msgspec.structs.replace(act, version=None))
+    outcome = queue.window(2, version=again.version)
+    assert sent(outcome).verification is not None
+    (reason,) = (row.status for row in outcome.evidence if row.kind == "redesign")
+    assert reason == "rolled back by eva: it hums; the fallback set is sent"
+    queue, update, _ = begun(fleet)
+    queue.act(act)
+    failing(monkeypatch)
+    refused = queue.window(1, version=update.version)
+    assert refused.outgoing == ()
+    (reason,) = (row.status for row in refused.evidence if row.kind == "redesign")
+    assert reason.startswith(f"version {update.version} is not sent again: the setting settles on 3.0 %")

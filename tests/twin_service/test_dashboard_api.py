@@ -11,9 +11,11 @@ from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, place, serve
 from servotwin.messages import encode
 from servotwin.store import overview
 from servotwin.store.engine import StoreUnavailable
+from servotwin.twin_service import fleet_feed, http_app
 from servotwin.twin_service.auth import Verifiers
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
 from servotwin.twin_service.fleet_reader import EdgePresence
+from servotwin.twin_service.http_app import ABORT, HttpRequest, HttpStream
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.sessions import COOKIE, SESSION_S
 
@@ -151,7 +153,7 @@ async def first_events(feed, count, after=None, allowed=lambda: None):
     async with asyncio.timeout(20.0):
         while len(found) < count:
             part = await anext(stream)
-            if part.startswith((b"id:", b"event:")) and not part.startswith(b"event: alive"):
+            if part.startswith((b"id:", b"event:")) and not part.startswith((b"event: alive", b"event: links")):
                 found.append(dict(line.split(b": ", 1) for line in part.strip().split(b"\n")))
     return found, stream
 
@@ -213,7 +215,8 @@ def test_a_slow_watcher_holds_nothing_up(tmp_path):
             system.feed._send(b"event: %d\n\n" % number)
         async with asyncio.timeout(10.0):
             found = [part async for part in stream]
-        assert found == [b"event: %d\n\n" % k for k in range(16)]
+        assert found[0].startswith(b"event: links")
+        assert found[1:] == [b"event: %d\n\n" % k for k in range(16)]
 
     with_service(tmp_path, body)
 
@@ -234,11 +237,11 @@ def test_a_look_that_fails_is_told_and_repeated_from_the_same_place(tmp_path, mo
             raise fault
 
         monkeypatch.setattr(system._reader, "rows", fail)
-        assert b"event: trouble" in await feed._look()
-        assert await feed._look() == b""
+        assert b"event: trouble" in (await feed._look())[0]
+        assert await feed._look() == []
         monkeypatch.setattr(system._reader, "rows", rows)
-        assert b'"servo":"ax-2"' in await feed._look()
-        assert await feed._look() == b""
+        assert b'"servo":"ax-2"' in (await feed._look())[0]
+        assert await feed._look() == []
 
     with_service(tmp_path, body)
 
@@ -247,7 +250,86 @@ def test_the_first_look_tells_which_edges_came(tmp_path, monkeypatch):
     async def body(system, _client):
         await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
         monkeypatch.setattr(system.polls, "_waiting", {"ax-1": {}})
-        assert b'"connected":true' in await feed_of(system)._changes()
+        assert b'"connected":true' in (await feed_of(system)._changes())[0]
+
+    with_service(tmp_path, body)
+
+
+def test_a_watcher_learns_at_once_which_edges_are_connected(tmp_path, monkeypatch):
+    async def body(system, _client):
+        monkeypatch.setattr(system.polls, "_waiting", {"ax-1": {}})
+        stream = system.feed.watch(None, lambda: None)
+        assert [part async for part in aiter_of(stream, 2)][1] == (
+            b'event: links\ndata: {"connected":["ax-1"],"sole":true}\n\n'
+        )
+        await stream.aclose()
+
+    with_service(tmp_path, body)
+
+
+async def aiter_of(stream, count):
+    for _ in range(count):
+        yield await anext(stream)
+
+
+def test_many_changes_come_in_parts_and_too_many_are_read_anew(tmp_path, monkeypatch):
+    monkeypatch.setattr(fleet_feed, "_ROWS", 2)
+    monkeypatch.setattr(fleet_feed, "_MOST", 5)
+
+    async def body(system, _client):
+        feed = feed_of(system)
+        await feed._changes()
+        for name in "abcde":
+            await asyncio.to_thread(say_hello, system.store, f"ax-{name}", 5.0)
+        parts = await feed._changes()
+        assert [part.count(b'"servo"') for part in parts] == [2, 2, 1]
+        assert [part.startswith(b"id:") for part in parts] == [False, False, True]
+        for name in "fghijk":
+            await asyncio.to_thread(say_hello, system.store, f"ax-{name}", 5.0)
+        (event,) = await feed._changes()
+        assert b"event: reload" in event
+
+    with_service(tmp_path, body)
+
+
+class Unread:
+    """A connection whose client takes the head of an answer and nothing more."""
+
+    def __init__(self):
+        self.aborted = asyncio.Event()
+
+    async def send(self, event):
+        if event["type"] == "http.response.body":
+            await asyncio.Event().wait()
+
+    async def receive(self):
+        await asyncio.Event().wait()
+
+    def request(self):
+        scope = {"method": "GET", "headers": [], "query_string": b"", "extensions": {ABORT: self.aborted.set}}
+        return HttpRequest(scope, self.receive, {})
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_a_page_that_does_not_read_counts_and_is_cut_off(tmp_path, monkeypatch, ends):
+    monkeypatch.setattr(http_app, "_STALL_S", 60.0 if ends else 0.01)
+    monkeypatch.setattr(http_app, "_LAST_S", 0.01)
+
+    async def body(system, _client):
+        page = Unread()
+        stream = HttpStream(
+            system.feed.watch(None, lambda: None), "text/event-stream", page.request(), system.feed.closing
+        )
+        sending = asyncio.create_task(stream.send(page.send))
+        if ends:
+            await asyncio.sleep(0.02)
+            for _ in range(40):
+                system.feed._send(b"event: rows\n\n")  # its queue overflows
+            assert system.feed.watchers == 1
+            system.feed.close()
+        await asyncio.wait_for(page.aborted.wait(), 20.0)
+        await sending
+        assert system.feed.watchers == 0
 
     with_service(tmp_path, body)
 

@@ -69,6 +69,10 @@ export const gapsFile = (name) => `${servo(name)}/gaps.csv?limit=1000`;
 export const reportFile = (name) => `${servo(name)}/report.html`;
 export const updates = (name, limit = 20) => request(`${servo(name)}/audit?updates=1&limit=${limit}`);
 export const events = (name, limit = 50) => request(`${servo(name)}/events?limit=${limit}`);
-export const channels = (name, boot, sequence, points) => request(`${windowPath(name, boot, sequence)}/channels?points=${points}`);
+export const channels = (name, boot, sequence, points, from = null, to = null) =>
+  request(`${windowPath(name, boot, sequence)}/channels?points=${points}${from === null ? "" : `&from=${from}&to=${to}`}`);
+export const oversight = (name) => request(`${servo(name)}/acts`);
+export const act = (name, asked) =>
+  request(`${servo(name)}/acts`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(asked), detailed: true });
 export const whatIf = (name, asked) =>
   request(`${servo(name)}/what-if`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(asked), signal: AbortSignal.timeout(60000), detailed: true });

@@ -4,7 +4,8 @@ export const DEG = 180 / Math.PI;
 const MINUTE = 60, HOUR = 3600, DAY = 86400, YEAR = 365.25 * DAY;
 const UNKNOWN = "–";
 
-const decimalsFor = (spread) => Math.min(6, Math.max(0, 1 - Math.floor(Math.log10(spread))));
+const decimalsFor = (spread) => Math.max(0, 1 - Math.floor(Math.log10(spread)));
+const DECIMALS = 6; // more are not readable
 
 export const fixed = (value, decimals) => value.toFixed(decimals).replace("-", "−");
 
@@ -26,9 +27,16 @@ export function gapText(gap, interval, scale = DEG) {
   const half = (high - low) / 2;
   if (!(half > 0)) return brief(gap * scale);
   const decimals = decimalsFor(half);
+  if (decimals > DECIMALS) return smallText(gap * scale, low, high);
   // An interval that ends at zero, or lies otherwise on one side, is not "plus or minus".
   if (Math.abs((high + low) / 2 - gap * scale) > 0.05 * half) return low > 0 ? `${fixed(low, decimals)} to ${fixed(high, decimals)}` : `≤ ${fixed(high, decimals)}`;
   return `${fixed(gap * scale, decimals)} ± ${fixed(half, decimals)}`;
+}
+
+// A value and its interval with a common power of ten.
+function smallText(value, low, high) {
+  const power = Math.floor(Math.log10(Math.max(Math.abs(low), Math.abs(high))));
+  return `(${gapText(value / 10 ** power, [low / 10 ** power, high / 10 ** power], 1)}) × 10^${String(power).replace("-", "−")}`;
 }
 
 // The gap in a row of the fleet: in brackets where the estimate was not accepted.
@@ -67,7 +75,7 @@ export function rateText(rate, interval, unit) {
   if (rate === null) return UNKNOWN;
   const half = interval ? ((interval[1] - interval[0]) / 2) * unit.factor : 0;
   if (!(half > 0)) return brief(rate * unit.factor);
-  const decimals = decimalsFor(half);
+  const decimals = Math.min(DECIMALS, decimalsFor(half));
   return `${fixed(rate * unit.factor, decimals)} ± ${fixed(half, decimals)}`;
 }
 

@@ -4,6 +4,7 @@ import * as api from "./api.js";
 
 const SILENT_MS = 40000; // the twin sends a sign of life every 15 s
 const RETRY_MS = [1000, 2000, 4000, 8000, 15000];
+const SPREAD_MS = 10000; // within which all pages read the fleet anew, where very much changed at once
 
 export class Live {
   constructor(changed, ended) {
@@ -16,6 +17,8 @@ export class Live {
     this.skew = 0;
     this.position = null;
     this.failures = 0;
+    // A browser opens six connections to one twin: a page that nobody sees leaves them to the others.
+    document.addEventListener("visibilitychange", () => (document.hidden ? this.pause() : this.resume()));
   }
 
   now() {
@@ -38,7 +41,20 @@ export class Live {
     }
   }
 
+  pause() {
+    if (this.state === "ended" || this.position === null) return;
+    this.paused = true;
+    this.stop();
+  }
+
+  resume() {
+    if (!this.paused) return;
+    this.paused = false;
+    this.follow();
+  }
+
   follow() {
+    if (document.hidden) return this.pause();
     const source = new EventSource(`/v1/fleet/events?after=${this.position}`);
     this.source = source;
     this.heard();
@@ -49,7 +65,11 @@ export class Live {
       this.changed([]);
     });
     source.addEventListener("rows", (event) => this.take(event));
-    source.addEventListener("reload", () => this.start());
+    source.addEventListener("links", (event) => this.takeLinks(event));
+    source.addEventListener("reload", () => {
+      this.stop();
+      this.timer = setTimeout(() => this.start(), Math.random() * SPREAD_MS);
+    });
     source.addEventListener("trouble", (event) => this.set("trouble", read(event) || "The twin reports trouble."));
     source.addEventListener("ended", () => this.end("The session has ended, or its token was revoked."));
     source.addEventListener("error", () => this.lost());
@@ -68,6 +88,18 @@ export class Live {
     for (const row of rows) if (row && typeof row.servo === "string") this.rows.set(row.servo, row);
     this.set("live");
     this.changed(rows.map((row) => row.servo));
+  }
+
+  takeLinks(event) {
+    const links = read(event);
+    if (!Array.isArray(links?.connected)) return;
+    const connected = new Set(links.connected), names = [];
+    for (const row of this.rows.values()) {
+      const now = connected.has(row.servo) ? true : links.sole ? false : null;
+      if (row.connected !== now) names.push(row.servo);
+      row.connected = now;
+    }
+    if (names.length) this.changed(names);
   }
 
   // The browser tries again by itself, unless the twin refused: then the reason is asked for.

@@ -2,13 +2,14 @@
 // One machine: what is known, its gap over time, its last windows, the updates and what they were verified on.
 
 import * as api from "./api.js";
+import { ActsPanel } from "./acts.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
 import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
-const REFRESH_MS = 1500, EVERY = 20000;
+const REFRESH_MS = 1500, EVERY = 20000, PART = 4 * EVERY; // samples that one answer holds undecimated
 const scaled = (values, factor) => values.map((value) => (value === null ? null : value * factor));
 
 export class MachinePage {
@@ -67,6 +68,7 @@ export class MachinePage {
       return this.plots.at(-1);
     };
     this.whatIf = new WhatIfPanel(name, () => this.start());
+    this.acts = new ActsPanel(name, () => this.later());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", {},
@@ -87,6 +89,7 @@ export class MachinePage {
         legend(["blue", "of each window"], ["orange", "version applied"]),
         element("div", { class: "two" }, places.tail, places.residual)),
       panel("Updates", [], this.chain),
+      panel("Oversight", [], ...this.acts.content),
       panel("Behind the last update", [], this.proof),
       panel("Events", [], this.events));
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
@@ -124,9 +127,9 @@ export class MachinePage {
 
   async refresh() {
     try {
-      const [gaps, updates, happened] = await Promise.all([api.gaps(this.name), api.updates(this.name), api.events(this.name)]);
+      const [gaps, updates, happened, oversight] = await Promise.all([api.gaps(this.name), api.updates(this.name), api.events(this.name), api.oversight(this.name)]);
       if (this.closed) return;
-      Object.assign(this, { gaps, updates, happened, error: "" });
+      Object.assign(this, { gaps, updates, happened, oversight, error: "" });
     } catch (error) {
       if (this.closed) return;
       this.error = error.message;
@@ -210,6 +213,7 @@ export class MachinePage {
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
     this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
     this.proof.replaceChildren(simulated(this.updates, unit));
+    this.acts.show(this.oversight, this.gaps.versions, unit);
     this.events.replaceChildren(eventList(this.happened));
     await this.chooseWindows();
   }
@@ -242,7 +246,8 @@ export class MachinePage {
     this.windowFile.href = `${api.windowPath(this.name, boot, sequence)}/channels.csv`;
     this.shown = key;
     try {
-      const window = await api.channels(this.name, boot, sequence, points);
+      let window = await api.channels(this.name, boot, sequence, points);
+      if (points === EVERY && window.samples > PART) window = await this.everySample(window, boot, sequence);
       if (this.closed || this.shown !== key) return;
       this.showWindow(window);
     } catch (error) {
@@ -252,6 +257,26 @@ export class MachinePage {
       for (const plot of [this.positionPlot, this.motorPlot, this.voltagePlot]) if (plot.data) plot.show([[], ...plot.data.slice(1).map(() => [])], "no samples");
       if (error.status === 401) this.live.end(error.message);
     }
+  }
+
+  // A long window comes in parts, each of which holds every sample; those at the seams come twice.
+  async everySample(window, boot, sequence) {
+    const channels = new Map(window.channels.map((each) => [each.name, { ...each, time: [], values: [] }]));
+    for (let first = 0; first < window.samples - 1; first += PART - 2) {
+      setText(this.windowNote, `Reading sample ${first} of ${window.samples} …`);
+      const last = Math.min(first + PART - 3, window.samples - 1);
+      const part = await api.channels(this.name, boot, sequence, EVERY, first / window.rate, last / window.rate);
+      if (this.closed) return window;
+      for (const { name, time, values } of part.channels) {
+        const whole = channels.get(name), after = whole.time.at(-1) ?? -1;
+        const skip = time.findIndex((each) => each > after);
+        for (let i = skip; i >= 0 && i < time.length; i++) {
+          whole.time.push(time[i]);
+          whole.values.push(values[i]);
+        }
+      }
+    }
+    return { ...window, channels: [...channels.values()] };
   }
 
   showWindow(window) {

@@ -98,6 +98,7 @@ const HAPPENED = {
   hello: (one) => `edge connected: boot ${one.status}, version ${one.version} in force`,
   fallback: (one) => `fallback from version ${one.version}: ${one.status}`,
   answer: (one) => `the edge answers a request: ${one.status}`,
+  act: (one) => one.status,
   alarm: (one) => `alarm: ${one.status}`,
 };
 

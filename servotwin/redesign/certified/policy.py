@@ -127,17 +127,10 @@ class CertifiedPolicy:
         estimate = self._estimate(evidence)
         if estimate is None and not self._shows_more(evidence):
             return Redesign(None, math.nan, evidence.unusable)
-        gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
         best = math.nan if estimate is None else estimate.gap
-        if gap[1] > self.uncertainty.gap[1]:
-            low, high, most = (math.degrees(x) for x in (*gap, self.uncertainty.gap[1]))
-            reason = (
-                f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified: nothing is sent"
-            )
-            return Redesign(None, math.nan, reason)
-        feedforward, input_bias = self._input_bias(evidence)
-        friction, noise, usual = self._friction(evidence), _noise(evidence), self._usual_step(evidence)
-        region = Region(gap, feedforward, input_bias, friction, noise, usual)
+        region = self.region(evidence)
+        if too_wide := self._too_wide(region):
+            return Redesign(None, math.nan, too_wide)
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
@@ -145,6 +138,40 @@ class CertifiedPolicy:
             return Redesign(None, best, "the verified setting is in force already", certificate=result)
         redesign = _redesign(result, region.noise, best, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
+
+    def region(self, evidence: Evidence) -> Region:
+        """Make the region that a setting must serve, from the evidence; gaps as stated where none was estimated."""
+        estimate = self._estimate(evidence)
+        gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
+        feedforward, input_bias = self._input_bias(evidence)
+        friction, noise, usual = self._friction(evidence), _noise(evidence), self._usual_step(evidence)
+        return Region(gap, feedforward, input_bias, friction, noise, usual)
+
+    def _too_wide(self, region: Region) -> str:
+        """Reason to send nothing: the gap may be wider than stated; empty: it is not."""
+        if region.gap[1] <= self.uncertainty.gap[1]:
+            return ""
+        low, high, most = (math.degrees(x) for x in (*region.gap, self.uncertainty.gap[1]))
+        return f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified: nothing is sent"
+
+    def fall_back(self, evidence: Evidence, reason: str) -> Redesign:
+        """Choose the fallback set, whatever else would be verified."""
+        region = self.region(evidence)
+        if too_wide := self._too_wide(region):
+            return Redesign(None, math.nan, too_wide)
+        return _fallback_redesign(self.fallback(), region, reason)
+
+    def confirm_again(self, evidence: Evidence, setting: Setting) -> Redesign:
+        """Verify an earlier setting for the present evidence; without a setting where it is not verified."""
+        region = self.region(evidence)
+        if too_wide := self._too_wide(region):
+            return Redesign(None, math.nan, too_wide)
+        law = self.servo.controller
+        design = Design(law if setting.gains is None else with_gains(law, setting.gains), setting.tolerance)
+        result = self.confirm(region, design, evidence.machine, evidence.motor)
+        if isinstance(result, NotVerified):
+            return Redesign(None, math.nan, result.reason)
+        return _redesign(result, region.noise, evidence.estimate.gap, "")
 
     def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
         """Find the cheapest setting for a region by simulation, or the running one where it is hardly dearer."""

@@ -20,9 +20,9 @@ MM = 1e3
 Family = Sequence[Sequence[MeasuredStep]]
 
 
-def fig15(runs: Runs, square: Square = BIPOLAR, scenario: str = CONTINUOUS, exact: bool = False) -> TwinRun:
+def fig15(runs: Runs, square: Square = BIPOLAR, scenario: str = CONTINUOUS) -> TwinRun:
     """Fig 15's run."""
-    return runs.get(TwinJob(runs.preset, scenario, square, exact=exact))
+    return runs.get(TwinJob(runs.preset, scenario, square))
 
 
 def family(runs: Runs, square: Square, exact: bool = False) -> Family:
