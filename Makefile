@@ -26,7 +26,7 @@ help:
 	@echo "make check      format, lint, types, layers and the fast tests, a minute or two"
 	@echo "make test       the same and all tests, about twenty minutes on two cores; as root it installs the Debian packages"
 	@echo "                that some tests need (make test PACKAGES=no: skip those tests instead)"
-	@echo "make fuzz       the random tests with fresh and with more examples"
+	@echo "make fuzz       the random tests with fresh and with more examples, and the explorations, which make test leaves out"
 	@echo "make bench      speed beside other solvers; or: python -m benchmarks NAME"
 	@echo "make format     format the code and fix what can be fixed"
 	@echo "make reference  write docs/configuration.md and docs/schemas from the code"
@@ -39,14 +39,14 @@ reproduce: $(STAMP)
 	$(BIN)/servotwin reproduce
 
 check: lint
-	$(PYTEST_FAST) -m "not slow"
+	$(PYTEST_FAST) -m "not slow and not exploration"
 
 test: $(STAMP)
 	@$(MAKE) --no-print-directory -j 3 lint packages kernels
 	$(PYTEST)
 
 fuzz: $(STAMP)
-	$(PYTEST) -m "hypothesis or exploration" --hypothesis-profile=fuzz
+	$(PYTEST) -m "hypothesis or random or exploration" --hypothesis-profile=fuzz
 
 bench: $(STAMP)
 	$(BIN)/python -m benchmarks

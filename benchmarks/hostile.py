@@ -121,10 +121,16 @@ def band(settings: TwinSettings | None = None) -> Band:
     return fallback.setting.band
 
 
-def endured(seed: int, kind: TwinFault, settings: TwinSettings | None = None, friction: bool = False) -> HostileOutcome:
-    """The machine of a seed with a twin of a kind."""
+def endured(
+    seed: int,
+    kind: TwinFault,
+    settings: TwinSettings | None = None,
+    friction: bool = False,
+    duration: float = DURATION,
+) -> HostileOutcome:
+    """The machine of a seed with a twin of a kind, for so many seconds."""
     machine, certified = case(seed, friction), band(settings)
-    loop, run = cosimulated(machine, kind, seed, settings)
+    loop, run = cosimulated(machine, kind, seed, settings, duration)
     error = np.abs(_settled(run, certified.settling)) / certified.error
     last = max((fallback.sample for fallback in loop.edge.fallbacks), default=0) / RATE
     return HostileOutcome(
@@ -156,10 +162,10 @@ def scenario(machine: HostileMachine, seed: int, settings: TwinSettings | None =
 
 
 def cosimulated(
-    machine: HostileMachine, kind: TwinFault, seed: int, settings: TwinSettings | None = None
+    machine: HostileMachine, kind: TwinFault, seed: int, settings: TwinSettings | None, duration: float
 ) -> tuple[Cosimulation, Run]:
     """The machine with a twin of a kind."""
-    known = scenario(machine, seed, settings)
+    known = scenario(machine, seed, settings).replace(duration=duration)
     twin = HostileTwin.of(kind, known, machine.gap, random.Random(f"{kind} {seed}"))
     plant = SimulatedMachine(known, simulation_of(known, machine.servo))
     loop = Cosimulation(known, plant, twin=twin)

@@ -119,6 +119,7 @@ def save(figure: Figure, directory: Path, name: str) -> Path:
     vector = directory / f"{name}.svg"
     with files.atomic_output(vector) as temporary:
         temporary.write_bytes(svg(figure, name))
+    figure.set_layout_engine("none")  # what was laid out for the first file stays: it takes longer than drawing
     with files.atomic_output(directory / f"{name}.png") as temporary, look():
         figure.savefig(temporary, format="png", dpi=200)
     return vector

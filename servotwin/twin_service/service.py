@@ -136,7 +136,15 @@ class TwinService:
             paused=lambda: bool(self.watch.fault),
         )
         self.claims = EdgeClaims(
-            store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
+            store,
+            self.executor,
+            self.polls.evict,
+            self.metrics,
+            self.clocks,
+            self._shared,
+            __version__,
+            samples_per_window=config.samples_per_window,
+            bytes_per_day=0 if math.isinf(config.megabytes_per_day) else round(config.megabytes_per_day * 1e6),
         )
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
@@ -179,7 +187,8 @@ class TwinService:
         await self.watch.start()
         if not self._shared and not self.watch.fault:
             # The store is locked for this process, so that every lease is one of a process that has ended.
-            await self.executor.run(partial(self.store.release, self._owner))
+            with suppress(StoreUnavailable):  # a full disk: the leases end by themselves
+                await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self.feed.run(), vital=False)

@@ -245,6 +245,7 @@ def test_the_store_shows_the_waiting_times_of_windows(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_a_small_fleet_runs_with_real_processes(tmp_path: Path, monkeypatch) -> None:
     kept: list[FleetRun] = []
     monkeypatch.setattr(

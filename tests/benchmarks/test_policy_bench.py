@@ -101,6 +101,7 @@ def test_no_constant_is_dropped_for_its_name() -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("few_machines")
+@pytest.mark.exploration
 def test_the_table_and_its_document(monkeypatch: pytest.MonkeyPatch) -> None:
     """The best of every tenth constant: how many are tried does not matter here."""
     few = dict(list(constants(MODEL, KNOWN).items())[::10])

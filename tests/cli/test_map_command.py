@@ -6,6 +6,7 @@ import socket
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from servotwin.analysis.maps.measures import measured
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.analysis.maps.store import MapStore
 from servotwin.cli import app as cli
-from servotwin.cli.map import summary
+from servotwin.cli.map import figure, summary
 from servotwin.cli.map.command import stability_map
 from servotwin.cli.map.options import MapOptions, parsed
 from servotwin.errors import InvalidInput
@@ -32,10 +33,20 @@ def run(*arguments):
     return CliRunner().invoke(cli.app, ["map", *map(str, arguments)])
 
 
+SAVE, DRAW = "servotwin.cli.map.figure.save", figure.save
+
+
 @pytest.fixture(autouse=True)
 def small_pieces(monkeypatch):
-    """Nine pieces instead of one."""
+    """Nine pieces instead of one, and no picture, which takes much longer than such a map."""
     monkeypatch.setattr("servotwin.analysis.maps.settings._SAMPLES_PER_CHUNK", 4 * 3 * 2100)
+    monkeypatch.setattr(SAVE, lambda *_: Path())
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Pictures after all."""
+    monkeypatch.setattr(SAVE, DRAW)
 
 
 @pytest.fixture(scope="module")
@@ -244,7 +255,7 @@ def test_a_scheduler_out_of_reach_is_one_sentence(tmp_path):
         ({"gap_deg": "2,8", "estimate_deg": "2,8", "k_dz": "1,2", "amplitude_mm": "0.5,1"}, 4),
     ],
 )
-def test_as_many_axes_as_vary_are_drawn(tmp_path, axes, size):
+def test_as_many_axes_as_vary_are_drawn(drawn, tmp_path, axes, size):
     found = stability_map(MapOptions("table1", members=1, duration=12.0, window=10.0, **axes), tmp_path, workers=1)
     assert sum(len(values) > 1 for _, values in found.axes) == size
     assert image.imread(tmp_path / "map.png").std() > 0.05
@@ -268,6 +279,7 @@ def started(*arguments):
     command = [sys.executable, "-m", "servotwin", "map", *map(str, arguments)]
     changed = (
         "import runpy, servotwin.analysis.maps.pool as p, servotwin.analysis.maps.settings as s; "
+        "import servotwin.cli.map.figure as f; f.save = lambda *_: '/'; "
         "p.CONNECT_TIMEOUT = 1.0; s._SAMPLES_PER_CHUNK = 4 * 3 * 2100; "
         "runpy.run_module('servotwin', run_name='__main__')"
     )

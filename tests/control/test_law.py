@@ -321,7 +321,7 @@ NOTCHED = LIMITED.replace(notch_hz=4.3, notch_damping=0.4, voltage_limit=1.0, ra
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 @pytest.mark.parametrize(
     "controller",
     [LIMITED, PAPER, BIASED, STOPPED, FED, NOTCHED],

@@ -51,7 +51,7 @@ LIMITS = {"voltage_limit": 2.5, "rate_limit": 1500.0, "enter": 0.5, "leave": 1.5
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 @pytest.mark.parametrize(
     "law",
     [

@@ -16,7 +16,7 @@ from servotwin.twin.settings import TwinSettings
 LEARNT = 20.0  # s, the second step begins
 
 
-LENGTH = 80.0  # s: the gap grows to 7 deg; the demonstration's test runs all of it
+LENGTH = 60.0  # s: three steps; the demonstration's test runs all ten
 
 
 @cache
@@ -57,16 +57,6 @@ def test_the_loop_stays_and_what_was_proved_holds():
     for begin in np.arange(LEARNT, LENGTH, 20.0):
         tail = slice(round((begin + 10.0) * run.sample_rate), round((begin + 20.0) * run.sample_rate))
         assert np.abs(run.reference[tail] - run.position[tail]).max() < 5e-6
-
-
-@pytest.mark.slow
-def test_the_published_controller_does_not_settle_on_the_same_machine():
-    """Neither with the published rule, nor with the twin switched off."""
-    published = Scenario.preset("fig15").replace(input_bias=0.05)
-    for scenario in (published, published.replace(twin=published.twin.replace(enabled=False))):
-        run = cosimulate(scenario.replace(duration=100.0)).run
-        last = slice(round(90.0 * run.sample_rate), None)
-        assert np.ptp(run.position[last]) > 1e-4
 
 
 @pytest.mark.slow

@@ -143,7 +143,7 @@ def test_a_move_of_the_reference_ends_the_probing_move_one_sample_later(
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 def test_requests_and_answers_survive_a_bad_link_and_count_once() -> None:
     bad = LinkSettings(delay_s=0.5, loss=0.5, duplicate=0.3)
     for seed in range(extent(2, 8)):

@@ -7,9 +7,9 @@ from pathlib import Path
 from types import CodeType, FrameType
 
 import pytest
+from few_machines import certified_scenario
 
 from servotwin.cosim import Cosimulation, SimulatedMachine
-from servotwin.cosim.scenario import Scenario
 
 ROOT = Path(__file__).parents[2]
 ROW = re.compile(r"^\| ([C ]) \| ([D ]) \| `(servotwin/[\w/]+\.py)` \|", re.MULTILINE)
@@ -73,7 +73,7 @@ def hop_of(file: str) -> str:
 
 @pytest.mark.slow
 def test_the_rows_of_the_co_simulation_are_the_files_that_run():
-    scenario = Scenario.preset("certified").replace(duration=50.0)
+    scenario = certified_scenario(25.0)
     loop = Cosimulation(scenario, SimulatedMachine(scenario))
 
     def run() -> None:

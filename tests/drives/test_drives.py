@@ -49,8 +49,8 @@ def read_all(drive: SupervisedDrive, most: int) -> list[Block]:
 
 @pytest.mark.slow
 def test_control_ticked_through_the_socket_is_the_sampled_simulation(tmp_path: Path) -> None:
-    """10 s at 5 kHz with noise, a dead zone and a gap that grows from nothing, contacts inside samples included."""
-    path = plant_file(tmp_path, "control", 10.0)
+    """4 s at 5 kHz with noise, a dead zone and a gap that grows from nothing, contacts inside samples included."""
+    path = plant_file(tmp_path, "control", 4.0)
     scenario = Scenario.load(tmp_path / "scenario.toml")
     run = whole(simulation_of(scenario))
     parameters, state = scenario.start_law.law(scenario.start_tolerance), law.start(0.0)
@@ -72,7 +72,7 @@ def test_control_ticked_through_the_socket_is_the_sampled_simulation(tmp_path: P
 
 @pytest.mark.slow
 def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(tmp_path: Path) -> None:
-    path = plant_file(tmp_path, "supervise", 10.0)
+    path = plant_file(tmp_path, "supervise", 5.0)
     scenario = Scenario.load(tmp_path / "scenario.toml")
     controller = scenario.start_law.replace(**SOFTER)
     with machine(path) as (address, process), closing(SimulatedSupervised(address)) as drive:

@@ -24,7 +24,7 @@ RATE = 5000.0
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 @pytest.mark.parametrize("view", [bench.EXACT, bench.UNKNOWN])
 def test_no_corrupted_window_gives_a_confident_wrong_gap(view):
     """A window of every kind, more in `make fuzz`; also that the clean ones are not refused for it."""

@@ -5,10 +5,11 @@ from functools import lru_cache, partial
 
 import numpy as np
 import pytest
+from exploration import explored
 
 from benchmarks import estimator_joint as bench
 from benchmarks.cramer_rao import bound, motor_unknowns, noise_root
-from benchmarks.estimator_windows import RATE
+from benchmarks.estimator_windows import RATE, WindowCase
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.whitening import Autoregression, burg
 from servotwin.estimation.estimate import GapStatus
@@ -107,7 +108,7 @@ def test_derivatives_of_the_whole_are_those_of_its_cost():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("voltage", [False, True])
+@pytest.mark.parametrize("voltage", explored((False, True), 1))
 def test_the_recorders_windows_meet_the_target(voltage):
     """2 s from 0.3 s before the step on, in `table1`, whose screw moves half as far: 0.03 and 0.02 deg."""
     loop = bench.recorded(bench.SAMPLED)
@@ -119,9 +120,7 @@ def test_the_recorders_windows_meet_the_target(voltage):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("loop", "preset"), [(bench.CONTINUOUS, "paper"), (bench.SAMPLED, "table1")], ids=["continuous", "sampled"]
-)
+@pytest.mark.parametrize(("loop", "preset"), explored([(bench.CONTINUOUS, "paper"), (bench.SAMPLED, "table1")], 1))
 def test_without_noise_the_voltages_jumps_cost_nothing(loop, preset):
     """The dead zone opens and the reference steps between samples; the stated spread covers what is left."""
     groups = bench.windows(loop, preset, 2, 11, floor=0.0)
@@ -176,18 +175,28 @@ def _gain(noise: Autoregression) -> float:
     return float(noise.spread[-1] / abs(noise.predictors[-1].sum()))
 
 
+def cases_near_the_bound() -> list[list[WindowCase]]:
+    """Two windows of each gap, in white noise."""
+    return bench.windows(bench.CONTINUOUS, "paper", 2, 3)
+
+
 @pytest.mark.slow
 def test_the_bound_grows_with_what_is_unknown():
-    """By code of its own; an estimator below it would have known the answer, one far above it wastes data."""
-    groups = bench.windows(bench.CONTINUOUS, "paper", 2, 3)
-    cases = [case for group in groups for case in group]
-    case, root = cases[0], noise_root(5000, RATE, FLOOR, None)
+    case, root = cases_near_the_bound()[0][0], noise_root(5000, RATE, FLOOR, None)
     bound_in = partial(bound, SERVO, case.window.theta_m, RATE, case.gap, case.theta_d0)
     plain, structure = bound_in(root), bound_in(root, free=("k", "c", "p"))
     motor = bound_in(root, angles=motor_unknowns(SERVO, case.window.voltage, RATE, zero_order_hold=False))
     assert plain < structure < 5.0 * plain
     assert plain < motor < 2.0 * plain
     assert bound_in(2.0 * root, free=("k", "c", "p")) == pytest.approx(2.0 * structure, rel=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.exploration
+def test_the_errors_are_near_the_bound():
+    """By code of its own; an estimator below it would have known the answer, one far above it wastes data."""
+    groups = cases_near_the_bound()
+    cases = [case for group in groups for case in group]
     errors = bench.Errors.of(groups, [bench.estimates(group, bench.CONTINUOUS, False, False) for group in groups])
     ratio = math.sqrt(np.mean(errors.errors**2)) / bench.limit(cases, bench.CONTINUOUS, voltage=False)
     assert 0.4 < ratio < 1.6

@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from exploration import extent
+from exploration import explored
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -13,7 +13,7 @@ from servotwin.estimation.joint.estimator import JointSettings, estimate_jointly
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import Run, simulate
 
@@ -54,18 +54,22 @@ def windows(run: Run, angle: bool = True, seed: int = 1) -> list[Window]:
     return found
 
 
-LOOPS = [(False, False, False), (False, True, False), (True, True, False), (True, True, True)]
-NAMES = ["continuous", "dead zone", "sampled", "paper's noise"]
+LOOPS = {
+    "continuous": (False, False, False),
+    "dead zone": (False, True, False),
+    "sampled": (True, True, False),
+    "paper's noise": (True, True, True),
+}
+CASES = [(preset, gap, loop) for preset, gap in (("paper", 4.0), ("paper", 18.0), ("table1", 10.0)) for loop in LOOPS]
+MACHINES_AND_LOOPS = explored(CASES, 0, 3, 5, 10)
+"""Every loop, every preset and both sizes of the gap once; all pairs of them are explorations."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loop", LOOPS, ids=NAMES)
-@pytest.mark.parametrize(
-    ("preset", "gap_deg", "limit"), [("paper", 4.0, 0.03), ("paper", 18.0, 0.03), ("table1", 10.0, 0.05)]
-)
-def test_a_wrong_structure_is_found_with_the_gap(preset, gap_deg, limit, loop):
+@pytest.mark.parametrize(("preset", "gap_deg", "loop"), MACHINES_AND_LOOPS)
+def test_a_wrong_structure_is_found_with_the_gap(preset, gap_deg, loop):
     """From k 5 %, c 20 %, pitch 1 % off: 0.03 deg; in `table1`, whose screw moves half as far, more."""
-    run = run_of(preset, gap_deg, *loop)
+    run, limit = run_of(preset, gap_deg, *LOOPS[loop]), 0.03 if preset == "paper" else 0.05
     for window in windows(run):
         found = estimate_jointly(window, scaled(run.servo, **WRONG))
         assert found.gap.ok, found.gap.reasons
@@ -78,15 +82,13 @@ def test_a_wrong_structure_is_found_with_the_gap(preset, gap_deg, limit, loop):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("loop", LOOPS, ids=NAMES)
-@pytest.mark.parametrize(
-    ("preset", "gap_deg", "limit"), [("paper", 4.0, 0.02), ("paper", 18.0, 0.02), ("table1", 10.0, 0.04)]
-)
-def test_the_angle_from_the_voltage(preset, gap_deg, limit, loop):
+@pytest.mark.parametrize(("preset", "gap_deg", "loop"), MACHINES_AND_LOOPS)
+def test_the_angle_from_the_voltage(preset, gap_deg, loop):
     """k_B 2 % off and no theta_m: 0.02 deg; in `table1`, whose screw moves half as far, twice that."""
-    run = run_of(preset, gap_deg, *loop)
+    sampled, dead_zone, noisy = LOOPS[loop]
+    run, limit = run_of(preset, gap_deg, sampled, dead_zone, noisy), 0.02 if preset == "paper" else 0.04
     model = scaled(run.servo, k_B=1.02)
-    if loop[0]:
+    if sampled:
         model = model.replace(sample_rate=5000.0)
     for window in windows(run, angle=False):
         found = estimate_jointly(window, model, free=("k_B",))
@@ -138,11 +140,11 @@ def test_a_gap_that_grows_within_the_window():
 
 @pytest.mark.slow
 def test_stated_spread_is_that_of_many_fits():
-    """The same window in 16 white noises; the stated spread carries the settings' inflation of 1.2."""
+    """The same window in 6 white noises; the stated spread carries the settings' inflation of 1.2."""
     run = run_of("paper", 10.0, False, False)
     servo, rng, errors, stated = scaled(run.servo, **WRONG), np.random.default_rng(8), [], []
     clean = Window.from_run(run, 5.0, 1.0)
-    for _ in range(16):
+    for _ in range(6):
         window = clean.replace(position=clean.position + FLOOR * rng.standard_normal(clean.position.size))
         found = estimate_jointly(window, servo, prior=math.radians(9.0))
         errors.append(found.gap.gap - math.radians(10.0))
@@ -156,7 +158,7 @@ def test_stated_spread_is_that_of_many_fits():
 def test_random_windows_are_right_or_refused():
     """Quiet, one contact, straddling a step, calm loops; wrong structures, and k_B wrong without the angle."""
     rng, accepted, travelled = np.random.default_rng(21), 0, 0
-    for index in range(extent(4, 5)):
+    for index in range(5):
         servo, gap = Servo.preset(("paper", "table1")[index % 2]), math.radians(rng.uniform(0.0, 25.0))
         controller = servo.controller.replace(Ki=servo.controller.Ki * rng.choice([0.0, 1.0, 1.0]))
         tolerance = rng.choice([None, servo.tolerance_for(gap)])
@@ -251,8 +253,9 @@ def test_an_elastic_screw_is_refused():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("angle", [True, False])
-@pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
+@pytest.mark.parametrize(
+    ("preset", "angle"), explored([(name, angle) for name in PRESETS for angle in (True, False)], 0, 3)
+)
 def test_a_gap_beyond_the_largest_is_a_lower_bound_with_its_reason(preset, angle):
     """The search goes up to 60 deg; at the bound it used to be sure of it."""
     servo = Servo.preset(preset)

@@ -234,7 +234,7 @@ def test_a_machine_survives_its_encoding():
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 @pytest.mark.parametrize(("loop", "machines", "seed"), [("calm", 4, 5), ("dead zone", 2, 17)])
 def test_a_twin_learns_its_machine(loop, machines, seed):
     """Stiffness within 5 %, damping 50 %, pitch 1 %, motor 10 % of the model, the gap growing: none wrong."""

@@ -273,6 +273,7 @@ def test_a_response_crosses_to_the_link_process_and_is_used_once(tmp_path: Path)
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_a_machine_that_was_learnt_shows_a_tenth_of_a_degree_in_one_window() -> None:
     tiny = replace(QUICK, quiet=200, changed=60, drawn=20_000, trials=20)
     off = NoveltyCondition("off", None, 1.05, 1.3, 1.01)

@@ -6,6 +6,7 @@ import warnings
 import control
 import numpy as np
 import pytest
+from exploration import explored
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -108,8 +109,7 @@ def test_crossovers_and_margins_against_python_control(servo: Servo, filter_hz: 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("k_d", [math.inf, 1e6])
-@pytest.mark.parametrize("n", [40, 100])
+@pytest.mark.parametrize(("n", "k_d"), explored([(40, math.inf), (40, 1e6), (100, math.inf), (100, 1e6)], 0, 1))
 def test_a_long_chain_has_margins(n: int, k_d: float) -> None:
     """Its polynomials are lost to rounding, those of a hundred masses overflow; the matrices are not."""
     servo = Servo.preset("paper").replace(n=n, k_d=k_d)

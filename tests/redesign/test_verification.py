@@ -19,7 +19,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.loop_set import PlantSet
-from servotwin.plant.servo import Servo
+from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
 from servotwin.redesign.certified.attempt import share_at_least
@@ -167,13 +167,15 @@ def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> N
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
-@pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
-def test_fresh_machines_settle_as_the_certificate_says(preset: str) -> None:
+@pytest.mark.parametrize(
+    ("preset", "count"),
+    [("paper", 128), *(pytest.param(each, 1024, marks=pytest.mark.exploration) for each in PRESETS)],
+)
+def test_fresh_machines_settle_as_the_certificate_says(preset: str, count: int) -> None:
     servo, known = Servo.preset(preset), Uncertainty(input_bias=(-0.1, 0.1))
     found = certify(servo, known)
     assert isinstance(found, Certificate), found
-    members = draw_independently(servo, known, extent(256, 1024), 99)
+    members = draw_independently(servo, known, count, 99)
     (measures,) = assess([found.setting], members, trial_for(servo, known, Demands()))
     assert measures.settled.mean() >= Demands().settled
 

@@ -133,6 +133,7 @@ def test_a_policy_that_cannot_design_states_the_reason(monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_every_policy_designs_in_noise():
     """The map behind `margin` is that of the loop that runs, its loop filter included."""
     found = PolicyJob("paper", "margin", NOISE, SHORT).run()

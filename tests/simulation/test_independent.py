@@ -80,7 +80,7 @@ def cases() -> list[tuple[int, Case, float]]:
     return [(seed, random_case(seed), sensitivity(random_case(seed))) for seed in range(SEEDS)]
 
 
-@pytest.mark.exploration
+@pytest.mark.random
 def test_most_random_runs_can_be_compared(cases: list[tuple[int, Case, float]]) -> None:
     assert sum(sensitive <= SENSITIVE for *_, sensitive in cases) >= 0.8 * SEEDS
     assert {case.servo.n for _, case, _ in cases} == {2, 3, 5}
@@ -102,7 +102,7 @@ def test_against_solve_ivp(cases: list[tuple[int, Case, float]]) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 def test_against_exponentials(cases: list[tuple[int, Case, float]]) -> None:
     """scipy's expm on a grid and brentq, on all; the events agree in kind and time."""
     for seed, case, sensitive in cases:

@@ -1,7 +1,9 @@
 """Extent of random tests: few examples, always the same, in the suite; many fresh ones in `make fuzz`."""
 
+from collections.abc import Iterable
 from typing import Any
 
+import pytest
 from hypothesis import settings
 
 FUZZ = 20
@@ -14,5 +16,20 @@ def examples(number: int, **others: Any) -> settings:
 
 
 def extent(suite: int, fuzz: int) -> int:
-    """Return the first number in the suite, the second one in `make fuzz`; for tests marked `exploration`."""
+    """Return the first number in the suite, the second one in `make fuzz`; for tests marked `random`."""
     return fuzz if settings.get_current_profile_name() == "fuzz" else suite
+
+
+def sized(kinds: Iterable[str], kept: dict[str, int], many: int) -> list[Any]:
+    """Return cases of (kind, how many): the kept ones, and as explorations many of every kind."""
+    return [*kept.items(), *(_exploration((kind, many)) for kind in kinds)]
+
+
+def explored(cases: Iterable[Any], *kept: int) -> list[Any]:
+    """Return the cases of a parametrised test, of which all but the kept ones (by place) are explorations."""
+    return [case if at in kept else _exploration(case) for at, case in enumerate(cases)]
+
+
+def _exploration(case: Any) -> Any:
+    values = case if isinstance(case, tuple) else (case,)
+    return pytest.param(*values, marks=pytest.mark.exploration)

@@ -62,7 +62,9 @@ def test_every_stored_estimate_comes_out_again(name, given_model):
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_in_another_process_too():
+    """The suite has a claim that is worked on in other processes, in test_work.py."""
     script = (
         "import sys, pickle; from servotwin.twin.replay import replay\n"
         "cases = pickle.load(sys.stdin.buffer)\n"

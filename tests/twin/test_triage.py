@@ -12,6 +12,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
+from few_machines import certified_scenario
 from rich.console import Console
 from twin_messages import eq_21, message_of
 
@@ -56,7 +57,7 @@ def cases(noisy: bool) -> tuple[WindowCase, ...]:
 @cache
 def calm_windows() -> tuple[messages.WindowMessage, ...]:
     """Of a deployed loop: at rest between steps, 2 s with a bias of 50 mV; only the first few show both contacts."""
-    lively, calm = (windows_under(scale, seconds) for scale, seconds in ((1.0, 65.0), (0.7, 125.0)))
+    lively, calm = (windows_under(scale, seconds) for scale, seconds in ((1.0, 45.0), (0.7, 105.0)))
     assert len(lively) >= 3
     return (*lively[:3], *calm[3:])
 
@@ -278,7 +279,7 @@ def test_wear_is_followed_as_closely_as_without_triage() -> None:
 @pytest.mark.slow
 def test_a_crash_in_a_steady_loop_is_estimated_at_once() -> None:
     before = calm_windows()
-    after = cosimulate(Scenario.preset("certified").replace(gap=26.0 * DEG, duration=85.0)).windows[3:]
+    after = cosimulate(certified_scenario(65.0).replace(gap=26.0 * DEG)).windows[3:]
     shifted = [
         msgspec.structs.replace(one, start=one.start + 400.0, sequence=one.sequence + 50, boot=before[0].boot)
         for one in after
@@ -344,6 +345,7 @@ def test_settings_out_of_range_are_refused(name: str, value: object) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.exploration
 def test_the_bench_says_how_often_a_glance_errs(tmp_path) -> None:
     output = tmp_path / "triage.json"
     rows = bench(output=output, gaps=2, console=Console(file=io.StringIO()))

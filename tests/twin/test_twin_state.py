@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from exploration import examples
+from few_machines import certified_scenario
 from hypothesis import given
 from hypothesis import strategies as st
 from twin_messages import known_gap, make, window_message
@@ -99,8 +100,8 @@ def probed() -> Scenario:
 
 
 SCENARIOS = {
-    "fig15": lambda: Scenario.preset("fig15").replace(duration=50.0),
-    "certified": lambda: Scenario.preset("certified").replace(duration=45.0),
+    "fig15": lambda: Scenario.preset("fig15").replace(duration=45.0),
+    "certified": lambda: certified_scenario(45.0),
     "probed": probed,
 }
 

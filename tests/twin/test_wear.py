@@ -7,6 +7,7 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
+from exploration import explored
 from quantisation import quantisation
 
 from servotwin.cosim import Loop, cosimulate
@@ -137,7 +138,9 @@ def errors_deg(loop: Loop) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "largest"), [("fig15", 0.003), ("fig15-sampled", 0.003), ("calm", 0.003)])
+@pytest.mark.parametrize(
+    ("name", "largest"), explored([("fig15", 0.003), ("fig15-sampled", 0.003), ("calm", 0.003)], 1, 2)
+)
 def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
     loop = loop_of(name)
     assert [e.status for e in loop.estimates] == [GapStatus.OK] * 10
@@ -148,7 +151,9 @@ def test_in_the_wearing_loop_every_window_shows_the_gap(name, largest):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "learn", "worst"), [(2023, False, 0.01), (2024, False, 0.01), (2025, True, 0.02)])
+@pytest.mark.parametrize(
+    ("seed", "learn", "worst"), explored([(2023, False, 0.01), (2024, False, 0.01), (2025, True, 0.02)], 2)
+)
 def test_in_the_papers_noise_what_is_accepted_is_right(seed, learn, worst):
     """With a model that is exact, and with one that is learnt on the way, which costs the first windows accuracy."""
     scenario = ours(Scenario.preset("fig16")).replace(seed=seed)

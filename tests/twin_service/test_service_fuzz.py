@@ -43,7 +43,7 @@ def described(url):
 
 @pytest.mark.slow
 @given(st.data())
-@examples(120, deadline=None, suppress_health_check=list(HealthCheck))
+@examples(40, deadline=None, suppress_health_check=list(HealthCheck))
 def test_requests_that_the_openapi_document_allows(described, data):
     """And headers, cookies and bodies of its own making."""
     from schemathesis.checks import not_a_server_error
@@ -85,7 +85,7 @@ def bodies(draw):
     ),
 )
 @example(body=zlib.compress(bytes(40_000_000)), sent="", declared="deflate", path=place(window(0)))
-@examples(60, deadline=None)
+@examples(25, deadline=None)
 def test_bodies_and_encodings(url, body, sent, declared, path):
     headers = {"content-encoding": declared} if declared else {}
     method = "PUT" if "windows" in path else "POST"

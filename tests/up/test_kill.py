@@ -63,7 +63,7 @@ def met(killer: Killer, relay: Relay, bad: Sequence[str]) -> bool:
 
 
 @pytest.mark.slow
-@pytest.mark.exploration
+@pytest.mark.random
 def test_kills_and_a_bad_network_lose_no_window(tmp_path: Path) -> None:
     fleet, windows = Fleet(tmp_path, ROLES), extent(60, 450)
     killer = Killer(fleet, SEED, {"twin": 1, "edge": 2, "link": 1})
@@ -79,7 +79,7 @@ def test_kills_and_a_bad_network_lose_no_window(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.exploration
 def test_kills_of_the_broker_too_lose_no_window(tmp_path: Path) -> None:
-    windows = extent(50, 250)
+    windows = 250
     with broker(tmp_path / "broker") as server:
         fleet = Fleet(tmp_path, ROLES, f'[service.mqtt]\nurl = "{server.url}"')
         killer = Killer(fleet, SEED, {"twin": 1, "edge": 1, "link": 1, "broker": 1}, server)

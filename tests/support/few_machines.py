@@ -1,0 +1,13 @@
+"""Demands of a certified twin for tests that are not about how often a setting was tried."""
+
+from servotwin.cosim.scenario import Scenario
+from servotwin.redesign.certified.certificate import Demands
+
+FEW = Demands(machines=64, screened=4, scales=(0.5, 0.7), settled=0.95)
+"""Settings verified on fewer machines than usual, from fewer candidates."""
+
+
+def certified_scenario(duration: float) -> Scenario:
+    """The packaged scenario `certified`, so long (s), with few machines."""
+    scenario = Scenario.preset("certified").replace(duration=duration)
+    return scenario.replace(twin=scenario.twin.replace(demands=FEW))
