@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import resource
+import shutil
 import signal
 import socket
 import sqlite3
@@ -17,7 +18,7 @@ from collections.abc import Callable, Mapping
 from contextlib import closing, suppress
 from pathlib import Path
 from random import Random
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import NamedTuple
 
 from rich.console import Console
@@ -44,8 +45,8 @@ class EnduranceOutcome(NamedTuple):
     ----------
     seconds : float
     faults : dict of str to int
-    starts, ended_alone : int
-        Starts of edges, and those that ended without a fault.
+    starts, ended_alone, twin_ended : int
+        Starts of edges, and those that ended without a fault; likewise ends of the twin. Both are started again.
     boots, stored : int
         Boots of edges from which windows are stored, and those windows.
     lost_acknowledged, holes, unseen, counted, waiting : int
@@ -64,6 +65,7 @@ class EnduranceOutcome(NamedTuple):
     faults: dict[str, int]
     starts: int
     ended_alone: int
+    twin_ended: int
     boots: int
     stored: int
     lost_acknowledged: int
@@ -175,8 +177,13 @@ def endure(
     console = console or Console()
     report.check(output)
     check_system()
-    with TemporaryDirectory(prefix="endure-") as name, console.status(f"{minutes:g} minutes of faults"):
-        outcome = _outcome(Site(Path(name), _free_port(), minutes), minutes, seed)
+    folder = Path(mkdtemp(prefix="endure-"))
+    with console.status(f"{minutes:g} minutes of faults"):
+        outcome = _outcome(Site(folder, _free_port(), minutes), minutes, seed)
+    if outcome.waiting or outcome.lost_acknowledged or outcome.holes or outcome.unseen:
+        console.print(f"[dim]the files are kept: {folder}[/]")
+    else:
+        shutil.rmtree(folder)
     console.print(shown(outcome))
     report.write(output, report.text(SCHEMA, date, minutes=minutes, seed=seed, outcome=outcome._asdict()), console)
     return outcome
@@ -192,12 +199,11 @@ def _outcome(site: Site, minutes: float, seed: int) -> EnduranceOutcome:
             samples.append((now, _memory(site)))
             time.sleep(random.uniform(*_FAULTS_S))
             witness.look()
+            site.revive()
             faults.strike()
         for machine in site.machines.values():
             machine.kill()
-        if not site.twin.pid:
-            site.twin.start()
-        _until(lambda: not site.waiting(), _END_S)
+        _until(site.settled, _END_S)
         witness.look()
         for member in (*site.edges.values(), site.twin):
             member.end()
@@ -222,6 +228,7 @@ def _figures(
         faults=dict(faults),
         starts=sum(edge.starts for edge in site.edges.values()),
         ended_alone=sum(edge.ended_alone for edge in site.edges.values()),
+        twin_ended=site.twin.ended_alone,
         boots=len(boots),
         stored=len(stored),
         lost_acknowledged=len(witness.acknowledged - stored),
@@ -276,6 +283,7 @@ def shown(outcome: EnduranceOutcome) -> Table:
     rows = {
         "time, s; edges": f"{outcome.seconds:.0f}; {SERVOS}",
         "starts of edges; ended without a fault": f"{outcome.starts}; {outcome.ended_alone}",
+        "ends of the twin without a fault": str(outcome.twin_ended),
         "boots with stored windows": str(outcome.boots),
         **{f"faults: {name}": str(number) for name, number in sorted(outcome.faults.items())},
         "windows stored": str(outcome.stored),

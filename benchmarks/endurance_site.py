@@ -22,13 +22,13 @@ from servotwin.up.enrolment import Enrolment, enroll
 SERVOS = 4
 _RATE, _WINDOW_S, _PERIOD_S = 500.0, 0.8, 1.64
 _END_S, _PATIENCE_S = 120.0, 60.0
-_TWIN = """
+TWIN_TOML = """
 [service]
 port = {port}
 tokens = "tokens.toml"
 workers = 1
 rate_limit_per_s = 1000
-log_level = "warning"
+{service}
 [models.paper]
 servo = "paper"
 [models.paper.controller]
@@ -37,17 +37,20 @@ sample_rate_hz = {rate}
 policy = "paper"
 k_dz = 1.0
 initial_gap_deg = 2.0
-validity_s = 100.0
+validity_s = {validity}
 [servos]
 "ax-*" = "paper"
 """
-_MACHINE = """
-role = "supervise"
-listen = "unix:{folder}/drive.sock"
+MACHINE_TOML = """
+role = "{role}"
+listen = "{listen}"
+speed = {speed}
 slack_s = 60.0
+watchdog_s = 0.5
 block_s = 0.1
 [scenario]
 servo = "paper"
+name = "{servo}"
 duration_s = {duration}
 seed = {seed}
 [scenario.reference]
@@ -119,6 +122,12 @@ class Member:
                 self._command, cwd=self._folder, stdout=log, stderr=log, env=environment, start_new_session=True
             )
 
+    def revive(self) -> None:
+        """Start it again where it has ended without a fault, as a service manager would."""
+        if self._running and not self.pid:
+            self.kill()
+            self.start()
+
     def kill(self) -> None:
         """Kill it and its children."""
         if self.process is not None:
@@ -144,7 +153,8 @@ class Site:
     def __init__(self, folder: Path, port: int, minutes: float) -> None:
         self.folder = folder
         (folder / "sitecustomize.py").write_text(_CLOCK, encoding="utf-8")
-        (folder / "twin.toml").write_text(_TWIN.format(port=port, rate=_RATE), encoding="utf-8")
+        twin = TWIN_TOML.format(port=port, service='log_level = "warning"', rate=_RATE, validity=100.0)
+        (folder / "twin.toml").write_text(twin, encoding="utf-8")
         self.twin = Member(folder, folder / "twin.log", "-m", "servotwin", "twin")
         self.edges: dict[str, Member] = {}
         self.machines: dict[str, Member] = {}
@@ -158,8 +168,10 @@ class Site:
         config = load(folder / "edge.toml")
         agent = replace(config.agent, window_s=_WINDOW_S, pre_trigger_s=0.0, retry=Retry(0.2, 2.0, 2.0))
         (folder / "edge.toml").write_text(edge_toml(replace(config, agent=agent)), encoding="utf-8")
-        known = {"folder": servo, "seed": seed, "rate": _RATE, "window": _WINDOW_S, "period": _PERIOD_S}
-        (self.folder / f"{servo}.toml").write_text(_MACHINE.format(duration=duration, **known), encoding="utf-8")
+        known = {"servo": servo, "seed": seed, "rate": _RATE, "window": _WINDOW_S, "period": _PERIOD_S}
+        listen = f"unix:{servo}/drive.sock"
+        text = MACHINE_TOML.format(role="supervise", listen=listen, speed=1.0, duration=duration, **known)
+        (self.folder / f"{servo}.toml").write_text(text, encoding="utf-8")
         machine = ("-m", "servotwin.drives.simulated", f"{servo}.toml")
         self.machines[servo] = Member(self.folder, self.folder / f"{servo}-machine.log", *machine)
         self.edges[servo] = Member(
@@ -177,6 +189,16 @@ class Site:
         finally:
             for each in members:
                 each.kill()
+
+    def revive(self) -> None:
+        """Start the twin and the edges again that have ended without a fault."""
+        for each in (self.twin, *self.edges.values()):
+            each.revive()
+
+    def settled(self) -> bool:
+        """True where no window waits; what has ended without a fault is started again."""
+        self.revive()
+        return not self.waiting()
 
     def outbox(self, servo: str) -> Path:
         """File of an edge's outbox."""

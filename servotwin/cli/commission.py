@@ -127,6 +127,11 @@ def axis_text(found: CommissionedAxis, axis: Axis) -> str:
         f"# Identified by servotwin commission from {names}.",
         *(f"# {line}" for line in _lines(found, fit)),
         "# For the twin, at the motor (95 %): [twin.uncertainty]",
+        *(
+            [f"#   {', '.join(f'{name}_percent = {100.0 * getattr(known, name):.3g}' for name in 'mkc')},"]
+            if found.drive.split is not None
+            else []
+        ),
         f"#   k_t_percent = {100.0 * known.k_T:.3g}, k_b_percent = {100.0 * known.k_B:.3g},",
         f"#   friction_n_m = [{known.friction[0]:.4g}, {known.friction[1]:.4g}], "
         f"input_bias_n_m = [{known.input_bias[0]:.4g}, {known.input_bias[1]:.4g}]",

@@ -17,6 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.driven_load.estimate import with_dynamics
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
@@ -44,6 +45,7 @@ def show(
     axis: str | None = None,
     dates: str | None = None,
     stiff: bool = False,
+    dynamics: bool = False,
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
@@ -52,6 +54,8 @@ def show(
     InvalidInput
         As `read_recording` and `estimate_lost_motion`; or both a machine and a stiff one are given.
     """
+    if stiff and dynamics:
+        raise InvalidInput("--stiff and --dynamics: give one of the two; a load behind a stiff transmission has none")
     if stiff and axis is not None:
         raise InvalidInput(f"--stiff and --axis {axis}: give one of the two; the axis says how stiff it is")
     console = Console(stderr=as_json)
@@ -69,6 +73,9 @@ def show(
             lost = estimate_lost_motion(log.recording)
             known = 0.0 if stiff else None
             found = gap_within(lost, known) if machine is None else gap_of_machine(log.recording, lost, machine)
+            if dynamics:
+                status.update(f"{path.name}: dynamics of the load")
+                found = with_dynamics(log.recording, found)
             answers.append((log, found))
     if page is not None:
         log, found = answers[-1]

@@ -9,6 +9,21 @@ import typer
 
 from servotwin.errors import InvalidInput
 
+# Columns of a foreign log, as all commands take them.
+MotorColumn = Annotated[str | None, typer.Option("--motor", help="Column of the motor's position.")]
+LoadColumn = Annotated[str | None, typer.Option("--load", help="Column of the load's position, by its own encoder.")]
+CommandColumn = Annotated[str | None, typer.Option("--command", help="Column of the motor's command.")]
+TimeColumn = Annotated[str | None, typer.Option("--time", help="Column of the time.")]
+SampleRate = Annotated[
+    float | None,
+    typer.Option("--rate", help="Sample rate, Hz, of a log without times; its own times do not count then."),
+]
+MotorUnit = Annotated[
+    str | None, typer.Option("--motor-unit", help="Where the header does not say it, such as deg or mm.")
+]
+LoadUnit = Annotated[str | None, typer.Option("--load-unit", help="Where the header does not say it, such as mm.")]
+_LOGS = "Recordings: .csv, .txt, .npz, .parquet, .mat, .h5, .mf4, .tdms, .mcap ..."
+
 
 def demo(
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("servotwin-demo"),
@@ -49,15 +64,13 @@ def simulate(
 def convert(
     log: Annotated[Path, typer.Argument(help="A log with time_s, position_m, theta_m_rad ..., or any with --motor.")],
     output: Annotated[Path, typer.Argument(help="run.csv, which an edge can replay, run.npz or run.parquet.")],
-    motor: Annotated[str | None, typer.Option(help="Of another log: column of the motor's position.")] = None,
-    load: Annotated[str | None, typer.Option(help="Column of the load's position.")] = None,
-    command: Annotated[str | None, typer.Option(help="Column of the motor's command.")] = None,
-    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    rate: Annotated[
-        float | None, typer.Option(help="Sample rate, Hz, of a log without times; its own times do not count then.")
-    ] = None,
-    motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as deg.")] = None,
-    load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as mm.")] = None,
+    motor: MotorColumn = None,
+    load: LoadColumn = None,
+    command: CommandColumn = None,
+    time: TimeColumn = None,
+    rate: SampleRate = None,
+    motor_unit: MotorUnit = None,
+    load_unit: LoadUnit = None,
 ) -> None:
     """Convert a recorded log to another format; with --motor and --load any log, cleaned of what is damaged."""
     from servotwin.cli.simulate import convert as run
@@ -73,18 +86,14 @@ def convert(
 
 
 def identify(
-    logs: Annotated[list[Path], typer.Argument(help="Recordings: .csv, .txt, .npz, .parquet, .mat, .h5 ...")],
-    motor: Annotated[str | None, typer.Option(help="Column of the motor's position.")] = None,
-    load: Annotated[str | None, typer.Option(help="Column of the load's position.")] = None,
-    command: Annotated[
-        str | None, typer.Option(help="Column of the motor's command: shows how far it winds up.")
-    ] = None,
-    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    rate: Annotated[
-        float | None, typer.Option(help="Sample rate, Hz, of a log without times; its own times do not count then.")
-    ] = None,
-    motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as deg.")] = None,
-    load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as mm.")] = None,
+    logs: Annotated[list[Path], typer.Argument(help=_LOGS)],
+    motor: MotorColumn = None,
+    load: LoadColumn = None,
+    command: CommandColumn = None,
+    time: TimeColumn = None,
+    rate: SampleRate = None,
+    motor_unit: MotorUnit = None,
+    load_unit: LoadUnit = None,
     page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
     servo: Annotated[
         str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
@@ -96,6 +105,12 @@ def identify(
     stiff: Annotated[
         bool,
         typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
+    ] = False,
+    dynamics: Annotated[
+        bool,
+        typer.Option(
+            "--dynamics", help="Fit the load's frequency, damping and friction where its motion alone shows no gap."
+        ),
     ] = False,
     dates: Annotated[
         str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")
@@ -137,14 +152,14 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
-    without_model = columns != RecordingColumns() or axis is not None or stiff or dates is not None
+    without_model = columns != RecordingColumns() or axis is not None or stiff or dynamics or dates is not None
     if without_model or (servo is None and not describes_its_machine(logs[0])):
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(
                 "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
                 "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
             )
-        show_lost_motion(logs, columns, json, page, axis, dates, stiff)
+        show_lost_motion(logs, columns, json, page, axis, dates, stiff, dynamics)
         return
     if len(logs) > 1 or page is not None:
         raise InvalidInput(
@@ -155,19 +170,17 @@ def identify(
 
 
 def commission(
-    logs: Annotated[
-        list[Path], typer.Argument(help="Recordings of one drive: .csv, .txt, .npz, .parquet, .mat, .h5 ...")
-    ],
+    logs: Annotated[list[Path], typer.Argument(help=_LOGS + " of one drive")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="The axis file, axis.toml.")] = None,
-    motor: Annotated[str | None, typer.Option(help="Column of the motor's position.")] = None,
-    command: Annotated[str | None, typer.Option(help="Column of the command to the drive.")] = None,
+    motor: MotorColumn = None,
+    command: CommandColumn = None,
     reference: Annotated[str | None, typer.Option(help="Column of the position's reference.")] = None,
-    load: Annotated[str | None, typer.Option(help="Column of a second encoder, at the load.")] = None,
-    time: Annotated[str | None, typer.Option(help="Column of the time.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Sample rate of a log without times, Hz.")] = None,
-    motor_unit: Annotated[str | None, typer.Option(help="Where the header does not say it, such as rad or mm.")] = None,
+    load: LoadColumn = None,
+    time: TimeColumn = None,
+    rate: SampleRate = None,
+    motor_unit: MotorUnit = None,
     reference_unit: Annotated[str | None, typer.Option(help="Where it is not that of the position.")] = None,
-    load_unit: Annotated[str | None, typer.Option(help="Where the header does not say it.")] = None,
+    load_unit: LoadUnit = None,
     command_unit: Annotated[str | None, typer.Option(help="Where the header does not say it: N, 'N m', A, V.")] = None,
     scale: Annotated[
         float | None, typer.Option(help="Force (rotary: torque) at the load per unit of the command, N or N m.")

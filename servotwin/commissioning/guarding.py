@@ -56,8 +56,6 @@ class Guarding(NamedTuple):
 def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
     """Derive supervision and limits for a policy that sends gains; None for one that sets the tolerance only.
 
-    The edge tolerates silence of the twin for the time for which its settings are verified.
-
     Parameters
     ----------
     servo : Servo or Axis
@@ -76,7 +74,7 @@ def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guardi
     policy = certified_policy(servo, settings)
     verified = policy.fallback()
     gains, band = gains_of(verified.setting.controller), band_of(verified, noise)
-    fallback = FallbackSet(Setting.of(verified.setting.tolerance, gains, band), policy.horizon)
+    fallback = FallbackSet(Setting.of(verified.setting.tolerance, gains, band), settings.silence)
     supervision = supervision_of(servo, settings, fallback)
     sent = policy_of(servo, settings)
     return Guarding(

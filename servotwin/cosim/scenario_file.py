@@ -112,8 +112,9 @@ GAPS: Mapping[str, Maker] = {"constant": constant_gap, "growing": growing_gap}
 
 def gap_maker(table: Table) -> Maker:
     """Choose the kind of gap that a table describes."""
-    growing = table.values.keys() & {"from_deg", "to_deg", "over_s", "begin_s"}
-    return growing_gap if growing and "total_deg" not in table.values else constant_gap
+    # In whatever unit: keys of another one are refused by name.
+    first = {name.split("_", 1)[0] for name in table.values}
+    return growing_gap if first & {"from", "to", "over", "begin"} and "total" not in first else constant_gap
 
 
 def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:

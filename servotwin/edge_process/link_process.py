@@ -16,7 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from threading import Event, Thread
 from typing import Any
 
@@ -34,6 +34,7 @@ from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Acknowledge, InvalidMessage, Resend, decode, encode
 from servotwin.runtime.frames import FrameSocket
+from servotwin.runtime.locks import locked
 
 _NICE = 10
 STATUS_PERIOD_S = 1.0
@@ -74,7 +75,8 @@ class LinkProcess:
         self._control: frames.StatusFrame | None = None
         self._pending = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
-        self._troubles, self._dropped = TroubleLog(), dict[str, int]()
+        # Counts of earlier processes are in their logs; what a corrupt file has just cost is in none.
+        self._troubles, self._dropped = TroubleLog(), {} if self.outbox.salvages else self._dropped_unintended()
         self._conflict, self._status_trouble = False, ""
 
     def run(self) -> None:
@@ -180,10 +182,13 @@ class LinkProcess:
         if self._receiver is not None:
             self._troubles.update("to the twin", self._session.trouble)
             self._troubles.update("from the twin", self._receiver.trouble)
-        dropped = {why: number for why, number in self.outbox.dropped.items() if why != FILTERED}
-        if dropped != self._dropped:
+            self._troubles.update("windows", self._window_trouble)
+        if (dropped := self._dropped_unintended()) != self._dropped:
             self._dropped = dropped
             log("windows dropped", **dropped)
+
+    def _dropped_unintended(self) -> dict[str, int]:
+        return {why: number for why, number in self.outbox.dropped.items() if why != FILTERED}
 
     def _report_conflict(self) -> None:
         """Tell the control process, once, that another edge of the servo has taken over."""
@@ -258,6 +263,26 @@ class LinkProcess:
         """Reason for which something is not on the disk; empty: all is."""
         return self._status_trouble if self.outbox.flushed else self.outbox.trouble or "not written yet"
 
+    def _limits(self) -> dict[str, int]:
+        """Limits of the twin, as it has told them; 0: it has not."""
+        twin = self._transport.twin if self._transport is not None else None
+        if twin is None:
+            return {"samples_per_window": 0, "bytes_per_day": 0}
+        return {"samples_per_window": twin.samples_per_window, "bytes_per_day": twin.bytes_per_day}
+
+    @property
+    def _window_trouble(self) -> str:
+        """Key of the edge's file by which the twin will refuse windows for their length; empty: there is none."""
+        twin = self._transport.twin if self._transport is not None else None
+        if twin is None or not twin.samples_per_window:
+            return ""
+        agent, most = self._config.agent, twin.samples_per_window
+        lengths = {"window_s": agent.window_s, "longest_window_s": agent.longest_window_s or 0.0}
+        for name, seconds in lengths.items():
+            if (samples := round(seconds * agent.sample_rate)) > most:
+                return f"{name} = {seconds!r} s has {samples} samples; the twin takes at most {most} and refuses longer"
+        return ""
+
     def _status(self) -> dict[str, Any]:
         control, box = self._control, self.outbox
         status: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
@@ -278,6 +303,7 @@ class LinkProcess:
         if self._receiver is not None:
             status["up"] = {"trouble": self._session.trouble, **self._session.counts}
             status["conflict"] = self._conflict
+            status["limits"] = self._limits()
             status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
 
@@ -292,6 +318,20 @@ def _outbox(config: EdgeConfig) -> SqliteOutbox:
     return SqliteOutbox(path, config.agent.servo, files.windows, files.bytes, kept, int(waiting))
 
 
+def run_alone(config: EdgeConfig, end: socket.socket, run: str) -> None:
+    """Run a link process once the one before it has ended.
+
+    Where the control process was killed alone, its link process still stores what it has received: a window that comes
+    into the file after the next one has read it would wait there until the edge is started again.
+    """
+    with ExitStack() as lock:
+        try:
+            lock.enter_context(locked(config.path(f"{config.files.outbox}-link-lock"), wait=True))
+        except OSError as error:
+            log("not locked", error=str(error))
+        LinkProcess(config, end, run).run()
+
+
 def main(arguments: list[str]) -> int:
     """Run as the child of a control process; return the exit code."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
@@ -300,7 +340,7 @@ def main(arguments: list[str]) -> int:
     path, descriptor, run = arguments
     end = socket.socket(fileno=int(descriptor))
     try:
-        LinkProcess(load(path), end, run).run()
+        run_alone(load(path), end, run)
     except Exception as error:
         log("link process failed", error=f"{type(error).__name__}: {error}")
         return 1

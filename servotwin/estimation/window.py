@@ -166,7 +166,8 @@ class Window:
         """
         if self.measured_position is None:
             raise InvalidInput(
-                f"{self.where}the window has no position of the load: only method 'motor_side' does without it"
+                f"{self.where}the window has no position of the load: give it, or method = 'motor_side', which "
+                "needs the motor's angle and the command"
             )
         return self.measured_position
 

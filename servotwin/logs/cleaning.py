@@ -20,6 +20,8 @@ NEAR_TURN = 0.2
 """Of a turn: a jump by a turn is one within so much."""
 WITHIN = 1.01
 """Turns: the range of an angle that wraps."""
+_HELD_CHANGES, _HELD = 50, 0.9  # changes of a channel that is held, and share of them after equally many samples
+_STEPS = (0.1, 0.9)  # quantiles of its steps, which differ
 _WRAPS = 3  # jumps of about one turn that make an angle a wrapped one
 
 
@@ -86,6 +88,8 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
         keep(~_spikes(table[:, place]), f"spikes of {name}")
+    for place, name in enumerate(names, 1):
+        keep(~_repeats(table[:, place]), f"repeats of a {name} that changes every few samples only")
     gaps = _dropouts(table[:, 0])
     if gaps:
         found["pauses longer than five intervals"] = gaps
@@ -126,6 +130,28 @@ def _spikes(values: Array) -> _Mask:
     there, back = steps[:-1], steps[1:]
     lonely = (np.minimum(np.abs(there), np.abs(back)) > _SPIKE * usual) & (np.abs(there + back) < 0.2 * np.abs(there))
     return np.concatenate([[False], lonely & (usual > 0.0), [False]])
+
+
+def _repeats(values: Array) -> _Mask:
+    """Samples that repeat a value because the channel is written more often than it is measured.
+
+    Its values last for the same number of samples at any speed, and change by different steps; those of an encoder
+    with few counts last longer the slower it moves, and change by one count.
+    """
+    repeated = np.zeros(values.size, dtype=np.bool_)
+    changes = np.flatnonzero(np.diff(values)) + 1
+    if changes.size < _HELD_CHANGES:
+        return repeated
+    lengths, steps = np.diff(changes), np.abs(np.diff(values))[changes - 1]
+    usual = int(np.median(lengths))
+    if usual < 2 or np.mean(lengths % usual == 0) < _HELD or np.ptp(np.quantile(steps, _STEPS)) <= 0.1 * steps.mean():
+        return repeated
+    # A channel at rest goes on being measured: of a longer run every so many samples stay.
+    since = (
+        np.arange(values.size) - changes[np.maximum(np.searchsorted(changes, np.arange(values.size), "right") - 1, 0)]
+    )
+    repeated[:] = since % usual != 0
+    return repeated
 
 
 def _dropouts(time: Array) -> int:

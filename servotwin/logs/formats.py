@@ -14,6 +14,9 @@ from servotwin.logs.csv_file import csv_blocks, read_csv, write_csv
 from servotwin.logs.epics_file import looks_like_epics, read_epics
 from servotwin.logs.hdf5_file import read_hdf5
 from servotwin.logs.matlab_file import read_matlab
+from servotwin.logs.mcap_file import read_mcap
+from servotwin.logs.mdf_file import read_mdf
+from servotwin.logs.tdms_file import read_tdms
 
 
 class LogFormat(NamedTuple):
@@ -62,6 +65,7 @@ def _text_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]
 
 
 _HDF5 = LogFormat(read_hdf5, library="h5py", extra="hdf5")
+_MDF = LogFormat(read_mdf, library="asammdf", extra="mdf")
 FORMATS: Mapping[str, LogFormat] = {
     ".csv": LogFormat(read_csv, write_csv, blocks=csv_blocks),
     ".npz": LogFormat(read_npz, write_npz),
@@ -72,6 +76,10 @@ FORMATS: Mapping[str, LogFormat] = {
     ".mat": LogFormat(read_matlab),
     ".h5": _HDF5,
     ".hdf5": _HDF5,
+    ".mf4": _MDF,
+    ".mdf": _MDF,
+    ".tdms": LogFormat(read_tdms, library="nptdms", extra="tdms"),
+    ".mcap": LogFormat(read_mcap, library="mcap", extra="mcap"),
 }
 WRITTEN = tuple(suffix for suffix, each in FORMATS.items() if each.write)
 """Suffixes of the formats that can be written."""

@@ -49,6 +49,8 @@ class Standing(Struct, frozen=True, omit_defaults=True, tag="standing/1"):
         Its number; 0: there is none yet.
     protocol, software : int, str
         Version of the twin's protocol, and of servotwin there.
+    samples_per_window, bytes_per_day : int
+        Most samples of a window, and bytes of the servo's messages in a day, that the twin takes; 0: it does not say.
     """
 
     servo: Name
@@ -56,3 +58,5 @@ class Standing(Struct, frozen=True, omit_defaults=True, tag="standing/1"):
     number: Count = 0
     protocol: Count = 1
     software: Text = ""
+    samples_per_window: Count = 0
+    bytes_per_day: Count = 0

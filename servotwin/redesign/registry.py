@@ -30,6 +30,8 @@ class PolicyOptions(Protocol):
     @property
     def demands(self) -> Demands: ...
     @property
+    def horizon(self) -> float: ...
+    @property
     def table(self) -> str | None: ...
     @property
     def k_dz(self) -> float | None: ...
@@ -67,7 +69,10 @@ def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
     """Make the certified policy; its largest feedforward cancels the largest stated input bias."""
     check_verifiable(servo)
     low, high = options.uncertainty.input_bias
-    return CertifiedPolicy(servo, options.uncertainty, options.demands, feedforward_limit=max(abs(low), abs(high)))
+    limit = max(abs(low), abs(high))
+    return CertifiedPolicy(
+        servo, options.uncertainty, options.demands, feedforward_limit=limit, horizon=options.horizon
+    )
 
 
 def check_verifiable(servo: Plant) -> None:

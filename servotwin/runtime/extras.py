@@ -10,6 +10,7 @@ from servotwin.errors import InvalidInput
 
 EXTRAS = {
     "alembic": ("alembic", "twin"),
+    "asammdf": ("asammdf", "mdf"),
     "asyncua": ("asyncua", "opcua"),
     "control": ("control", "interop"),
     "distributed": ("dask[distributed]", "dask"),
@@ -17,6 +18,8 @@ EXTRAS = {
     "httptools": ("httptools", "twin"),
     "joblib": ("joblib", "maps"),
     "matplotlib": ("matplotlib", "plot"),
+    "mcap": ("mcap", "mcap"),
+    "nptdms": ("npTDMS", "tdms"),
     "paho": ("paho-mqtt", "mqtt"),
     "pandas": ("pandas", "pandas"),
     "psycopg": ("psycopg", "postgres"),
@@ -50,7 +53,9 @@ def require(module: str, purpose: str) -> Any:
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
-        raise missing_extra(error.name or module, purpose) from None
+        # A dependency of the package may be what is missing: the same extra brings it.
+        known = error.name is not None and error.name.partition(".")[0] in EXTRAS
+        raise missing_extra(error.name if known and error.name else module, purpose) from None
 
 
 def check_extra(module: str, purpose: str) -> None:

@@ -140,6 +140,25 @@ class TwinSettings:
             "a setting up, sends it and verifies it afterwards; without the file it verifies before it sends.",
         ),
     ] = None
+    horizon: Annotated[
+        float,
+        key(
+            "horizon_s",
+            minimum=0.0,
+            help="Time for which a certified setting is to hold: it is verified for the gap as the trend lets it grow "
+            "meanwhile.",
+        ),
+    ] = 40.0
+    silence: Annotated[
+        float,
+        key(
+            "silence_s",
+            above=0.0,
+            infinite=True,
+            help="Time for which the twin may leave a window unanswered before an edge of a certified policy falls "
+            "back, as `enroll` writes it into the edge's file; inf: for ever.",
+        ),
+    ] = 40.0
     k_dz: Annotated[
         float | None, key(minimum=0.0, help="Dead-zone gain of Eq 21, for the policy paper; 1 where absent.")
     ] = None

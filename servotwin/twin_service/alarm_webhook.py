@@ -35,6 +35,8 @@ _OLDEST_S = 86400.0
 _WAITING, _KNOWN = 1000, 10_000
 """Alarms that wait, and alarms that are remembered so as not to be repeated."""
 _RETRY = Retry(2.0, 2.0, 300.0)
+OF_ALL = "twin"
+"""Stands for a machine's name in alarms of the twin itself."""
 _Commit = Callable[[WorkResult], Coroutine[Any, Any, bool]]
 
 
@@ -85,6 +87,10 @@ class AlarmWebhook:
             kind = log_kind(record)
             if kind in ALARMS:
                 self._queue(alarm_post(result.servo, kind, record.status, self._wall(), record.version))
+
+    def announce(self, kind: str, sentence: str) -> None:
+        """Queue an alarm of the twin itself, which concerns every machine."""
+        self._queue(alarm_post(OF_ALL, kind, sentence, self._wall()))
 
     async def run(self) -> None:
         """Post what waits."""

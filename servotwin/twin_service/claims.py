@@ -48,6 +48,8 @@ class EdgeClaims:
         Other processes write the store too.
     software : str
         Version of servotwin.
+    samples_per_window, bytes_per_day : int
+        Limits that edges are told; 0: none.
     """
 
     def __init__(
@@ -59,7 +61,10 @@ class EdgeClaims:
         clocks: Clocks,
         shared: bool,
         software: str,
+        samples_per_window: int = 0,
+        bytes_per_day: int = 0,
     ) -> None:
+        self._samples_per_window, self._bytes_per_day = samples_per_window, bytes_per_day
         self._store, self._executor, self._evict, self._metrics = store, executor, evict, metrics
         self._clocks, self._shared, self._software = clocks, shared, software
         self._known: OrderedDict[str, _Known] = OrderedDict()
@@ -98,7 +103,8 @@ class EdgeClaims:
                 newest = await self._take(servo, StoredClaim(claim.run, claim.takes), newest)
         elif claim.held and claim.run != newest.run and claim.held <= newest.number:
             await self._report(servo, claim, newest)
-        return Standing(servo, newest.run, newest.number, PROTOCOL, self._software)
+        limits = self._samples_per_window, self._bytes_per_day
+        return Standing(servo, newest.run, newest.number, PROTOCOL, self._software, *limits)
 
     async def _take(self, servo: str, new: StoredClaim, before: StoredClaim) -> StoredClaim:
         newest = await self._write(servo, partial(self._store.raise_claim, servo, new, new.number))

@@ -136,7 +136,15 @@ class TwinService:
             paused=lambda: bool(self.watch.fault),
         )
         self.claims = EdgeClaims(
-            store, self.executor, self.polls.evict, self.metrics, self.clocks, self._shared, __version__
+            store,
+            self.executor,
+            self.polls.evict,
+            self.metrics,
+            self.clocks,
+            self._shared,
+            __version__,
+            samples_per_window=config.samples_per_window,
+            bytes_per_day=0 if math.isinf(config.megabytes_per_day) else round(config.megabytes_per_day * 1e6),
         )
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
@@ -179,13 +187,15 @@ class TwinService:
         await self.watch.start()
         if not self._shared and not self.watch.fault:
             # The store is locked for this process, so that every lease is one of a process that has ended.
-            await self.executor.run(partial(self.store.release, self._owner))
+            with suppress(StoreUnavailable):  # a full disk: the leases end by themselves
+                await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self.feed.run(), vital=False)
         self._spawn(self.what_if.run())
         if self.webhook is not None:
             self._spawn(self.webhook.run())
+            self._spawn(self._announce_damage(self.webhook))
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -282,8 +292,21 @@ class TwinService:
                 figures = {"lag": round(backlog.lag, 1), "waiting": backlog.messages}
                 if lagging and not before:
                     log.warning("updates lag", extra=figures)
+                    if self.webhook is not None:
+                        # Always in the same words, so that a lag that comes and goes is not posted each time.
+                        longest = (
+                            f"new messages of a servo wait for longer than lag_limit_s = {self.config.lag_limit_s:g} s"
+                        )
+                        self.webhook.announce("lag", longest)
                 if before and not lagging:
                     log.info("updates lag no longer", extra=figures)
+
+    async def _announce_damage(self, webhook: AlarmWebhook) -> None:
+        """Post that the store is damaged, once it is."""
+        while not self.watch.fault:
+            await asyncio.sleep(_REFRESH_S)
+        webhook.announce("store damaged", f"it is not written any more: {self.watch.fault}")
+        await asyncio.Event().wait()
 
     async def _apply_retention(self) -> None:
         """Delete the bodies of windows that are too old: never at the start, where a wrong clock is set right."""

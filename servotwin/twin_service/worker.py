@@ -33,6 +33,8 @@ log = logging.getLogger(__name__)
 
 _START_S = 120.0
 """s that a worker may take until it is ready: it imports and compiles."""
+_START_TRIES = 3
+"""Times that a worker is started before the service gives up its own start."""
 _STOP_S = 5.0
 _COMMAND = (sys.executable, "-m", "servotwin.twin_service.worker")
 
@@ -277,21 +279,36 @@ class WorkerPool:
                 worker.discard()
 
     async def start(self) -> None:
-        """Start all workers.
+        """Start all workers; one that ends meanwhile is replaced, as it would be later.
 
         Raises
         ------
         WorkerLost
-            A worker did not start; the others were stopped.
+            A worker and those in its place did not start; the others were stopped.
         """
         self._workers = set(self._launched) or {self._make() for _ in range(self.size)}
         try:
-            await asyncio.gather(*(worker.start() for worker in self._workers))
+            await asyncio.gather(*(self._start(worker) for worker in list(self._workers)))
         except WorkerLost:
             await self.stop()
             raise
         for worker in self._workers:
             self._idle.put_nowait(worker)
+
+    async def _start(self, worker: WorkerProcess) -> None:
+        for tries_left in reversed(range(_START_TRIES)):
+            try:
+                await worker.start()
+                return
+            except WorkerLost as error:
+                if not tries_left:
+                    raise
+                log.warning("worker replaced", extra={"pid": worker.pid, "why": str(error)})
+            self.lost += 1
+            self._workers.discard(worker)
+            await worker.kill()
+            worker = self._make()
+            self._workers.add(worker)
 
     async def acquire(self) -> WorkerProcess:
         """Wait for an idle worker."""

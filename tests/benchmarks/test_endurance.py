@@ -44,7 +44,10 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
     (tmp_path / "ax-0/status.json").write_text('{"schema": "servotwin-edge-status/1", "boot": "b2", "windows_cut": 7}')
     edge = SimpleNamespace(starts=4, ended_alone=1)
     site: Any = SimpleNamespace(
-        folder=tmp_path, edges={"ax-0": edge}, outbox=lambda servo: tmp_path / servo / "outbox.sqlite"
+        folder=tmp_path,
+        edges={"ax-0": edge},
+        twin=SimpleNamespace(ended_alone=2),
+        outbox=lambda servo: tmp_path / servo / "outbox.sqlite",
     )
     site.stored, site.waiting = lambda: Site.stored(site), lambda: Site.waiting(site)
     witness = Witness(site)
@@ -54,7 +57,7 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
     assert (found.stored, found.boots, found.applied) == (3, 2, 1)
     assert (found.lost_acknowledged, found.holes, found.counted, found.waiting) == (1, 1, 2, 1)
     # Seven were cut in b2 up to its last status: one is stored, one waits.
-    assert (found.starts, found.ended_alone, found.unseen) == (4, 1, 5)
+    assert (found.starts, found.ended_alone, found.twin_ended, found.unseen) == (4, 1, 2, 5)
     assert found.memory == {"twin": (103, 109)}
     with (console := Console(width=120)).capture() as printed:
         console.print(endurance.shown(found))
@@ -79,9 +82,12 @@ def test_a_process_that_ends_without_a_fault_is_counted_once(tmp_path: Path) -> 
             assert member.process is not None
             member.process.wait()
             assert member.pid == 0
+        member.revive()
+        assert member.starts == 1 + alone
         member.kill()
         member.kill()
-        assert (member.starts, member.ended_alone) == (1, alone)
+        member.revive()  # killed by a fault, which starts it itself
+        assert (member.starts, member.ended_alone) == (1 + alone, alone)
 
 
 def test_minutes_are_for_the_endurance_alone() -> None:

@@ -156,6 +156,8 @@ def test_two_encoders_give_the_shaft_and_the_gap(tmp_path):
     assert result.exit_code == 0, result.output
     known = tomllib.loads((tmp_path / "scenario.toml").read_text(encoding="utf-8"))["twin"]["uncertainty"]
     assert 3.0 < known["m_percent"] < known["k_percent"] < known["c_percent"]
+    text = (tmp_path / "axis.toml").read_text(encoding="utf-8")
+    assert all(f"{name} = {known[name]:.3g}" in text for name in ("m_percent", "k_percent", "c_percent"))
     found = json.loads(result.stdout)
     axis = st.Axis.from_file(tmp_path / "axis.toml")
     assert axis.transmission.in_gap == "free"

@@ -179,6 +179,11 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ),
         ("total_deg = 10.0", "total_deg = -1", "gap.total_deg = -1 is not allowed; give a number, at least 0"),
         ("total_deg = 10.0", "from_deg = 1\nto_deg = -1\nover_s = 3", "gap.to_deg = -1 is not allowed"),
+        (
+            "total_deg = 10.0",
+            "from_rad = 0.1\nto_rad = 0.2\nover_s = 3",
+            "'gap.from_deg' is missing (found 'gap.from_rad' instead)",
+        ),
         ("total_deg = 10.0", "total_deg = 1\nto_deg = 3", "unknown key 'gap.to_deg'"),
         ("[gap]", "[controller]\nsample_rate_hz = 3000\n[gap]", "3000.0 Hz does not divide"),
         ("[gap]", "[controller]\nsample_rate = 5000\n[gap]", "unknown key 'controller.sample_rate'"),

@@ -6,7 +6,7 @@ from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 
 import pytest
 from edge_process_parts import SETTINGS, LinkEnd, cut, exchange_all
@@ -15,13 +15,14 @@ from faketwin import FakeTwin
 from servotwin.edge.agent import Agent
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
-from servotwin.edge_process import frames
+from servotwin.edge_process import frames, link_process
 from servotwin.edge_process.config_file import load
-from servotwin.edge_process.link_process import LinkProcess
+from servotwin.edge_process.link_process import LinkProcess, run_alone
 from servotwin.edge_process.monitoring import read_status, write_status
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.messages import Cause, Fallback, Resend, Setting, Standing
 from servotwin.runtime.frames import FrameSocket
+from servotwin.runtime.locks import locked
 
 PATIENCE = 60.0
 EDGE = """
@@ -154,3 +155,70 @@ def test_a_twin_gets_windows_again_a_full_disk_is_said_and_a_corrupt_outbox_is_l
     log = capfd.readouterr().err
     assert '"event":"outbox broken","file":"outbox.sqlite.broken-1","rescued":0,"lost":80' in log
     assert '"event":"windows asked for again","number":2,"why":"restored"' in log
+
+
+def test_an_outbox_is_read_only_after_the_link_process_before_has_ended(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its control process was killed alone: what it stores last must be in the next one's index, or it waits on."""
+    (tmp_path / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9"))
+    ended, began_after_it = Event(), list[bool]()
+
+    class Opened:
+        def __init__(self, *_: object) -> None:
+            began_after_it.append(ended.is_set())
+
+        def run(self) -> None:
+            """End at once."""
+
+    monkeypatch.setattr(link_process, "LinkProcess", Opened)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        running = Thread(target=run_alone, args=(load(tmp_path / "edge.toml"), theirs, "b2-bb"))
+        with locked(tmp_path / "outbox.sqlite-link-lock"):
+            running.start()
+            running.join(0.2)
+            ended.set()
+        running.join(PATIENCE)
+    assert began_after_it == [True]
+    monkeypatch.setattr(link_process, "locked", lambda *_, **__: (_ for _ in ()).throw(OSError("no locks here")))
+    run_alone(load(tmp_path / "edge.toml"), theirs, "b2-bb")
+    assert began_after_it == [True, True]
+
+
+def test_windows_that_an_earlier_link_process_has_dropped_are_not_logged_again(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9"))
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    for _ in range(2):
+        ours, theirs = socket.socketpair()
+        process = LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa")
+        if not process.outbox.dropped:
+            process.outbox.count_dropped("bad_checksum")
+        process._check()
+        process._end_all([])
+        ours.close()
+    assert capfd.readouterr().err.count('"event":"windows dropped","bad_checksum":1') == 1
+
+
+def test_an_edge_says_which_window_is_longer_than_its_twin_takes(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9") + "[window]\nlongest_window_s = 3.0\n")
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    ours, theirs = socket.socketpair()
+    process = LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa")
+    assert process._transport is not None
+    for samples in (0, 300, 299, 99):
+        process._transport.twin = Standing("ax-1", samples_per_window=samples, bytes_per_day=5)
+        process._check()
+    assert (read_status(tmp_path / "status.json") or {})["limits"] == {"samples_per_window": 99, "bytes_per_day": 5}
+    process._end_all([])
+    ours.close()
+    told = [line for line in capfd.readouterr().err.splitlines() if '"where":"windows"' in line]
+    assert "longest_window_s = 3.0 s has 300 samples; the twin takes at most 299" in told[0]
+    assert '"why":"window_s = 1.0 s has 100 samples; the twin takes at most 99' in told[1]
+    assert len(told) == 2

@@ -44,7 +44,7 @@ def window(run: Run) -> Window:
 
 
 def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window: Window) -> None:
-    """To a five-hundredth of its travel; a gap that is 5 % off leaves more, no gap ten times as much."""
+    """To the encoder's rounding; a gap that is 1 % off leaves three times as much, no gap a hundred times."""
     assert window.theta_m is not None
     assert window.voltage is not None
     shaft = ShaftModel(SCREW, Priors(0.1, 0.1, 0.1, 0.1, 1e-3))
@@ -60,9 +60,10 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window:
         changed[0] *= factor
         return float(np.std(problem.misfit(changed, 0.15 * model.speed))) / count
 
-    assert left(1.0) < 2e-3 * float(np.ptp(window.theta_m)) / SCREW.encoder_resolution
-    assert left(0.95) > 1.2 * left(1.0)
-    assert left(0.0) > 10.0 * left(1.0)
+    # With one part of a sample instead of eight it was eight counts, and gaps were off by up to 5 %.
+    assert left(1.0) < 1.0
+    assert left(0.99) > 3.0 * left(1.0)
+    assert left(0.0) > 100.0 * left(1.0)
 
 
 def test_the_twin_of_an_axis_without_a_load_encoder_estimates_its_gap(window: Window) -> None:
@@ -107,7 +108,7 @@ def test_friction_that_falls_with_the_speed_is_refused(window: Window) -> None:
 
 
 def test_a_window_needs_command_and_samples(window: Window) -> None:
-    with pytest.raises(InvalidInput, match="has no voltage"):
+    with pytest.raises(InvalidInput, match="has no command: method 'motor_side' needs the drive"):
         estimate_gap(Window(theta_m=window.theta_m, sample_rate=RATE), SCREW)
     with pytest.raises(InvalidInput, match="needs at least 400"):
         estimate_gap(window.slice(BEGIN, 0.1), SCREW)

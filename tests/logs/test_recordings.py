@@ -345,3 +345,21 @@ def test_wear_over_three_logs_in_calendar_time(tmp_path):
     wrong = CliRunner().invoke(app, ["identify", *map(str, logs), "--dates", "2026-01-01"])
     assert wrong.exit_code == 2
     assert "has 1 dates for 3 logs" in wrong.stderr
+
+
+@pytest.mark.parametrize("held", [["load"], ["motor", "load"]])
+def test_a_channel_that_is_measured_less_often_than_it_is_written_is_thinned(made, held):
+    every = np.arange(made.time.size) // 4 * 4
+    channels = {"motor": made.motor, "load": made.load}
+    channels |= {name: channels[name][every] for name in held}
+    found = cleaned(made.time, channels, {})
+    # Rounding repeats a value now and then: it stays with the samples at which it would have been measured.
+    assert 0.24 < found.time.size / made.time.size < 0.27
+    assert sum(found.found.values()) == made.time.size - found.time.size
+    assert any("load that changes every few samples" in defect or "motor that" in defect for defect in found.found)
+
+
+def test_an_encoder_of_few_counts_is_not_taken_for_one_that_is_held(made):
+    load = np.round(made.load / 0.02) * 0.02
+    found = cleaned(made.time, {"motor": made.motor, "load": load}, {})
+    assert found.time.size == made.time.size

@@ -140,7 +140,7 @@ def test_margin_has_no_map_for_a_limited_voltage():
 
 @pytest.mark.slow
 def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_path):
-    scenario = load(tmp_path, "")
+    scenario = load(tmp_path, "[twin]\nhorizon_s = 7.0\nsilence_s = 90.0\n")
     verified = certified_policy(scenario.model, scenario.twin).fallback()
     agent = scenario.agent_settings()
     fallback = agent.supervision.fallback
@@ -149,7 +149,8 @@ def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_pat
     assert fallback.setting.band == agent.parameters.setting.band == band_of(verified)
     assert agent.parameters.fallback
     assert scenario.start_law == verified.setting.controller
-    assert fallback.silence_s == certified_policy(scenario.model, scenario.twin).horizon
+    assert fallback.silence_s == 90.0
+    assert certified_policy(scenario.model, scenario.twin).horizon == 7.0
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from typing import Any
 
 from mosquitto import free_port
 
+from benchmarks.endurance_site import MACHINE_TOML, TWIN_TOML
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.edge_process.monitoring import read_status
@@ -29,59 +30,6 @@ RATE, WINDOW_S = 500.0, 0.8
 EVERY = 410
 """Samples between changes of the reference: windows follow each other closely."""
 PATIENCE = 240.0
-TWIN = """
-[service]
-port = {port}
-store = "sqlite:///{store}"
-workers = 1
-speed = 2.0
-tokens = "tokens.toml"
-rate_limit_per_s = 1000
-{service}
-[models.paper]
-servo = "paper"
-[models.paper.controller]
-sample_rate_hz = {rate}
-[models.paper.twin]
-policy = "paper"
-k_dz = 1.0
-initial_gap_deg = 2.0
-validity_s = 1000.0
-[servos]
-"ax-*" = "paper"
-"""
-MACHINE = """
-role = "{role}"
-listen = "127.0.0.1:0"
-speed = {speed}
-slack_s = 60.0
-watchdog_s = 0.5
-block_s = 0.1
-[scenario]
-servo = "paper"
-name = "{servo}"
-duration_s = 300.0
-seed = {seed}
-[scenario.reference]
-kind = "square"
-amplitude_mm = 1.0
-period_s = {period}
-[scenario.gap]
-from_deg = 2.0
-to_deg = 20.0
-over_s = 300.0
-[scenario.recording]
-sample_rate_hz = {rate}
-window_s = {window}
-[scenario.controller]
-sample_rate_hz = {rate}
-[scenario.noise]
-std_mm = 0.001
-[scenario.twin]
-initial_gap_deg = 2.0
-policy = "paper"
-k_dz = 1.0
-"""
 WITNESS = """
 CREATE TABLE witness (boot TEXT NOT NULL, sequence INTEGER NOT NULL, UNIQUE (boot, sequence));
 CREATE TRIGGER seen AFTER INSERT ON windows BEGIN INSERT OR IGNORE INTO witness VALUES (new.boot, new.sequence); END;
@@ -180,7 +128,8 @@ class Fleet:
         self.roles = {f"ax-{k}": role for k, role in enumerate(roles)}
         (folder / "tokens.toml").touch(0o600)
         self.database = folder / store
-        text = TWIN.format(port=self.port, rate=RATE, service=service, store=store)
+        keys = f'store = "sqlite:///{store}"\nspeed = 2.0\n{service}'
+        text = TWIN_TOML.format(port=self.port, service=keys, rate=RATE, validity=1000.0)
         (folder / "twin.toml").write_text(text)
         self.twin = Process("twin", folder, folder, ["-m", "servotwin", "twin", "--config", "twin.toml"])
         run = ["-m", "servotwin.edge_process", "edge.toml"]
@@ -225,7 +174,8 @@ class Fleet:
         for number, (servo, role) in enumerate(self.roles.items()):
             # Those that are fast have more windows than the bad link carries at once: theirs come late.
             speed = 1.0 if role == "control" or number % 3 == 0 else 1.6
-            text = MACHINE.format(servo=servo, role=role, seed=number, speed=speed, **known)
+            place = {"listen": "127.0.0.1:0", "speed": speed, "duration": 300.0}
+            text = MACHINE_TOML.format(servo=servo, role=role, seed=number, **place, **known)
             (self.folder / f"{servo}.toml").write_text(text)
         row, log = Path(__file__).with_name("plantrow.py"), self.folder / "machines.log"
         command = [sys.executable, str(row), str(log), *(f"{servo}.toml" for servo in self.roles)]

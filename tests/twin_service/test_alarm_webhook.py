@@ -16,9 +16,9 @@ from service_system import bearer, place, twin_file, window
 from servotwin.cli.alarm_test import post_test_alarm
 from servotwin.errors import InvalidInput
 from servotwin.messages import encode
-from servotwin.store.records import EvidenceRecord, WorkResult
+from servotwin.store.records import Backlog, EvidenceRecord, WorkResult
 from servotwin.store.store import open_store
-from servotwin.twin_service import alarm_webhook
+from servotwin.twin_service import alarm_webhook, service
 from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.service import TwinService
@@ -244,6 +244,35 @@ def test_a_result_that_is_void_announces_nothing(monkeypatch):
         assert webhook.waiting == 1
 
     asyncio.run(body())
+
+
+def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch):
+    posted = []
+
+    async def body():
+        twin = read_twin(with_webhook(tmp_path, "http://127.0.0.1:9/hook"))
+        store = open_store(twin.service.store)
+        system = TwinService(twin, store, pool=WorkerPool(0, twin.start, 30.0))
+        monkeypatch.setattr(system.webhook, "_send", lambda _config, post: posted.append((post.servo, post.text)))
+        late = [Backlog(3, 0, 99.0, lag) for lag in (99.0, 0.0, 98.0)]
+        monkeypatch.setattr(store, "backlog", lambda _now: late.pop(0) if len(late) > 1 else late[0])
+        monkeypatch.setattr(service, "_WATCH_S", 0.01)
+        monkeypatch.setattr(service, "_REFRESH_S", 0.01)
+        try:
+            async with system.http_app().lifespan(), asyncio.timeout(60.0):
+                while len(late) > 1 or len(posted) < 1:
+                    await asyncio.sleep(0.01)
+                system.watch.fault = "page 7 is damaged"
+                while len(posted) < 2:
+                    await asyncio.sleep(0.01)
+        finally:
+            store.close()
+
+    asyncio.run(body())
+    assert posted == [
+        ("twin", "twin: lag: new messages of a servo wait for longer than lag_limit_s = 30 s"),
+        ("twin", "twin: store damaged: it is not written any more: page 7 is damaged"),
+    ]
 
 
 def test_what_a_twin_could_not_process_is_posted(tmp_path):

@@ -39,7 +39,9 @@ async def listen(client: httpx.AsyncClient, held: Held, wait: float) -> int:
 def test_a_copied_folder_is_refused_and_an_alarm_is_stored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def run() -> None:
         async with served(twin_file(tmp_path)) as (system, client):
-            assert await ask(client, EdgeClaim("ax-1", "one")) == Standing("ax-1", "", 0, PROTOCOL, __version__)
+            limits = system.config.samples_per_window, round(1e6 * system.config.megabytes_per_day)
+            told = await ask(client, EdgeClaim("ax-1", "one"))
+            assert told == Standing("ax-1", "", 0, PROTOCOL, __version__, *limits)
             assert (await ask(client, EdgeClaim("ax-1", "one", 0, 1))).run == "one"
             assert await put(client, 0, "one", 1) == 201
             poll = asyncio.create_task(listen(client, Held("one", 1), 20.0))

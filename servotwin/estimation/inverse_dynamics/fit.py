@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -35,7 +35,7 @@ class ParameterFit:
         friction and offset (N; N m), the offset as a force that resists the forward motion.
     values : (p,) array
     covariance : (p, p) array
-        By leaving out one part of the recording after the other.
+        By leaving out one part of the recording after the other; of `identify_drive` also of what a held command does.
     freedom : (p,) array
         Degrees of freedom of the variances.
     relative_error : float
@@ -143,6 +143,12 @@ def fit_models(rows: Rows) -> tuple[ParameterFit, ParameterFit]:
         least_squares(SYMMETRIC, rows.design[:, :ends], rows),
         least_squares(ASYMMETRIC, rows.design[:, ends:], rows),
     )
+
+
+def widened(fit: ParameterFit, other: ParameterFit) -> ParameterFit:
+    """Fit whose covariance also contains its difference to another one that may as well be true."""
+    off = fit.values - other.values
+    return replace(fit, covariance=fit.covariance + np.outer(off, off))
 
 
 def _blocks(times: Array, cycle: float, rows: Array) -> Groups:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import Refinement, refine
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
-from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of
+from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
-from servotwin.estimation.inverse_dynamics.recording import DriveRecording
+from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
 _FITTED = GivenGains()
@@ -74,7 +74,7 @@ def identify_drive(
         A recording does not show the parameters: no motion, one direction or one speed only, a command at its limit, of
         the wrong sign or of something else.
     """
-    used, rows, motions, bands = [], [], [], []
+    used, rows, held, motions, bands = [], [], [], [], []
     for each in recordings:
         checks.check_motion(each)
         band = band_of(each)
@@ -87,12 +87,16 @@ def identify_drive(
         motions.append(motion)
         bands.append(band)
         rows.append(rows_of(each, motion, band, cycle_time(motion)))
+        held.append(rows_of(held_command(each), motion, band, cycle_time(motion)))
     every = joined(rows)
     checks.check_separable(used[0], every)
-    symmetric, asymmetric = fit_models(every)
+    others = fit_models(joined(held))
+    fits = fit_models(every)
+    symmetric, asymmetric = (widened(*both) for both in zip(fits, others, strict=True))
     checks.check_sense(used[0], symmetric)
     law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
-    advice = next_experiment(symmetric, every, motions[0], used[0].unit)
+    # No further motion shows more of what the hold does.
+    advice = next_experiment(fits[0], every, motions[0], used[0].unit)
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
     return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split)

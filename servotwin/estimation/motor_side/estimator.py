@@ -15,9 +15,10 @@ from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
 from servotwin.estimation.motor_side.problem import MotorModel, MotorProblem
 from servotwin.estimation.motor_side.settings import MotorSideSettings
-from servotwin.estimation.motor_side.verdict import JudgedGap, judge
+from servotwin.estimation.motor_side.verdict import judge
 from servotwin.estimation.output_error.fit import search
 from servotwin.estimation.output_error.models import Priors, ShaftModel
+from servotwin.estimation.output_error.verdict import JudgedFit
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import Play
@@ -117,9 +118,12 @@ def estimate(
 
 def _checked(window: Window) -> tuple[Array, Array]:
     """The motor's angle and the command of a window that can be fitted."""
-    for name, channel, unit in (("theta_m", window.theta_m, "rad"), ("voltage", window.voltage, "the drive's unit")):
+    for name, channel, unit in (
+        ("theta_m", window.theta_m, "the motor's angle in rad"),
+        ("command", window.voltage, 'the drive\'s command in its unit, as the channel "voltage"'),
+    ):
         if channel is None:
-            raise InvalidInput(f"{window.where}the window has no {name}: method {METHOD!r} needs it, in {unit}")
+            raise InvalidInput(f"{window.where}the window has no {name}: method {METHOD!r} needs {unit}")
     assert window.theta_m is not None
     assert window.voltage is not None
     if window.theta_m.size < SHORTEST:
@@ -138,7 +142,7 @@ def _problem(window: Window, theta_m: Array, command: Array, axis: Axis, setting
     return MotorProblem(model, axis.p * theta_m, command, interval, axis.p * count)
 
 
-def _stated(blank: GapEstimate, verdict: JudgedGap, unit: float) -> GapEstimate:
+def _stated(blank: GapEstimate, verdict: JudgedFit, unit: float) -> GapEstimate:
     """Fill a blank estimate."""
     made = replace(blank, status=verdict.status, reasons=verdict.reasons)
     if verdict.status is not GapStatus.OK:

@@ -2,9 +2,56 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from servotwin.estimation.output_error.shaft import drive_to, guard, through_sample
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
+
+
+class MotorStep(NamedTuple):
+    """Exact step of the motor over a part of a sample; its states (d,) end with speed and angle at the load.
+
+    Attributes
+    ----------
+    step : (d, d) array
+    by_command, by_force : (d,) arrays
+        Columns of the command and of the shaft's force.
+    friction : float
+        Speed at the load that Coulomb friction takes off in a part at most.
+    """
+
+    step: Array
+    by_command: Array
+    by_force: Array
+    friction: float
+
+
+class LoadStep(NamedTuple):
+    """Step of the load over a part of a sample, `fine` times `interval` (s) long.
+
+    Attributes
+    ----------
+    fine : int
+    interval, half : float
+    flows, steps, push : arrays
+    friction : float
+        Those of `run_shaft`.
+    momentum : (2 n + 3,) array
+        Row of the load's momentum, and what its damper to the ground takes of it per position.
+    ground : (float, float)
+        Stiffness to the ground (N/m, rotary: N m/rad), and constant force (N, rotary: N m) on the load.
+    """
+
+    fine: int
+    interval: float
+    half: float
+    flows: Array
+    steps: Array
+    push: Array
+    friction: float
+    momentum: Array
+    ground: tuple[float, float]
 
 
 @bare
@@ -23,46 +70,63 @@ def momentum(row: Array, state: Array) -> float:
 
 
 @bare
-def step_motor(
-    step: Array,
-    by_command: Array,
-    by_torque: Array,
-    command: float,
-    torque: float,
-    friction: float,
-    motor: Array,
-    ahead: Array,
-) -> None:
-    """States (d,) of the motor one interval later under a constant command and torque, into `ahead`."""
+def step_motor(by: MotorStep, command: float, force: float, motor: Array, ahead: Array) -> None:
+    """States (d,) of the motor one part of a sample later under a constant command and force, into `ahead`."""
     size = motor.size
     for j in range(size):
-        ahead[j] = by_command[j] * command + by_torque[j] * torque
+        ahead[j] = by.by_command[j] * command + by.by_force[j] * force
         for k in range(size):
-            ahead[j] += step[j, k] * motor[k]
-    ahead[size - 2] -= min(max(ahead[size - 2], -friction), friction)
+            ahead[j] += by.step[j, k] * motor[k]
+    ahead[size - 2] -= min(max(ahead[size - 2], -by.friction), by.friction)
+
+
+@bare
+def step_load(by: LoadStep, side: int, begin: float, rate: float, work: Array, state: Array) -> tuple[int, float]:
+    """Advance the load while the motor moves from `begin` at a rate (1/s); return the flank and the shaft's mean force.
+
+    The impulse of the shaft is what the load's momentum gained: exact, whatever happened meanwhile.
+    """
+    n, kept, impulse = (state.size - 3) // 2, state.size - 3, 0.0
+    for k in range(by.fine):
+        now, then = begin + k * by.interval * rate, begin + (k + 1) * by.interval * rate
+        drive_to(state, side, now, rate, by.half, kept)
+        impulse -= momentum(by.momentum, state) - 0.5 * by.interval * by.ground[0] * state[0]
+        side = through_sample(side, now, then, by.interval, by.half, by.flows, by.steps, by.push, work, state)
+        impulse += momentum(by.momentum, state) + by.interval * (0.5 * by.ground[0] * state[0] - by.ground[1])
+        speed = state[2 * n - 1]
+        state[2 * n - 1] = speed - min(max(speed, -by.friction), by.friction)
+    return side, impulse / (by.fine * by.interval)
+
+
+@bare
+def step_both(by: MotorStep, load: LoadStep, side: int, command: float, work: Array, motor: Array, state: Array) -> int:
+    """Advance motor and load by a part of a sample, and return the flank at its end.
+
+    With the force as it begins: where that leads the motor, the load goes with it, and the mean force moves the motor.
+    """
+    ahead, kept, begin = work[-1, : motor.size], state.size - 3, motor[-1]
+    drive_to(state, side, begin, motor[-2], load.half, kept)
+    force = flank_force(side, begin, state, load.push, load.half)
+    step_motor(by, command, -force, motor, ahead)
+    rate = (ahead[-1] - begin) / (load.fine * load.interval)
+    side, force = step_load(load, side, begin, rate, work[:-1], state)
+    step_motor(by, command, -force, motor, ahead)
+    for j in range(motor.size):
+        motor[j] = ahead[j]
+    return side
 
 
 @bare
 def run_motor(
     measured: Array,
     command: Array,
-    fine: int,
-    interval: float,
-    half: float,
-    flows: Array,
-    steps: Array,
-    push: Array,
-    friction: float,
-    work: Array,
-    state: Array,
-    row: Array,
-    ground: tuple[float, float],
-    step: Array,
-    by_command: Array,
-    by_torque: Array,
-    motor_friction: float,
+    parts: int,
+    by: MotorStep,
+    load: LoadStep,
     gains: Array,
+    work: Array,
     motor: Array,
+    state: Array,
     predicted: Array,
     driven: Array,
 ) -> None:
@@ -74,57 +138,30 @@ def run_motor(
         Motor's angle at the load, m or rad.
     command : (N,) array
         Held from each sample to the next, in the actuator's unit.
-    fine : int
-        Parts of a sample that the load needs, each `interval` (s) long.
-    interval, half, flows, steps, push, friction, work, state
-        Those of `run_shaft`, of the load.
-    row : (2 n + 3,) array
-        Momentum of the load, and what its damper to the ground takes of it per position.
-    ground : (float, float)
-        Stiffness to the ground (N/m, rotary: N m/rad), and constant force (N, rotary: N m) on the load.
-    step : (d, d) array
-    by_command, by_torque : (d,) arrays
-        Exact step of the motor's states over one sample, speed and angle at the load the last two, and columns of the
-        command and of the shaft's force.
-    motor_friction : float
-        Speed at the load that the motor's Coulomb friction takes off in one sample at most.
+    parts : int
+        Of a sample, one after the other.
+    by, load : MotorStep, LoadStep
     gains : (2, 2 n + 2) array
         Shares of the measured angle less the predicted one that are added to the motor's angle and speed, and to the
         n positions and speeds of the load: in the gap and in contact.
-    motor : (d,) array
-        At the first sample; changed.
+    work : (19, size) array
+        Scratch; size is that of the larger one of the states.
+    motor, state : arrays
+        States of the motor (d,) and those of `run_shaft` (2 n + 3,) at the first sample; changed.
     predicted, driven : (N,) arrays
         Out: motor's angle, and the driven end.
     """
-    n, kept, size = (state.size - 3) // 2, state.size - 3, motor.size
-    ahead, lead = work[-1], motor[size - 1] - state[kept]
-    side = 0 if abs(lead) <= half else (1 if lead > 0.0 else -1)
+    n, kept = (state.size - 3) // 2, state.size - 3
+    lead = motor[-1] - state[kept]
+    side = 0 if abs(lead) <= load.half else (1 if lead > 0.0 else -1)
     for i in range(measured.size):
-        predicted[i], driven[i] = motor[size - 1], state[kept]
-        error, mode = measured[i] - motor[size - 1], 1 if side != 0 else 0
-        motor[size - 1] += gains[mode, 0] * error
-        motor[size - 2] += gains[mode, 1] * error
+        predicted[i], driven[i] = motor[-1], state[kept]
+        error, mode = measured[i] - motor[-1], 1 if side != 0 else 0
+        motor[-1] += gains[mode, 0] * error
+        motor[-2] += gains[mode, 1] * error
         for j in range(2 * n):
             state[j] += gains[mode, 2 + j] * error
         if i + 1 == measured.size:
             break
-        begin = motor[size - 1]
-        drive_to(state, side, begin, motor[size - 2], half, kept)
-        force = flank_force(side, begin, state, push, half)
-        # With the force as it begins: where that leads the motor, the load goes with it, and the mean force moves it.
-        step_motor(step, by_command, by_torque, command[i], -force, motor_friction, motor, ahead)
-        rate = (ahead[size - 1] - begin) / (fine * interval)
-        impulse = 0.0
-        for k in range(fine):
-            now, then = begin + k * interval * rate, begin + (k + 1) * interval * rate
-            drive_to(state, side, now, rate, half, kept)
-            # The impulse of the shaft is what the load's momentum gained: exact, whatever happened within the sample.
-            impulse -= momentum(row, state) - 0.5 * interval * ground[0] * state[0]
-            side = through_sample(side, now, then, interval, half, flows, steps, push, work[:-1], state)
-            impulse += momentum(row, state) + interval * (0.5 * ground[0] * state[0] - ground[1])
-            speed = state[2 * n - 1]
-            state[2 * n - 1] = speed - min(max(speed, -friction), friction)
-        force = impulse / (fine * interval)
-        step_motor(step, by_command, by_torque, command[i], -force, motor_friction, motor, ahead)
-        for j in range(size):
-            motor[j] = ahead[j]
+        for _ in range(parts):
+            side = step_both(by, load, side, command[i], work, motor, state)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.motor_side.settings import MotorSideSettings
 from servotwin.estimation.output_error.fit import Fit, Search, descend, one_flank
 from servotwin.estimation.output_error.models import HALF
-from servotwin.estimation.output_error.verdict import differing_halves, grown, unusual_numbers
+from servotwin.estimation.output_error.verdict import JudgedFit, differing_halves, grown, unusual_numbers
 
 _BELIEVED = 60.0  # rise of the cost without the gap, or without the second flank, over the noise's variance
 _RIVAL = 30.0  # the same of another gap that explains the window as well
@@ -23,38 +22,20 @@ _AROUND = (0.01, 0.03, 0.08, 0.2)  # of a gap, either way: where the cost is loo
 _STEPS = 5
 
 
-@dataclass(frozen=True)
-class JudgedGap:
-    """Status of a gap with its spread, all of the half gap at the load.
-
-    Attributes
-    ----------
-    status : GapStatus
-    half, std, std_total : float
-    reasons : tuple of str
-    """
-
-    status: GapStatus
-    half: float = math.nan
-    std: float = math.inf
-    std_total: float = math.inf
-    reasons: tuple[str, ...] = ()
-
-
-def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedGap:
+def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedFit:
     """Decide on a fit; `unit` is the total gap at the motor (rad) per half gap at the load, for the words."""
     best, problem = found.best, found.problem
     half = float(best.values[HALF])
     shut = _shut(found)
     left = float(np.std(best.raw) / np.std(shut.raw))
     if reason := _unseen(found, shut, left, settings):
-        return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=(reason,))
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(reason,))
     mismatches = unusual_numbers(found) + _unusual_friction(found) + differing_halves(found, settings.gap_rate / unit)
     if mismatches:
-        return JudgedGap(GapStatus.MODEL_MISMATCH, reasons=mismatches)
+        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     std = best.std(HALF, found.free)
     if math.isinf(std):
-        return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=("the measurements do not depend on the gap",))
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=("the measurements do not depend on the gap",))
     rivals = _rivals(found, half) / NORMAL_95
     model = math.hypot(settings.model_share, _MISLED * left) * half
     total = math.hypot(
@@ -64,8 +45,8 @@ def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedGap:
     if math.hypot(_DOUBT * std, rivals) > allowed:
         known, limit = math.degrees(unit * math.hypot(_DOUBT * std, rivals)), math.degrees(unit * allowed)
         words = f"the gap is known to {known:.3g} deg only, and {limit:.3g} deg are allowed"
-        return JudgedGap(GapStatus.UNIDENTIFIABLE, reasons=(words,))
-    return JudgedGap(GapStatus.OK, half, math.hypot(_DOUBT * std, rivals), total)
+        return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(words,))
+    return JudgedFit(GapStatus.OK, half, math.hypot(_DOUBT * std, rivals), total)
 
 
 def _unusual_friction(found: Search) -> tuple[str, ...]:

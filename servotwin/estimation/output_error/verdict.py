@@ -44,10 +44,10 @@ class JudgedFit:
     """
 
     status: GapStatus
-    half: float
-    std: float
-    std_total: float
-    reasons: tuple[str, ...]
+    half: float = math.nan
+    std: float = math.inf
+    std_total: float = math.inf
+    reasons: tuple[str, ...] = ()
 
 
 def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFit:
@@ -59,7 +59,7 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFi
     total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count, growth)
     mismatches = _mismatches(found, settings.gap_rate / unit)
     if mismatches:
-        return JudgedFit(GapStatus.MODEL_MISMATCH, math.nan, math.inf, math.inf, mismatches)
+        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     single = one_flank(found)
     rise = (single.cost - best.cost) / best.variance()
     if rise < _BELIEVED:
@@ -67,7 +67,7 @@ def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFi
         enough = bound > _BOUND_COUNTS * problem.count
         words = "one flank explains the window nearly as well as two"
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
-        return JudgedFit(status, 0.5 * bound if enough else math.nan, math.inf, math.inf, (words,))
+        return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
     doubts = tuple(filter(None, (_wide(found, half, std, settings, unit), _rival(found, half, total, unit))))
     status = GapStatus.UNIDENTIFIABLE if doubts else GapStatus.OK
     return JudgedFit(status, math.nan if doubts else half, std, total, doubts)

@@ -24,6 +24,7 @@ def test_a_simulated_loop_gives_its_parameters_and_its_gains(integral_time):
         assert drive.refinement.symmetric[name] == pytest.approx(true, rel=1e-3), name
         # Derivatives and the held command cost a per cent, at 500 Hz.
         assert drive.symmetric[name] == pytest.approx(true, rel=0.02), name
+        assert abs(drive.symmetric[name] - true) <= drive.symmetric.half_width(name), name
     assert drive.law.integral_time == (None if integral_time is None else pytest.approx(integral_time, rel=1e-3))
     for name, true in GAINS.items():
         assert getattr(drive.law, name) == pytest.approx(true, rel=1e-3), name

@@ -1,0 +1,217 @@
+"""The gap between two encoders whose load swings, sticks and winds up: `gap_of_driven_load`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.estimation.core.whitening import burg
+from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, slowest_and_fastest
+from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
+from servotwin.estimation.estimate import NORMAL_95, GapStatus
+from servotwin.estimation.kinematic.lost_motion import LostMotion
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.strokes import counts_of, play_and_side
+from servotwin.estimation.kinematic.wind_up import TransmissionGap
+from servotwin.estimation.output_error.models import DELAY, HALF
+from servotwin.plant.signals import Array
+
+MODEL = "two masses"
+"""`model_kind` of an answer that this model gave."""
+_MOST = 10_000  # samples, from the first on
+_LEAST = 6  # strokes within them
+_FOLDS = 8  # parts of the recording, whose errors are compared
+_EVIDENCE = 2.0  # standard errors
+_BETTER = 0.5  # of the error of a model without dynamics: a larger one is no evidence for dynamics
+_OTHERS = (0.8, 1.25)  # gaps over the best one that the recording must rule out
+_COUNTS = 2.0  # that a model may leave, white or not
+_WHITE = 0.5  # of the variance of what is left, which its past must not predict
+_AT_BOUND = 0.98
+_WIDEST = 0.3  # of the gap: half an interval
+_STEPS = 12
+
+
+class DrivenGap(NamedTuple):
+    """What a model with dynamics says of a recording.
+
+    Attributes
+    ----------
+    gap : TransmissionGap or None
+        None: the recording does not show it, for the reason given.
+    dynamics : LoadDynamics or None
+        None: nothing was fitted.
+    reason : str
+    """
+
+    gap: TransmissionGap | None
+    dynamics: LoadDynamics | None
+    reason: str
+
+
+def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenGap:
+    """Fit a load behind play and spring to the motor's and the load's motion, and judge if it shows the gap.
+
+    While the load swings freely in the gap, nothing but its friction brakes it; while the transmission winds up, the
+    spring drives it. A recording that is fast enough tells one from the other, and the gap from the wind-up by
+    friction. The frequency, dampings and friction of the load are fitted with the gap.
+
+    Parameters
+    ----------
+    recording : EncoderRecording
+        Its first 10 000 samples count.
+    lost : LostMotion
+        Its answer without dynamics: ratio, lag and cyclic errors.
+    """
+    if not math.isfinite(lost.ratio) or lost.ratio == 0.0:
+        return DrivenGap(None, None, "the load does not follow the motor")
+    piece = _first(recording)
+    strokes = sum(each.time <= piece.time[-1] for each in lost.local) or _strokes(piece)
+    if strokes < _LEAST:
+        return DrivenGap(
+            None, None, f"{strokes} strokes in {_MOST} samples are too few to see how the load moves: move faster"
+        )
+    cycles = lost.cycles if "cyclic" in lost.model else ()
+    problem = DrivenLoad(LoadDynamics(1.0, 1.0, 1.0), piece, lost.ratio, 0.0, cycles)
+    quasi_static = _quasi_static(problem, lost)
+    found = best_fit(problem, quasi_static, strokes)
+    if found is None:
+        return DrivenGap(None, None, "too few samples a stroke to see how the load moves: record faster")
+    counts = _counts(recording, abs(lost.ratio))
+    reason = _doubt(found, quasi_static, counts)
+    slower = found.again(_STEPS, rate=SLOWER * found.rate)
+    # Friction is never as constant as the model has it: as with a known machine, what it winds up is doubtful.
+    half = math.hypot(NORMAL_95 * _std(found, slower, counts), found.lost - found.gap)
+    if not reason and half > _WIDEST * found.gap:
+        reason = f"the gap is known to {100.0 * half / found.gap:.0f} % only with the load's dynamics"
+    if reason:
+        return DrivenGap(None, found.dynamics, reason)
+    return DrivenGap(_answer(found, half, lost), found.dynamics, "")
+
+
+def with_dynamics(recording: EncoderRecording, found: TransmissionGap) -> TransmissionGap:
+    """The gap that the load's dynamics show where the motion alone does not; else what is known, and the reason."""
+    if found.ok or found.status is GapStatus.LOWER_BOUND:
+        return found
+    driven = gap_of_driven_load(recording, found.lost)
+    if driven.gap is not None:
+        return driven.gap
+    *others, last = found.reasons or ("",)
+    reasons = (*others, f"the load's dynamics do not show the gap: {driven.reason}", last)
+    return replace(found, reasons=tuple(reason for reason in reasons if reason))
+
+
+def _first(recording: EncoderRecording) -> EncoderRecording:
+    part = slice(0, _MOST)
+    return replace(recording, time=recording.time[part], motor=recording.motor[part], load=recording.load[part])
+
+
+def _strokes(piece: EncoderRecording) -> int:
+    side = np.zeros(piece.motor.size, dtype=np.int8)
+    play_and_side(piece.motor, 0.1 * float(np.ptp(piece.motor)), side)
+    return int(np.count_nonzero(np.diff(side[side != 0]))) + 1
+
+
+def _quasi_static(problem: DrivenLoad, lost: LostMotion) -> Array:
+    """(N,) load that the model without dynamics predicts."""
+    gap = lost.at_load if math.isfinite(lost.at_load) else 0.0
+    place = play_and_side(problem.drive, gap, np.zeros(problem.drive.size, dtype=np.int8))
+    late = np.interp(np.arange(place.size) - lost.lag / problem.interval, np.arange(place.size), place)
+    return np.asarray(late - np.mean(late - problem.position))
+
+
+def _doubt(found: LoadFit, quasi_static: Array, counts: float) -> str:
+    """Reason not to believe the fit; empty: none. `counts` is one of both encoders, at the load."""
+    problem = found.problem
+    bare = problem.quasi_static_misfit(quasi_static, found.rate)
+    if not found.rms < _BETTER * float(np.std(bare)) or not _worse(bare, found.fit.raw):
+        return "a load on a spring predicts its motion no better than play alone"
+    fastest = slowest_and_fastest(problem, 1)[1]
+    if found.dynamics.frequency > fastest:
+        rate = found.dynamics.frequency / fastest / problem.interval
+        return f"the load swings too fast for the recording: record at {rate:.2g} Hz or more"
+    limits = problem.limits()
+    bound = [
+        unknown.name
+        for unknown, value, limit in zip(problem.model.unknowns, found.fit.values, limits, strict=True)
+        if math.isfinite(limit) and (value if unknown.unit == "damping" else abs(value)) > _AT_BOUND * limit
+    ]
+    if bound:
+        return f"the fit of the load's dynamics ends at a bound ({', '.join(bound)})"
+    if found.rms > _COUNTS * counts and burg(found.fit.raw[None], 24).unpredicted < _WHITE:
+        return "the load on a spring leaves more than noise: it has other dynamics too"
+    for other in _OTHERS:
+        tried = found.split(other * found.gap, _STEPS, gap_free=False)
+        if not _worse(tried.fit.raw, found.fit.raw):
+            return (
+                f"gap and wind-up by friction look alike here, also with the load's dynamics: {100.0 * other:.0f} % of "
+                "the gap explain the recording as well; record faster reversals too"
+            )
+    return ""
+
+
+def _worse(raw: Array, best: Array) -> bool:
+    """True where errors are larger than the best ones, by more than their ratio differs between parts."""
+    raws, bests = (
+        np.array([np.mean(part**2) for part in np.array_split(each, _FOLDS)]) + np.finfo(float).tiny
+        for each in (raw, best)
+    )
+    gain = np.log(raws / bests)
+    return bool(gain.mean() > _EVIDENCE * gain.std(ddof=1) / math.sqrt(_FOLDS))
+
+
+def _std(found: LoadFit, slower: LoadFit, counts: float) -> float:
+    """Standard deviation of the gap at the load.
+
+    Errors of neighbouring samples may be alike: parts of the recording show by how much more they change the gap than
+    as many independent ones. What another observer finds counts as one standard deviation, and counts of the
+    encoders, which are the same at every reversal, as what they are.
+    """
+    rows, residual = found.fit.rows[:, : found.fit.raw.size], found.fit.residual[: found.fit.raw.size]
+    free = np.flatnonzero(found.problem.free & (np.linalg.norm(rows, axis=1) > 0.0))
+    scaled = rows[free] / np.linalg.norm(rows[free], axis=1)[:, None]
+    inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-12)
+    slopes = np.array(
+        [
+            part @ left
+            for part, left in zip(np.array_split(scaled, _FOLDS, axis=1), np.array_split(residual, _FOLDS), strict=True)
+        ]
+    )
+    at = int(np.flatnonzero(free == HALF)[0])
+    of_parts = inverse[at] @ (slopes.T @ slopes) @ inverse[at] * _FOLDS / (_FOLDS - 1.0)
+    single = max(float(of_parts), float(inverse[at, at]))
+    statistical = 2.0 * found.scale * math.sqrt(single) / float(np.linalg.norm(rows[HALF]))
+    return math.hypot(statistical, slower.gap - found.gap, counts / math.sqrt(12.0))
+
+
+def _counts(recording: EncoderRecording, ratio: float) -> float:
+    motor, load = counts_of(recording)
+    return math.hypot(motor * ratio, load)
+
+
+def _answer(found: LoadFit, half: float, lost: LostMotion) -> TransmissionGap:
+    ratio = lost.ratio * found.scale
+    at_motor, total, half, std = (each / abs(ratio) for each in (found.gap, found.lost, half, half / NORMAL_95))
+    wound = total - at_motor
+    dynamics = found.dynamics
+    frequency = dynamics.frequency / (2.0 * math.pi)
+    reason = (
+        f"the load swings at {frequency:.4g} Hz; {wound:.3g} of the lost motion of {total:.4g}, at the motor, are "
+        "wind-up by its friction, which its dynamics tell from the gap"
+    )
+    shown = replace(
+        lost,
+        at_motor=total,
+        std_motor=std,
+        interval_motor=(max(total - half, 0.0), total + half),
+        ratio=ratio,
+        lag=float(found.fit.values[DELAY]),
+        status=GapStatus.OK,
+        reasons=(),
+        model=MODEL,
+        rms=found.rms,
+    )
+    interval = (max(at_motor - half, 0.0), at_motor + half)
+    return TransmissionGap(shown, at_motor, std, interval, GapStatus.OK, (reason,))

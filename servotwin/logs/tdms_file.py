@@ -1,0 +1,52 @@
+"""TDMS files of LabVIEW, by npTDMS: every channel of numbers is a column, with its unit in the name."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from servotwin.errors import InvalidInput
+from servotwin.logs.columns import LogColumns
+from servotwin.logs.own_times import TimedChannel, one_table, with_unit
+from servotwin.runtime.extras import require
+
+
+def read_tdms(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read channels by name, group/channel where there are several groups.
+
+    Channels with a sample interval (waveforms) have times; without one the log has none but those of a channel.
+
+    Raises
+    ------
+    InvalidInput
+        npTDMS is not installed, or the file is damaged.
+    """
+    nptdms = require("nptdms", f"log {path}")
+    try:
+        with path.open("rb") as opened, nptdms.TdmsFile.open(opened) as file:
+            groups = [group for group in file.groups() if group.channels()]
+            channels = {_name(channel, len(groups) > 1): channel for group in groups for channel in group.channels()}
+            if not any("wf_increment" in channel.properties for channel in channels.values()):
+                found = {name: channel[:] for name, channel in channels.items() if name in requested}
+                return LogColumns(found, tuple(channels), {})
+
+            def channel_of(name: str) -> TimedChannel:
+                channel = channels[name]
+                interval = float(channel.properties.get("wf_increment", np.nan))
+                begin = float(channel.properties.get("wf_start_offset", 0.0))
+                time = np.asarray(begin + interval * np.arange(len(channel)), dtype=np.float64)
+                return TimedChannel(time, channel[:])
+
+            return one_table(tuple(channels), requested, channel_of)
+    # The library raises whatever a damaged file leads to.
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InvalidInput(f"log {path}: is not a TDMS file that can be read ({reason})") from None
+
+
+def _name(channel: Any, grouped: bool) -> str:
+    name = f"{channel.group_name}/{channel.name}" if grouped else str(channel.name)
+    return with_unit(name, str(channel.properties.get("unit_string", "")))

@@ -1,0 +1,124 @@
+"""A folder of an edge that was copied: both link processes run against a twin's service, over HTTP."""
+
+import shutil
+import socket
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from edge_process_parts import cut
+from service_system import TOKEN, twin_file
+from services import service
+
+from servotwin.edge_process import frames
+from servotwin.edge_process.config_file import load
+from servotwin.edge_process.link_process import LinkProcess
+from servotwin.edge_process.monitoring import read_status
+from servotwin.runtime.frames import FrameSocket
+
+PATIENCE = 60.0
+EDGE = """
+servo = "ax-1"
+role = "supervise"
+sample_rate_hz = 100.0
+[drive]
+kind = "simulated"
+address = "unix:nothing.sock"
+[retry]
+first_s = 0.05
+longest_s = 0.2
+[twin]
+url = "{url}"
+token_file = "token"
+wait_s = 0.5
+"""
+
+
+class Edge:
+    """A link process in a thread, and the control process's end."""
+
+    def __init__(self, folder: Path, run: str) -> None:
+        self.folder, self.run, (ours, theirs) = folder, run, socket.socketpair()
+        self.pipe, self.sent, self.superseded = FrameSocket(ours), 0, False
+        self.thread = Thread(target=LinkProcess(load(folder / "edge.toml"), theirs, run).run)
+        self.thread.start()
+
+    def send(self) -> None:
+        self.pipe.post(frames.encode(frames.window_frame(cut(self.sent), self.run, self.sent + 1)))
+        self.sent += 1
+        while self.pipe.backlog:
+            self.pipe.send()
+
+    def heard(self) -> bool:
+        """True once the control process was told that another edge has taken over."""
+        found = [frames.to_control(data) for data in self.pipe.receive()]
+        self.superseded |= any(isinstance(frame, frames.SupersededFrame) for frame in found)
+        return self.superseded
+
+    @property
+    def status(self) -> dict:
+        return read_status(self.folder / "status.json") or {}
+
+
+@contextmanager
+def edge(folder: Path, run: str) -> Iterator[Edge]:
+    one = Edge(folder, run)
+    try:
+        yield one
+    finally:
+        one.pipe.close()
+        one.thread.join(PATIENCE)
+
+
+def until(condition: Callable[[], bool]) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) -> None:
+    """The copy takes over; the first one sends nothing more, keeps its window, and both say so; nothing is mixed."""
+
+    def asked(text: str) -> list[tuple]:
+        with closing(sqlite3.connect(f"file:{tmp_path / 'twin.db'}?mode=ro", uri=True)) as database:
+            return database.execute(text).fetchall()
+
+    def stored() -> set[tuple[str, int]]:
+        return set(asked("SELECT boot, sequence FROM messages WHERE kind = 'window'"))
+
+    config = twin_file(tmp_path, 'store = "sqlite:///twin.db"')
+    first, copy = tmp_path / "first", tmp_path / "copy"
+    first.mkdir()
+    with service(config) as url:
+        (first / "edge.toml").write_text(EDGE.format(url=url))
+        (first / "token").touch(0o600)
+        (first / "token").write_text(TOKEN)
+        with edge(first, "b1-aa") as one:
+            one.send()
+            until(lambda: stored() == {("b1-aa", 0)})
+            until(lambda: (first / "status.json").exists())
+            shutil.copytree(first, copy)
+            with edge(copy, "b2-bb") as two:
+                two.send()
+                until(lambda: ("b2-bb", 0) in stored())
+                one.send()
+                until(one.heard)
+                until(lambda: one.status.get("conflict") is True and one.status["windows"]["waiting"] == 1)
+                two.send()
+                until(lambda: ("b2-bb", 1) in stored())
+                assert two.status["conflict"] is False
+                alarm = "SELECT status FROM evidence WHERE kind = 'alarm'"
+                until(lambda: bool(asked(alarm)))
+                assert asked(alarm) == [
+                    ("conflict: two edges of this servo run, b1-aa and b2-bb; the newer one counts",)
+                ]
+        assert stored() == {("b1-aa", 0), ("b2-bb", 0), ("b2-bb", 1)}
+        with edge(first, "b3-cc") as again:  # an operator starts the right one again: what waited is not lost
+            until(lambda: ("b1-aa", 1) in stored())
+            assert again.status.get("conflict") is not True

@@ -1,0 +1,84 @@
+"""Gaps between two encoders, told from wind-up by friction with the load's dynamics."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recordings import recording
+
+from servotwin.estimation.driven_load.estimate import MODEL, gap_of_driven_load, with_dynamics
+from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.kinematic.lost_motion import LostMotion
+from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.wind_up import gap_within
+
+GAP, FREQUENCY, FRICTION = 0.02, 60.0, 0.002  # rad, rad/s, rad: the wind-up is a fifth of the gap
+UNKNOWN = LostMotion(math.nan, math.inf, (0.0, math.inf), 1.03, 0.0, GapStatus.MODEL_MISMATCH, ("it swings",))
+
+
+def swinging(seconds=6.0, rate=250.0, speed=1.0):
+    """A weakly damped load that swings through its gap, both positions counted."""
+    time = np.arange(0.0, seconds, 1.0 / rate)
+    motor = 0.2 * np.sin(4.0 * speed * time) + 0.08 * np.sin(10.3 * speed * time + 1.0)
+    load = LoadDynamics(FREQUENCY, 0.05, FRICTION, 0.01)
+    blank = EncoderRecording(time, motor, np.zeros(time.size))
+    problem = DrivenLoad(load, blank, 1.0, 0.0, ())
+    values = problem.model.start(0.5 * GAP, 0.0, (0.0, 0.0))
+    moved = problem.misfit(values)
+    count = 2e-5
+    return replace(blank, motor=np.round(motor / count) * count, load=np.round((moved + 0.5) / count) * count)
+
+
+@pytest.fixture(scope="module")
+def made():
+    return swinging()
+
+
+@pytest.fixture(scope="module")
+def found(made):
+    return gap_of_driven_load(made, UNKNOWN)
+
+
+def test_the_gap_is_told_from_the_wind_up_of_an_unknown_load(found):
+    assert found.reason == ""
+    assert found.gap.ok
+    assert found.gap.gap_motor == pytest.approx(GAP, rel=2e-3)
+    low, high = found.gap.interval_motor
+    assert low < GAP < high
+    assert found.gap.lost.at_motor == pytest.approx(GAP + 2.0 * FRICTION, rel=0.02)
+    assert found.gap.lost.ratio == pytest.approx(1.0, rel=1e-3)
+    assert found.gap.lost.model == MODEL
+
+
+def test_the_dynamics_of_the_load_are_found_too(found):
+    assert found.dynamics.frequency == pytest.approx(FREQUENCY, rel=5e-3)
+    assert found.dynamics.friction == pytest.approx(FRICTION, rel=2e-2)
+
+
+def test_friction_is_never_so_well_known_that_its_wind_up_does_not_widen_the_interval(found):
+    low, high = found.gap.interval_motor
+    assert 0.5 * (high - low) >= 2.0 * 0.9 * FRICTION
+
+
+def test_slow_strokes_without_dynamics_show_no_gap():
+    made = recording(seconds=4.0, rate=50.0)
+    lost = LostMotion(0.05, 1e-4, (0.049, 0.051), 0.1, 0.0, GapStatus.OK)
+    known = with_dynamics(made, gap_within(lost, None))
+    assert known.status is GapStatus.LOST_MOTION
+    assert math.isnan(known.gap_motor)
+    assert "the load's dynamics do not show the gap" in known.reasons[0]
+
+
+def test_too_few_strokes_are_said_to_be_too_few(made):
+    short = replace(made, time=made.time[:200], motor=made.motor[:200], load=made.load[:200])
+    answer = gap_of_driven_load(short, UNKNOWN)
+    assert answer.gap is None
+    assert "too few" in answer.reason
+
+
+def test_a_gap_that_is_known_is_left_as_it_is(made):
+    lost = LostMotion(0.05, 1e-4, (0.049, 0.051), 0.1, 0.0, GapStatus.OK)
+    known = gap_within(lost, 0.0)
+    assert with_dynamics(made, known) is known
