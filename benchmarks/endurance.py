@@ -180,7 +180,8 @@ def endure(
     folder = Path(mkdtemp(prefix="endure-"))
     with console.status(f"{minutes:g} minutes of faults"):
         outcome = _outcome(Site(folder, _free_port(), minutes), minutes, seed)
-    if outcome.waiting or outcome.lost_acknowledged or outcome.holes or outcome.unseen:
+    failed = outcome.waiting or outcome.lost_acknowledged or outcome.holes or outcome.unseen
+    if failed or outcome.ended_alone or outcome.twin_ended:
         console.print(f"[dim]the files are kept: {folder}[/]")
     else:
         shutil.rmtree(folder)

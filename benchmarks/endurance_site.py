@@ -106,7 +106,7 @@ class Member:
         self._folder, self._log, self._command = folder, log, [sys.executable, *arguments]
         self.process: subprocess.Popen[bytes] | None = None
         self.starts = self.ended_alone = 0
-        self._running = False
+        self._running, self._clock_s = False, 0.0
 
     @property
     def pid(self) -> int:
@@ -116,7 +116,7 @@ class Member:
     def start(self, clock_s: float = 0.0) -> None:
         """Start, on a clock that is ahead."""
         environment = {**os.environ, "PYTHONPATH": _python_path(self._log.parent), "BENCH_CLOCK_S": str(clock_s)}
-        self.starts, self._running = self.starts + 1, True
+        self.starts, self._running, self._clock_s = self.starts + 1, True, clock_s
         with self._log.open("ab") as log:
             self.process = subprocess.Popen(
                 self._command, cwd=self._folder, stdout=log, stderr=log, env=environment, start_new_session=True
@@ -126,7 +126,7 @@ class Member:
         """Start it again where it has ended without a fault, as a service manager would."""
         if self._running and not self.pid:
             self.kill()
-            self.start()
+            self.start(self._clock_s)
 
     def kill(self) -> None:
         """Kill it and its children."""

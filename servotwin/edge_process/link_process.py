@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
 
@@ -37,6 +38,7 @@ from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
 
 _NICE = 10
+_PREDECESSOR_S, _LOCK_S = 30.0, 0.05  # how long a link process waits for the end of the one before, and how often
 STATUS_PERIOD_S = 1.0
 _SHORTEST_POLL_S = 0.1
 """Time between two empty polls: a twin that is about to end answers a poll at once."""
@@ -322,14 +324,31 @@ def run_alone(config: EdgeConfig, end: socket.socket, run: str) -> None:
     """Run a link process once the one before it has ended.
 
     Where the control process was killed alone, its link process still stores what it has received: a window that comes
-    into the file after the next one has read it would wait there until the edge is started again.
+    into the file after the next one has read it would wait there until the edge is started again. One that hangs, on a
+    dead disk for one, is waited for only so long.
     """
     with ExitStack() as lock:
         try:
-            lock.enter_context(locked(config.path(f"{config.files.outbox}-link-lock"), wait=True))
+            _enter(lock, config.path(f"{config.files.outbox}-link-lock"))
         except OSError as error:
             log("not locked", error=str(error))
         LinkProcess(config, end, run).run()
+
+
+def _enter(lock: ExitStack, path: Path) -> None:
+    """Wait for the lock and hold it; BlockingIOError after `_PREDECESSOR_S`."""
+    until, told = time.monotonic() + _PREDECESSOR_S, False
+    while True:
+        try:
+            lock.enter_context(locked(path))
+            return
+        except BlockingIOError:
+            if time.monotonic() >= until:
+                raise BlockingIOError(f"the link process before has not ended within {_PREDECESSOR_S:g} s") from None
+            if not told:
+                log("not locked", error="the link process before still runs; waiting for its end")
+                told = True
+        time.sleep(_LOCK_S)
 
 
 def main(arguments: list[str]) -> int:

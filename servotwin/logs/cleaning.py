@@ -1,4 +1,4 @@
-"""Cleaning of recorded samples: what is wrong is mended or left out, and counted; nothing is refused for one sample."""
+"""Cleaning of recorded samples: what is wrong is mended, left out or counted; nothing is refused for one sample."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ NEAR_TURN = 0.2
 WITHIN = 1.01
 """Turns: the range of an angle that wraps."""
 _HELD_CHANGES, _HELD = 50, 0.9  # changes of a channel that is held, and share of them after equally many samples
+_MEASURED = ("motor", "load")  # commands and references are held on purpose
 _STEPS = (0.1, 0.9)  # quantiles of its steps, which differ
 _WRAPS = 3  # jumps of about one turn that make an angle a wrapped one
 
@@ -88,8 +89,11 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
         keep(~_spikes(table[:, place]), f"spikes of {name}")
+    # Counted only: to leave them out would cost every other channel its samples. What a hold delays is the fit's lag.
     for place, name in enumerate(names, 1):
-        keep(~_repeats(table[:, place]), f"repeats of a {name} that changes every few samples only")
+        held = _repeats(table[:, place]) if name in _MEASURED else 0
+        if held:
+            found[f"repeats of a {name} that is written more often than it is measured"] = held
     gaps = _dropouts(table[:, 0])
     if gaps:
         found["pauses longer than five intervals"] = gaps
@@ -132,26 +136,21 @@ def _spikes(values: Array) -> _Mask:
     return np.concatenate([[False], lonely & (usual > 0.0), [False]])
 
 
-def _repeats(values: Array) -> _Mask:
-    """Samples that repeat a value because the channel is written more often than it is measured.
+def _repeats(values: Array) -> int:
+    """Number of samples that repeat a value because the channel is written more often than it is measured.
 
     Its values last for the same number of samples at any speed, and change by different steps; those of an encoder
     with few counts last longer the slower it moves, and change by one count.
     """
-    repeated = np.zeros(values.size, dtype=np.bool_)
     changes = np.flatnonzero(np.diff(values)) + 1
     if changes.size < _HELD_CHANGES:
-        return repeated
+        return 0
     lengths, steps = np.diff(changes), np.abs(np.diff(values))[changes - 1]
     usual = int(np.median(lengths))
     if usual < 2 or np.mean(lengths % usual == 0) < _HELD or np.ptp(np.quantile(steps, _STEPS)) <= 0.1 * steps.mean():
-        return repeated
-    # A channel at rest goes on being measured: of a longer run every so many samples stay.
-    since = (
-        np.arange(values.size) - changes[np.maximum(np.searchsorted(changes, np.arange(values.size), "right") - 1, 0)]
-    )
-    repeated[:] = since % usual != 0
-    return repeated
+        return 0
+    # A channel at rest goes on being measured: of a longer run one in so many samples is new.
+    return int(np.sum(lengths - lengths // usual))
 
 
 def _dropouts(time: Array) -> int:

@@ -35,16 +35,28 @@ def read_tdms(path: Path, requested: Collection[str]) -> LogColumns:
 
             def channel_of(name: str) -> TimedChannel:
                 channel = channels[name]
-                interval = float(channel.properties.get("wf_increment", np.nan))
-                begin = float(channel.properties.get("wf_start_offset", 0.0))
+                if "wf_increment" not in channel.properties:
+                    raise InvalidInput(
+                        f"channel {name!r} has no sample interval (wf_increment), others have: export one"
+                    )
+                interval = float(channel.properties["wf_increment"])
+                begin = float(channel.properties.get("wf_start_offset", 0.0)) + _start(channel) - first
                 time = np.asarray(begin + interval * np.arange(len(channel)), dtype=np.float64)
                 return TimedChannel(time, channel[:])
+
+            first = min(_start(channel) for channel in channels.values())
 
             return one_table(tuple(channels), requested, channel_of)
     # The library raises whatever a damaged file leads to.
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InvalidInput(f"log {path}: is not a TDMS file that can be read ({reason})") from None
+
+
+def _start(channel: Any) -> float:
+    """Time at which a waveform starts, s since 1970; 0 where it does not say."""
+    start = channel.properties.get("wf_start_time")
+    return 0.0 if start is None else float(np.datetime64(start, "us").astype(np.int64)) * 1e-6
 
 
 def _name(channel: Any, grouped: bool) -> str:

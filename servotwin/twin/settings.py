@@ -155,8 +155,9 @@ class TwinSettings:
             "silence_s",
             above=0.0,
             infinite=True,
-            help="Time for which the twin may leave a window unanswered before an edge of a certified policy falls "
-            "back, as `enroll` writes it into the edge's file; inf: for ever.",
+            help="Time for which the twin may leave a window unanswered before an edge whose policy sends gains falls "
+            "back, as `enroll` writes it into the edge's file; inf: for ever. Longer than horizon_s, the edge keeps a "
+            "setting beyond the time for which it was verified.",
         ),
     ] = 40.0
     k_dz: Annotated[

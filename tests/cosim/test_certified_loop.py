@@ -59,6 +59,16 @@ def test_the_loop_stays_and_what_was_proved_holds():
         assert np.abs(run.reference[tail] - run.position[tail]).max() < 5e-6
 
 
+@pytest.mark.exploration
+def test_the_published_controller_does_not_settle_on_the_same_machine():
+    """Neither with the published rule, nor with the twin switched off; the suite sees it in the demonstration."""
+    published = Scenario.preset("fig15").replace(input_bias=0.05)
+    for scenario in (published, published.replace(twin=published.twin.replace(enabled=False))):
+        run = cosimulate(scenario.replace(duration=100.0)).run
+        last = slice(round(90.0 * run.sample_rate), None)
+        assert np.ptp(run.position[last]) > 1e-4
+
+
 @pytest.mark.slow
 def test_evidence_goes_with_the_update_and_stays_in_the_store():
     sent = [redesign for redesign in loop().redesigns if redesign.setting is not None]

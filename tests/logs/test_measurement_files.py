@@ -58,6 +58,21 @@ def test_a_joint_state_that_is_cut_off_is_refused():
             joint_state(whole[:size])
 
 
+def test_a_wrapped_angle_and_times_that_go_back_give_no_values_between():
+    slow = np.arange(0.0, 8.0, 0.5)
+    angle = np.mod(1.0 + 2.0 * slow, 2.0 * np.pi)
+    back = np.insert(slow, 6, 0.1)
+    channels = {
+        "fast": TimedChannel(np.arange(0.0, 7.4, 0.01), np.zeros(740)),
+        "slow": TimedChannel(back, np.insert(angle, 6, 99.0)),
+    }
+    found = one_table(("fast", "slow"), ("fast", "slow"), channels.__getitem__).values["slow"]
+    # The nearest sample is half an interval away at most, in which the angle turns by 0.5.
+    wrong = np.unwrap(found) - (1.0 + 2.0 * channels["fast"].time)
+    assert np.abs(wrong).max() <= 0.5 + 1e-9
+    assert np.median(np.abs(wrong)) < 1e-9
+
+
 def test_channels_come_to_the_times_of_the_longest():
     channels = {
         "fast": TimedChannel(np.arange(5.0), np.arange(5.0) ** 2),

@@ -347,16 +347,28 @@ def test_wear_over_three_logs_in_calendar_time(tmp_path):
     assert "has 1 dates for 3 logs" in wrong.stderr
 
 
-@pytest.mark.parametrize("held", [["load"], ["motor", "load"]])
-def test_a_channel_that_is_measured_less_often_than_it_is_written_is_thinned(made, held):
-    every = np.arange(made.time.size) // 4 * 4
-    channels = {"motor": made.motor, "load": made.load}
+@pytest.mark.parametrize(("held", "times"), [(["load"], 4), (["load"], 10), (["motor", "load"], 4)])
+def test_a_channel_that_is_measured_less_often_than_it_is_written_is_counted(made, held, times):
+    every = np.arange(made.time.size) // times * times
+    channels = {"motor": made.motor, "load": made.load, "command": made.motor[every]}
     channels |= {name: channels[name][every] for name in held}
     found = cleaned(made.time, channels, {})
-    # Rounding repeats a value now and then: it stays with the samples at which it would have been measured.
-    assert 0.24 < found.time.size / made.time.size < 0.27
-    assert sum(found.found.values()) == made.time.size - found.time.size
-    assert any("load that changes every few samples" in defect or "motor that" in defect for defect in found.found)
+    assert found.time.size == made.time.size
+    # A value that equals the one before it makes a run longer; the first and the last run are not counted.
+    for name in held:
+        repeats = found.found[f"repeats of a {name} that is written more often than it is measured"]
+        assert repeats / made.time.size == pytest.approx(1.0 - 1.0 / times, abs=0.03)
+    assert len(found.found) == len(held)
+
+
+@pytest.mark.parametrize("times", [2, 4, 10])
+def test_a_load_that_was_held_gives_the_gap_as_ever(made, tmp_path, times):
+    every = np.arange(made.time.size) // times * times
+    log = csv(tmp_path / "held.csv", zip(made.time, made.motor, made.load[every], strict=True))
+    result = CliRunner().invoke(app, ["identify", str(log), "--json", "--stiff"])
+    assert result.exit_code == 0, result.output
+    low, high = json.loads(result.stdout)["interval_load"]
+    assert low <= GAP * RATIO <= high
 
 
 def test_an_encoder_of_few_counts_is_not_taken_for_one_that_is_held(made):

@@ -12,7 +12,7 @@ from hypothesis.stateful import Bundle, RuleBasedStateMachine, consumes, invaria
 from store_cases import incoming
 
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, OutgoingMessage, PutResult, WorkResult
-from servotwin.store.store import open_store
+from servotwin.store.store import WORK_KINDS, open_store
 
 LEASE_S = 10.0
 QUEUES = {
@@ -173,12 +173,10 @@ class Against(RuleBasedStateMachine):
         for name, model in self.servos.items():
             result = self.store.servo(name)
             assert (result.serial, result.wake) == (model.serial, model.wake)
-            assert result.waiting == len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER)))
+            assert result.waiting == len(self.undone(name, WORK_KINDS))
             assert self.store.outgoing(name, 0) == [OutgoingMessage(n, body) for n, body in enumerate(model.letters, 1)]
         waiting = self.store.backlog(self.now)
-        assert waiting.messages == sum(
-            len(self.undone(name, (MessageKind.WINDOW, MessageKind.LETTER))) for name in self.servos
-        )
+        assert waiting.messages == sum(len(self.undone(name, WORK_KINDS)) for name in self.servos)
         assert waiting.verifications == sum(len(self.undone(name, (MessageKind.VERIFICATION,))) for name in self.servos)
 
 

@@ -22,6 +22,7 @@ from servotwin.plant.signals import Array
 MODEL = "two masses"
 """`model_kind` of an answer that this model gave."""
 _MOST = 10_000  # samples, from the first on
+_PAUSE = 5.0  # usual intervals
 _LEAST = 6  # strokes within them
 _FOLDS = 8  # parts of the recording, whose errors are compared
 _EVIDENCE = 2.0  # standard errors
@@ -71,7 +72,10 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
     strokes = sum(each.time <= piece.time[-1] for each in lost.local) or _strokes(piece)
     if strokes < _LEAST:
         return DrivenGap(
-            None, None, f"{strokes} strokes in {_MOST} samples are too few to see how the load moves: move faster"
+            None,
+            None,
+            f"{strokes} strokes in {piece.time.size} samples without a pause are too few to see how the load moves: "
+            "move faster",
         )
     cycles = lost.cycles if "cyclic" in lost.model else ()
     problem = DrivenLoad(LoadDynamics(1.0, 1.0, 1.0), piece, lost.ratio, 0.0, cycles)
@@ -104,7 +108,10 @@ def with_dynamics(recording: EncoderRecording, found: TransmissionGap) -> Transm
 
 
 def _first(recording: EncoderRecording) -> EncoderRecording:
-    part = slice(0, _MOST)
+    """The samples before the first pause; nothing says how the load moved in one."""
+    intervals = np.diff(recording.time[:_MOST])
+    pauses = np.flatnonzero(intervals > _PAUSE * np.median(intervals)) if intervals.size else intervals
+    part = slice(0, int(pauses[0]) + 1 if pauses.size else _MOST)
     return replace(recording, time=recording.time[part], motor=recording.motor[part], load=recording.load[part])
 
 

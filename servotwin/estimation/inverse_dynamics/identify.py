@@ -93,7 +93,7 @@ def identify_drive(
     others = fit_models(joined(held))
     fits = fit_models(every)
     symmetric, asymmetric = (widened(*both) for both in zip(fits, others, strict=True))
-    checks.check_sense(used[0], symmetric)
+    checks.check_sense(used[0], fits[0])
     law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
     # No further motion shows more of what the hold does.
     advice = next_experiment(fits[0], every, motions[0], used[0].unit)
