@@ -47,7 +47,8 @@ class NextExperiment:
         known = f"{_WORDS[self.worst]} is known worst, to {100.0 * self.relative_std:.2g} % (one standard deviation)"
         if self.duration == 0.0:
             return f"{known}: no further experiment is needed for 1 %"
-        return f"{known}; {self.motion}, for {self.duration:.2g} s, would tell most of it and bring it to 1 %"
+        seconds = float(f"{self.duration:.2g}")
+        return f"{known}; {self.motion}, for {seconds:g} s, would tell most of it and bring it to 1 %"
 
 
 def next_experiment(fit: ParameterFit, rows: Rows, motion: DriveMotion, unit: str) -> NextExperiment:
