@@ -2,8 +2,8 @@
 acknowledgements down.
 
 MessagePack with a tag that carries the schema's version ("window/1"); an unknown tag is refused, unknown fields of a
-known tag are ignored. A window's channels are planar int16 with a scale and an offset each. Parameter messages may be
-JSON too. SI units throughout. Values that are not known, or bounds that do not exist, are None on the wire.
+known tag are ignored. A window's channels are planar int16 with a scale and an offset each.
+SI units throughout. Values that are not known, or bounds that do not exist, are None on the wire.
 """
 
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite

@@ -16,16 +16,21 @@ from servotwin.messages.acts import Act, ActKind
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.policy import Evidence, Policy, Redesign
+from servotwin.twin.lookups import VerificationRequest
 
 _STABLE = 0.5
 """Share of its validity for which a proposal stays, so that it can be read: then a newer one takes its place."""
 
 
 class Proposal(Struct, frozen=True):
-    """An update that waits for its approval, without its version and base; `gap`: rad, for which it was made."""
+    """An update that waits for its approval, without its version and base; `gap`: rad, for which it was made.
+
+    `verification`: what a setting that was looked up still needs once it is sent.
+    """
 
     update: Update
     gap: float | None
+    verification: VerificationRequest | None = None
 
 
 class Oversight(Struct, frozen=True):
@@ -47,6 +52,10 @@ class Oversight(Struct, frozen=True):
     ask_first: bool = False
     proposal: Proposal | None = None
     again: Act | None = None
+
+    def without_proposal(self) -> Oversight:
+        """Copy in which nothing waits for an approval."""
+        return replace(self, proposal=None)
 
     def proposes_anew(self, message: WindowMessage) -> bool:
         """True where a redesign of this window takes the place of what waits, or nothing waits."""

@@ -30,7 +30,7 @@ from servotwin.messages import (
     WindowMessage,
     finite,
 )
-from servotwin.messages.acts import Act
+from servotwin.messages.acts import Act, ActKind
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
@@ -227,7 +227,7 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     if overseen.ask_first and not overseen.held:
         if not overseen.proposes_anew(message):
             return StepResult(state, tuple(others), tuple(records))
-        waiting = Proposal(draft, finite(redesign.gap))
+        waiting = Proposal(draft, finite(redesign.gap), VerificationRequest.of(draft, redesign, evidence))
         state = replace(state, oversight=replace(overseen, proposal=waiting))
         return StepResult(state, tuple(others), (*records, ProposalRecord(waiting)))
     versions = state.versions.with_update(draft)
@@ -334,7 +334,7 @@ def _teach(
     model: TwinModel, state: TwinState, decoded: DecodedWindow, arrived: float, estimate: GapEstimate | None = None
 ) -> tuple[TwinState, tuple[LearntResponse, ...]]:
     """Decide if the edge is sent the learnt structure; `estimate`: of this window, where it counts."""
-    if model.responses is None or state.responses is None:
+    if model.responses is None or state.responses is None or state.oversight.held:
         return state, ()
     machine = state.wear.known_machine(model.settings.learning, arrived)
     responses, sent = model.responses.after(state.responses, decoded, arrived, estimate, machine)
@@ -343,7 +343,10 @@ def _teach(
 
 def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: bool) -> tuple[TwinState, Redesign]:
     """Consult the policy; without a setting the result has the reason."""
-    machine = state.wear.machine
+    machine, overseen = state.wear.machine, state.oversight
+    if overseen.again is not None and overseen.again.version is None and not stale:
+        # The fallback set is for every machine within the stated ranges, in doubt too.
+        return _send_again(model, state, evidence, overseen.again)
     if machine is not None and machine.disputed and not stale:
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
     if state.other_controller >= OTHER_CONTROLLER and not stale:
@@ -351,11 +354,10 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     needs_estimate = model.lookups is None and model.policy.needs_estimate
     if stale:
         return state, Redesign(None, math.nan, evidence.why_not)
-    overseen = state.oversight
     if overseen.again is not None:
         return _send_again(model, state, evidence, overseen.again)
     if overseen.held:
-        return state, Redesign(None, math.nan, overseen.held)
+        return state, Redesign(None, math.nan, _why_held(state))
     if evidence.why_not and needs_estimate:
         return state, Redesign(None, math.nan, evidence.why_not)
     try:
@@ -365,6 +367,13 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
         return replace(state, lookups=lookups), redesign
     except InvalidInput as error:
         return state, Redesign(None, math.nan, str(error))
+
+
+def _why_held(state: TwinState) -> str:
+    """Say who holds the machine; and that what is in force there failed, for a hold keeps it."""
+    failed = "" if state.lookups is None else state.lookups.why
+    held = state.oversight.held
+    return f"{held}; but {failed}: roll back to the fallback set" if failed else held
 
 
 def _send_again(model: TwinModel, state: TwinState, evidence: Evidence, act: Act) -> tuple[TwinState, Redesign]:
@@ -387,10 +396,18 @@ def _take_act(model: TwinModel, state: TwinState, act: Act, now: float) -> StepR
     state = replace(state, oversight=judged.oversight, triage=doubted)
     if proposal is not None:
         versions = state.versions.with_update(proposal.update)
-        return _send(replace(state, versions=versions, tuned_for=proposal.gap), versions.pending, now, (record,))
-    if state.oversight.held:
-        # What was sent already may still be applied; it is not sent again.
-        state = replace(state, versions=state.versions.without_pending(), tuned_for=None)
+        sent = _send(replace(state, versions=versions, tuned_for=proposal.gap), versions.pending, now, (record,))
+        if proposal.verification is None or versions.pending is None:
+            return sent
+        return sent._replace(
+            evidence=(*sent.evidence, replace(proposal.verification, version=versions.pending.version))
+        )
+    if act.act in (ActKind.HOLD, ActKind.ROLL_BACK) and not refused:
+        # What was sent already may still be applied; it is not sent again, a probing move neither.
+        requests = state.requests
+        if requests is not None and requests.pending is not None:
+            requests = requests.closed(None)
+        state = replace(state, versions=state.versions.without_pending(), tuned_for=None, requests=requests)
     return StepResult(state, (), (record,))
 
 
@@ -414,7 +431,7 @@ def _take_hello(state: TwinState, hello: Hello) -> StepResult:
 
 
 def _take_fallback(state: TwinState, fallback: Fallback) -> StepResult:
-    """Note that the edge has fallen back: no earlier update is sent again."""
+    """Note that the edge has fallen back: no earlier update is sent again, and no proposal from before is approved."""
     versions = state.versions.noted(fallback.boot, fallback.parameter_version)
     if versions.has_ended(fallback.boot):
         return StepResult(state, (), (fallback,))
@@ -424,6 +441,7 @@ def _take_fallback(state: TwinState, fallback: Fallback) -> StepResult:
         known=noted_setting(state.known, fallback.parameter_version, fallback.setting, fallback.replaced),
         tuned_for=None,
         triage=state.triage and state.triage.doubted("the edge has fallen back"),
+        oversight=state.oversight.without_proposal(),
     )
     return StepResult(state, (), (fallback,))
 
@@ -460,5 +478,6 @@ def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) ->
     if not why:
         return StepResult(replace(state, lookups=lookups), (), (record,))
     triage = state.triage and state.triage.doubted(why)
-    state = replace(state, lookups=lookups, versions=state.versions.without_pending(), triage=triage)
+    versions, oversight = state.versions.without_pending(), state.oversight.without_proposal()
+    state = replace(state, lookups=lookups, versions=versions, triage=triage, oversight=oversight)
     return StepResult(state, (), (record, WithdrawalRecord(request, why)))

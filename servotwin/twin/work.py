@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Hello, Message, WindowMessage
-from servotwin.messages.acts import Act, decode_act
+from servotwin.messages.acts import Act, ActKind, decode_act
 from servotwin.messages.codec import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
@@ -128,7 +128,8 @@ class _Worker:
             events = list(self._decoded(batch))
             decoded = iter(_urgent(events, self.state, self.model.settings.validity, now, urgency))
         for message, event in decoded:
-            if not self.model.settings.enabled:
+            # Acts are kept although the twin is switched off, but for the one that sends something.
+            if not self.model.settings.enabled and not (isinstance(event, Act) and event.act is not ActKind.APPROVE):
                 continue
             if urgency is not None and isinstance(event, WindowArrival) and self.state.has_overtaken(event.window):
                 event = event._replace(overtaken=True, unseen=urgency.others_wait)

@@ -287,9 +287,14 @@ class WorkerPool:
             A worker and those in its place did not start; the others were stopped.
         """
         self._workers = set(self._launched) or {self._make() for _ in range(self.size)}
+        starts = [asyncio.ensure_future(self._start(worker)) for worker in list(self._workers)]
         try:
-            await asyncio.gather(*(self._start(worker) for worker in list(self._workers)))
+            await asyncio.gather(*starts)
         except WorkerLost:
+            # Their workers end now, which they must not take for a death.
+            for start in starts:
+                start.cancel()
+            await asyncio.gather(*starts, return_exceptions=True)
             await self.stop()
             raise
         for worker in self._workers:

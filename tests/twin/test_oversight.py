@@ -5,7 +5,15 @@ import pytest
 from msgspec.structs import replace
 from twin_messages import PITCH, make, receipt, window_message
 
-from servotwin.messages import Hello, InvalidMessage, Reason, Setting, Update
+from servotwin.messages import (
+    Cause,
+    Fallback,
+    Hello,
+    InvalidMessage,
+    Reason,
+    Setting,
+    Update,
+)
 from servotwin.messages.acts import Act, ActKind, decode_act, encode_act
 
 
@@ -124,6 +132,29 @@ def test_a_proposal_gives_way_to_a_newer_one_expires_and_ends_with_the_boot():
     update, refused = overseen.do(ActKind.APPROVE, window=third.window)
     assert update is None
     assert "started again" in refused
+
+
+def test_a_proposal_ends_where_the_edge_falls_back():
+    overseen = Overseen(validity=100.0)
+    overseen.window()
+    overseen.do(ActKind.ASK_FIRST)
+    overseen.window()
+    proposal = overseen.log.proposals[-1].update
+    fallback = Fallback("axis", "boot-1", 2100, Cause.LIMIT_CYCLE, 1e-3, 1e-4, 1, 2, Setting(2e-4))
+    overseen.twin.receive(fallback, 21.0)
+    assert overseen.do(ActKind.APPROVE, window=proposal.window) == (None, "no proposal waits")
+
+
+def test_another_act_does_not_end_the_repetition_of_a_roll_back():
+    twin, log = make(retry=5.0)
+    _, first = twin.receive(window_message(1, 10.0), 10.0)
+    twin.receive(receipt(first), 10.0)
+    twin._step(act(ActKind.ROLL_BACK, version=1), 11.0)
+    _, again = twin.receive(window_message(2, 20.0, version=1), 20.0)
+    twin._step(act(ActKind.ASK_FIRST), 21.0)
+    twin._step(act(ActKind.ROLL_BACK, version=99), 21.0)
+    assert "not known" in log.acts[-1].refused
+    assert twin.wake(30.0) == [again]
 
 
 @pytest.mark.parametrize(

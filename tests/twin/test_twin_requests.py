@@ -8,7 +8,8 @@ import pytest
 from servotwin import messages
 from servotwin.control.gains import gains_of
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
-from servotwin.messages import Answer, LongerWindow, Probe, RequestOutcome, Setting, pack_channel
+from servotwin.messages import Answer, LongerWindow, Probe, Request, RequestOutcome, Setting, pack_channel
+from servotwin.messages.acts import Act, ActKind
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.twin.evidence import EvidenceLog
@@ -185,3 +186,13 @@ def test_without_settings_answers_are_stored_and_nothing_is_requested() -> None:
     late = Answer("axis", "b0", 1, 0, RequestOutcome.ACCEPTED, 1)
     assert twin.receive(late, 50.0) == []
     assert store.answers == [late]
+
+
+def test_a_held_machine_is_asked_for_no_probing_move():
+    twin, _ = make()
+    [request] = requests_after(twin, long(0), long(1))
+    twin._step(Act("axis", ActKind.HOLD, "eva", "a hand is in the machine", 18.0), 18.0)
+    assert twin.wake(20.0) == []
+    assert not any(
+        isinstance(each, Request) for each in twin.receive(answer(request, RequestOutcome.DUPLICATE, 7), 20.5)
+    )

@@ -6,6 +6,7 @@ const UNKNOWN = "–";
 
 const decimalsFor = (spread) => Math.max(0, 1 - Math.floor(Math.log10(spread)));
 const DECIMALS = 6; // more are not readable
+const SMALL = 1e-3, FINEST = 12; // below: with a power of ten; and what a precise gap may have
 
 export const fixed = (value, decimals) => value.toFixed(decimals).replace("-", "−");
 
@@ -26,8 +27,8 @@ export function gapText(gap, interval, scale = DEG) {
   const [low, high] = interval.map((end) => end * scale);
   const half = (high - low) / 2;
   if (!(half > 0)) return brief(gap * scale);
-  const decimals = decimalsFor(half);
-  if (decimals > DECIMALS) return smallText(gap * scale, low, high);
+  if (decimalsFor(half) > DECIMALS && Math.max(Math.abs(low), Math.abs(high)) < SMALL) return smallText(gap * scale, low, high);
+  const decimals = Math.min(FINEST, decimalsFor(half));
   // An interval that ends at zero, or lies otherwise on one side, is not "plus or minus".
   if (Math.abs((high + low) / 2 - gap * scale) > 0.05 * half) return low > 0 ? `${fixed(low, decimals)} to ${fixed(high, decimals)}` : `≤ ${fixed(high, decimals)}`;
   return `${fixed(gap * scale, decimals)} ± ${fixed(half, decimals)}`;
