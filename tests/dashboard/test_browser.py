@@ -279,6 +279,8 @@ def test_numbers_are_readable_and_long_windows_complete(open_page):
     text = "([gap, low, high]) => import('/static/format.js').then((f) => f.gapText(gap, [low, high], 1))"
     assert page.evaluate(text, [4.5, 4.4, 4.6]) == "4.500 ± 0.100"
     assert page.evaluate(text, [4.5e-8, 4.4e-8, 4.6e-8]) == "(4.50 ± 0.10) × 10^−8"
+    # An interval far narrower than the gap is no reason for a power of ten.
+    assert page.evaluate(text, [10.0, 10.0 - 2e-6, 10.0 + 2e-6]) == "10.0000000 ± 0.0000020"
     samples, rate = 200_000, 1000.0
 
     def answer(route):
