@@ -63,7 +63,7 @@ class Act(Struct, frozen=True, omit_defaults=True, tag="act/1"):
 
     @property
     def sentence(self) -> str:
-        """Who does it and why."""
+        """The act in words, with the engineer and the reason."""
         done = {ActKind.HOLD: "held", ActKind.ROLL_BACK: "rolled back", ActKind.RELEASE: "released"}
         return f"{done.get(self.act, self.act.value)} by {self.who}: {self.why}"
 

@@ -380,9 +380,13 @@ def _send_again(model: TwinModel, state: TwinState, evidence: Evidence, act: Act
     """Carry out a roll back; the machine stays held."""
     state = replace(state, oversight=replace(state.oversight, again=None))
     try:
-        return state, sent_again(model.policy, evidence, act, state.known)
+        redesign = sent_again(model.policy, evidence, act, state.known)
     except InvalidInput as error:
         return state, Redesign(None, math.nan, str(error))
+    if state.lookups is not None and redesign.setting is not None:
+        # The setting that failed its verification is replaced.
+        state = replace(state, lookups=replace(state.lookups, why=""))
+    return state, redesign
 
 
 def _take_act(model: TwinModel, state: TwinState, act: Act, now: float) -> StepResult:

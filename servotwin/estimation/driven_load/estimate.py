@@ -36,7 +36,7 @@ _STEPS = 12
 
 
 class DrivenGap(NamedTuple):
-    """What a model with dynamics says of a recording.
+    """Gap that a model with dynamics finds in a recording.
 
     Attributes
     ----------
