@@ -226,6 +226,11 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     introduced: bool = False
     oversight: Oversight = Oversight()
 
+    def with_sent(self, update: Update, now: float) -> TwinState:
+        """Note the first sending of an update, with its setting: the receipt may get lost."""
+        known = noted_setting(self.known, update.version, update.setting, update.base_version, self.versions.in_force)
+        return replace(self, known=known, attempts=Attempts(now, 1))
+
     def is_of_other_boot(self, window: WindowMessage) -> bool:
         """True for a window of a boot that has ended, or was not introduced though the edge introduces each."""
         unknown = self.introduced and window.boot != self.versions.boot

@@ -30,11 +30,19 @@ from servotwin.messages import (
     WindowMessage,
     finite,
 )
-from servotwin.messages.acts import Act, ActKind
+from servotwin.messages.acts import Act
 from servotwin.redesign.policy import Evidence, Redesign
+from servotwin.twin.answers import (
+    StepResult,
+    take_act,
+    take_answer,
+    take_fallback,
+    take_hello,
+    take_verification,
+    take_wake,
+)
 from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
-    ActRecord,
     AlarmRecord,
     DisturbanceRecord,
     ExcitationRecord,
@@ -46,14 +54,11 @@ from servotwin.twin.evidence import (
     Record,
     RedesignRecord,
     TrendRecord,
-    VerificationRecord,
-    WithdrawalRecord,
 )
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
-from servotwin.twin.oversight import Proposal, judge_act, sent_again
-from servotwin.twin.requests import Attempts
-from servotwin.twin.state import TwinState, draft_update, noted_setting
+from servotwin.twin.oversight import Proposal, sent_again
+from servotwin.twin.state import TwinState, draft_update
 from servotwin.twin.triage import Glance, no_glance
 
 _MIXED = "windows of two machines came under this name: a setting follows when some in a row are of one"
@@ -62,8 +67,6 @@ _OVERTAKEN = "a newer window of this servo has come: the setting follows from th
 _STALE = "the window is not newer than what the parameters stand on, or of an earlier boot"
 
 
-# Protocol from which on an edge sends a hello for every boot, and another where it is asked for windows of every boot.
-_INTRODUCES_ITSELF = 2
 # Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
 _RESTS = 3
 # Windows whose step is remembered.
@@ -102,23 +105,6 @@ class Wake(NamedTuple):
 Event = WindowArrival | ParameterMessage | VerificationRequest | Act | Wake
 
 
-class StepResult(NamedTuple):
-    """Result of a step.
-
-    Attributes
-    ----------
-    state : TwinState
-    messages : tuple of Message
-        Messages to the edge, in order.
-    evidence : tuple of Record
-        Evidence to store, in order; the caller passes a `VerificationRequest` among it as an event, at any later time.
-    """
-
-    state: TwinState
-    messages: tuple[Message, ...] = ()
-    evidence: tuple[Record, ...] = ()
-
-
 def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepResult:
     """Process one event.
 
@@ -138,7 +124,7 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
         A verification is requested, but the twin uses no table any more.
     """
     if isinstance(event, VerificationRequest):
-        return _verify(model, state, event)
+        return take_verification(model, state, event)
     if not isinstance(event, Wake):
         servo = event.window.servo if isinstance(event, WindowArrival) else event.servo
         if servo != state.servo:
@@ -153,15 +139,15 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
             versions, again = state.versions.after_receipt(event)
             return _send(replace(state, versions=versions), again, now, (event,))
         case Fallback():
-            return _take_fallback(state, event)
+            return take_fallback(state, event)
         case Hello():
-            return _take_hello(state, event)
+            return take_hello(state, event)
         case Answer():
-            return _take_answer(model, state, event, now)
+            return take_answer(model, state, event, now)
         case Act():
-            return _take_act(model, state, event, now)
+            return take_act(model, state, event, now)
         case Wake():
-            return _wake(model, state, now)
+            return take_wake(model, state, now)
     raise InvalidMessage(f"a twin does not receive {type(event).__name__} messages")
 
 
@@ -389,99 +375,8 @@ def _send_again(model: TwinModel, state: TwinState, evidence: Evidence, act: Act
     return state, redesign
 
 
-def _take_act(model: TwinModel, state: TwinState, act: Act, now: float) -> StepResult:
-    """Carry out an engineer's act, and keep it with what became of it."""
-    judged = judge_act(state.oversight, act, state.newest, state.known, model.policy)
-    proposal, refused = judged.approved, judged.refused
-    if proposal is not None and proposal.update.data_time <= state.versions.data_time:
-        proposal, refused = None, "a newer version was sent meanwhile"
-    record = ActRecord(act, refused)
-    doubted = state.triage and state.triage.doubted(act.sentence)
-    state = replace(state, oversight=judged.oversight, triage=doubted)
-    if proposal is not None:
-        versions = state.versions.with_update(proposal.update)
-        sent = _send(replace(state, versions=versions, tuned_for=proposal.gap), versions.pending, now, (record,))
-        if proposal.verification is None or versions.pending is None:
-            return sent
-        return sent._replace(
-            evidence=(*sent.evidence, replace(proposal.verification, version=versions.pending.version))
-        )
-    if act.act in (ActKind.HOLD, ActKind.ROLL_BACK) and not refused:
-        # What was sent already may still be applied; it is not sent again, a probing move neither.
-        requests = state.requests
-        if requests is not None and requests.pending is not None:
-            requests = requests.closed(None)
-        state = replace(state, versions=state.versions.without_pending(), tuned_for=None, requests=requests)
-    return StepResult(state, (), (record,))
-
-
 def _send(state: TwinState, update: Update | None, now: float, records: tuple[Record, ...]) -> StepResult:
     """Send the pending update for the first time; None: there is none."""
     if update is None:
         return StepResult(state, (), records)
-    # The receipt may get lost: the setting is noted when the update is sent.
-    known = noted_setting(state.known, update.version, update.setting, update.base_version, state.versions.in_force)
-    return StepResult(replace(state, known=known, attempts=Attempts(now, 1)), (update,), (*records, update))
-
-
-def _take_hello(state: TwinState, hello: Hello) -> StepResult:
-    """Note that the edge started or reconnected, and its setting, which may come from an earlier boot."""
-    versions = state.versions.noted(hello.boot, hello.parameter_version)
-    if versions.has_ended(hello.boot):
-        return StepResult(state, (), (hello,))
-    known = noted_setting(state.known, hello.parameter_version, hello.setting, hello.parameter_version)
-    introduced = hello.protocol >= _INTRODUCES_ITSELF
-    return StepResult(replace(state, versions=versions, known=known, introduced=introduced), (), (hello,))
-
-
-def _take_fallback(state: TwinState, fallback: Fallback) -> StepResult:
-    """Note that the edge has fallen back: no earlier update is sent again, and no proposal from before is approved."""
-    versions = state.versions.noted(fallback.boot, fallback.parameter_version)
-    if versions.has_ended(fallback.boot):
-        return StepResult(state, (), (fallback,))
-    state = replace(
-        state,
-        versions=versions.without_pending(),
-        known=noted_setting(state.known, fallback.parameter_version, fallback.setting, fallback.replaced),
-        tuned_for=None,
-        triage=state.triage and state.triage.doubted("the edge has fallen back"),
-        oversight=state.oversight.without_proposal(),
-    )
-    return StepResult(state, (), (fallback,))
-
-
-def _take_answer(model: TwinModel, state: TwinState, answer: Answer, now: float) -> StepResult:
-    if model.requests is None or state.requests is None:
-        return StepResult(state, (), (answer,))
-    requests, again = model.requests.answered(state.requests, answer, now)
-    state = replace(state, requests=requests)
-    return StepResult(state, (), (answer,)) if again is None else StepResult(state, (again,), (answer, again))
-
-
-def _wake(model: TwinModel, state: TwinState, now: float) -> StepResult:
-    """Repeat the pending update and request when their answers are overdue; abandon them after `attempts`."""
-    repeated: tuple[Message, ...] = ()
-    if model.requests is not None and state.requests is not None:
-        requests, repeated = model.requests.wake(state.requests, now)
-        state = replace(state, requests=requests)
-    pending = state.versions.pending
-    if pending is None or now < state.attempts.sent_at + model.settings.retry:
-        return StepResult(state, repeated)
-    if state.attempts.count >= model.settings.attempts:
-        return StepResult(replace(state, versions=state.versions.without_pending()), repeated)
-    return StepResult(replace(state, attempts=state.attempts.another(now)), (pending, *repeated))
-
-
-def _verify(model: TwinModel, state: TwinState, request: VerificationRequest) -> StepResult:
-    """Verify a setting that was looked up; where that fails withdraw it, so that the fallback set is sent next."""
-    if model.lookups is None or state.lookups is None:
-        raise InvalidInput("no setting has to be verified, because the twin uses no table any more")
-    current = [state.known.get(version) for version in state.versions.current]
-    lookups, result, why = model.lookups.verify(state.lookups, request, current)
-    record = VerificationRecord(request, result)
-    if not why:
-        return StepResult(replace(state, lookups=lookups), (), (record,))
-    triage = state.triage and state.triage.doubted(why)
-    versions, oversight = state.versions.without_pending(), state.oversight.without_proposal()
-    state = replace(state, lookups=lookups, versions=versions, triage=triage, oversight=oversight)
-    return StepResult(state, (), (record, WithdrawalRecord(request, why)))
+    return StepResult(state.with_sent(update, now), (update,), (*records, update))

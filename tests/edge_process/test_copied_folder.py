@@ -10,7 +10,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
-from edge_process_parts import cut
+from edge_process_parts import EDGE, cut
 from service_system import TOKEN, twin_file
 from services import service
 
@@ -21,21 +21,6 @@ from servotwin.edge_process.monitoring import read_status
 from servotwin.runtime.frames import FrameSocket
 
 PATIENCE = 60.0
-EDGE = """
-servo = "ax-1"
-role = "supervise"
-sample_rate_hz = 100.0
-[drive]
-kind = "simulated"
-address = "unix:nothing.sock"
-[retry]
-first_s = 0.05
-longest_s = 0.2
-[twin]
-url = "{url}"
-token_file = "token"
-wait_s = 0.5
-"""
 
 
 class Edge:
@@ -103,7 +88,7 @@ def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) 
             one.send()
             until(lambda: stored() == {("b1-aa", 0)})
             until(lambda: (first / "status.json").exists())
-            shutil.copytree(first, copy)
+            shutil.copytree(first, copy, ignore=shutil.ignore_patterns("*.new"))  # a file that is being replaced
             with edge(copy, "b2-bb") as two:
                 two.send()
                 until(lambda: ("b2-bb", 0) in stored())

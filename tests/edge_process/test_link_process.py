@@ -9,7 +9,7 @@ from pathlib import Path
 from threading import Event, Thread
 
 import pytest
-from edge_process_parts import SETTINGS, LinkEnd, cut, exchange_all
+from edge_process_parts import EDGE, SETTINGS, LinkEnd, cut, exchange_all
 from faketwin import FakeTwin
 
 from servotwin.edge.agent import Agent
@@ -25,21 +25,6 @@ from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
 
 PATIENCE = 60.0
-EDGE = """
-servo = "ax-1"
-role = "supervise"
-sample_rate_hz = 100.0
-[drive]
-kind = "simulated"
-address = "unix:nothing.sock"
-[retry]
-first_s = 0.05
-longest_s = 0.1
-[twin]
-url = "{url}"
-token_file = "token"
-wait_s = 0.2
-"""
 
 
 def until(condition: Callable[[], bool]) -> None:

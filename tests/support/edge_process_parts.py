@@ -19,6 +19,23 @@ LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
 SETTINGS = AgentSettings("axis-1", UNBOOTED, RATE, 0.1, limits=Limits(maximum=1e-3), probe=ProbeLimits(1e-3, 0.0, 0.05))
 CONFIG = EdgeConfig(SETTINGS, "control", LAW, {"kind": "simulated"})
 
+EDGE = """
+servo = "ax-1"
+role = "supervise"
+sample_rate_hz = 100.0
+[drive]
+kind = "simulated"
+address = "unix:nothing.sock"
+[retry]
+first_s = 0.05
+longest_s = 0.1
+[twin]
+url = "{url}"
+token_file = "token"
+wait_s = 0.2
+"""
+"""An edge's configuration file; `url` is to be filled in."""
+
 
 def cut(sequence: int = 0, samples: int = 10) -> Cut:
     signals = {name: array("d", [1e-3 * k for k in range(samples)]) for name in CHANNELS}
