@@ -74,14 +74,14 @@ def test_a_version_from_its_window_to_its_effect() -> None:
     effect = {"window": {"sequence": 2}, "before": estimate(), "after": after}
     receipt = found("receipt", "applied", version=3, body={"applied": True, "sample": 5000})
     first = link(1, estimate(), found("redesign", "", body={}), steps=[step(effect, receipt)])
-    lines = chain(first, link(2, after, found("redesign", "what was proved is in force already")))
+    lines = chain(first, link(2, after, found("redesign", "what was verified is in force already")))
     assert lines[0] == "boot b1"
     assert [line[HEAD.index("what followed") :] for line in lines[1:]] == [
         "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, verified on 256 "
         "simulated machines",
         "version 3 applied at sample 5000",
         "version 3 in window 2: error 12.3 -> 5.0 um",
-        "what was proved is in force already",
+        "what was verified is in force already",
     ]
     assert lines[1].split()[:6] == ["1970-01-01", "00:01:00", "1", "7.500", "12.3", "2"]
 

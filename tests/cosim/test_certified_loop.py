@@ -51,7 +51,7 @@ def test_updates_are_applied_and_the_bias_is_learnt():
 
 
 @pytest.mark.slow
-def test_the_loop_stays_and_what_was_proved_holds():
+def test_the_loop_stays_and_what_was_verified_holds():
     assert not loop().fallbacks
     run = loop().run
     for begin in np.arange(LEARNT, LENGTH, 20.0):
@@ -89,7 +89,7 @@ def test_the_same_scenario_gives_the_same_bytes():
 
 
 @pytest.mark.slow
-def test_without_a_twin_the_edge_stays_on_what_is_proved_for_every_gap():
+def test_without_a_twin_the_edge_stays_on_what_is_verified_for_every_gap():
     scenario = Scenario.preset("certified")
     alone = cosimulate(scenario.replace(duration=60.0, twin=scenario.twin.replace(enabled=False)))
     fallback_certificate = certified_policy(scenario.model, scenario.twin).fallback()

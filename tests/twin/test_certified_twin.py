@@ -86,7 +86,7 @@ def test_an_empty_set_of_candidates_sends_nothing():
 
 
 @pytest.mark.slow
-def test_where_the_whole_range_cannot_be_proved_nothing_is_sent():
+def test_where_the_whole_range_cannot_be_verified_nothing_is_sent():
     known = Uncertainty(input_bias=(0.0, 0.0))
     settings = SETTINGS.replace(uncertainty=known, demands=replace(FEW, overshoot=0.001))
     sent, redesign = answer(settings=settings)

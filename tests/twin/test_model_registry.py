@@ -66,7 +66,7 @@ def test_models_carry_settings_controller_and_start():
     assert calm.first_setting == Setting(0.0, gains_of(calm.servo.controller))
 
 
-def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
+def test_without_a_start_it_is_the_verified_fallback_set_as_in_a_scenario():
     scenario = Scenario.preset("certified")
     model = ServoModel("axis", scenario.model, scenario.twin)
     assert model.first_setting == Setting(scenario.start_tolerance, gains_of(scenario.start_law))
@@ -74,7 +74,7 @@ def test_without_a_start_it_is_the_proved_fallback_set_as_in_a_scenario():
 
 
 @pytest.mark.slow
-def test_where_nothing_is_proved_nothing_is_known_of_the_start():
+def test_where_nothing_is_verified_nothing_is_known_of_the_start():
     wide = TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0))
     few = Demands(machines=40, screened=2, conditions=4, scales=(0.5,), beyond=Beyond(machines=4), settled=0.9)
     settings = TwinSettings(uncertainty=wide, demands=few)

@@ -177,7 +177,7 @@ def test_a_verification_that_fails_sends_the_fallback_set_with_the_next_window(
 
 
 @pytest.mark.slow
-def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelRegistry, monkeypatch) -> None:
+def test_after_a_withdrawal_everything_is_verified_before_it_is_sent(fleet: ModelRegistry, monkeypatch) -> None:
     queue, update, queued = begun(fleet)
     with monkeypatch.context() as patched:
         failing(patched)
@@ -195,7 +195,25 @@ def test_after_a_withdrawal_everything_is_proved_before_it_is_sent(fleet: ModelR
 
 
 @pytest.mark.slow
-def test_what_is_no_longer_in_force_is_not_proved_any_more(fleet: ModelRegistry, monkeypatch) -> None:
+def test_a_held_machine_says_that_its_setting_failed_until_the_fallback_set_was_sent(
+    fleet: ModelRegistry, monkeypatch
+) -> None:
+    queue, update, queued = begun(fleet)
+    queue.act(Act("axis", ActKind.HOLD, "eva", "inspection", 1.0))
+    with monkeypatch.context() as patched:
+        failing(patched)
+        queue.give(queued)
+
+    held = {row.kind: row.status for row in queue.window(1, update.version, reason="asked for").evidence}
+    assert "roll back to the fallback set" in held["redesign"]
+    assert b" failed" in queue.state
+    queue.act(Act("axis", ActKind.ROLL_BACK, "eva", "as advised", 2.0))
+    assert sent(queue.window(2, update.version, reason="asked for")).base_version == update.version
+    assert b" failed" not in queue.state
+
+
+@pytest.mark.slow
+def test_what_is_no_longer_in_force_is_not_verified_any_more(fleet: ModelRegistry, monkeypatch) -> None:
     queue, _, queued = begun(fleet)
     question = decode_request(queued.body)
     law = question.setting.controller.replace(Kp=2.0 * question.setting.controller.Kp)
