@@ -178,8 +178,12 @@ def endure(
     report.check(output)
     check_system()
     folder = Path(mkdtemp(prefix="endure-"))
-    with console.status(f"{minutes:g} minutes of faults"):
-        outcome = _outcome(Site(folder, _free_port(), minutes), minutes, seed)
+    try:
+        with console.status(f"{minutes:g} minutes of faults"):
+            outcome = _outcome(Site(folder, _free_port(), minutes), minutes, seed)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder)
+        raise
     failed = outcome.waiting or outcome.lost_acknowledged or outcome.holes or outcome.unseen
     if failed or outcome.ended_alone or outcome.twin_ended:
         console.print(f"[dim]the files are kept: {folder}[/]")

@@ -66,6 +66,28 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
     assert ["faults:", "edge", "killed", "3"] in lines
 
 
+@pytest.mark.parametrize(("ended_by", "kept"), [(KeyboardInterrupt, False), (RuntimeError, True)])
+def test_an_interrupted_run_leaves_no_files_and_a_failed_one_does(
+    ended_by: type[BaseException], kept: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / "endure"
+
+    def ended(*_: object) -> None:
+        (folder / "twin.db").touch()
+        raise ended_by
+
+    def made(prefix: str) -> str:
+        folder.mkdir()
+        return str(folder)
+
+    monkeypatch.setattr(endurance, "mkdtemp", made)
+    monkeypatch.setattr(endurance, "Site", lambda *_: None)
+    monkeypatch.setattr(endurance, "_outcome", ended)
+    with pytest.raises(ended_by):
+        endurance.endure(minutes=0.1, console=Console(quiet=True))
+    assert folder.exists() == kept
+
+
 def test_an_outbox_that_cannot_be_read_is_no_empty_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(endurance_site, "_PATIENCE_S", 0.0)
     (tmp_path / "outbox.sqlite").write_bytes(b"no database" * 1000)
