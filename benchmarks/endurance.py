@@ -33,6 +33,7 @@ QUICK, MINUTES = 0.5, 10.0
 _FAULTS_S = (4.0, 12.0)
 """s between two faults, at least and at most."""
 _DISK_S, _START_S, _END_S = 5.0, 120.0, 120.0
+_KEPT = "[dim]the files are kept: {}[/]"
 _CLOCKS_DAYS = (-90, 0, 90)
 _YEAR_WINDOWS = 365.25 * 86400.0 / 20.0
 """Windows of a servo that sends one every 20 s, in a year."""
@@ -184,9 +185,12 @@ def endure(
     except KeyboardInterrupt:
         shutil.rmtree(folder)
         raise
+    except Exception:
+        console.print(_KEPT.format(folder))
+        raise
     failed = outcome.waiting or outcome.lost_acknowledged or outcome.holes or outcome.unseen
     if failed or outcome.ended_alone or outcome.twin_ended:
-        console.print(f"[dim]the files are kept: {folder}[/]")
+        console.print(_KEPT.format(folder))
     else:
         shutil.rmtree(folder)
     console.print(shown(outcome))

@@ -1,5 +1,6 @@
 """`servotwin bench endurance`: what it counts as lost, and its options."""
 
+import io
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -84,8 +85,9 @@ def test_an_interrupted_run_leaves_no_files_and_a_failed_one_does(
     monkeypatch.setattr(endurance, "Site", lambda *_: None)
     monkeypatch.setattr(endurance, "_outcome", ended)
     with pytest.raises(ended_by):
-        endurance.endure(minutes=0.1, console=Console(quiet=True))
+        endurance.endure(minutes=0.1, console=Console(file=(shown := io.StringIO()), width=500))
     assert folder.exists() == kept
+    assert (f"the files are kept: {folder}" in shown.getvalue()) == kept
 
 
 def test_an_outbox_that_cannot_be_read_is_no_empty_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
