@@ -134,10 +134,14 @@ class ProposalRecord(NamedTuple):
 
 
 class ActRecord(NamedTuple):
-    """An engineer's act, and the reason for which it was refused; empty: it was carried out."""
+    """An engineer's act, and the reason for which it was refused; empty: it was carried out.
+
+    `later`: a roll back, once a window has come with which its setting was sent, or could not be.
+    """
 
     act: Act
     refused: str
+    later: bool = False
 
 
 Record = (
@@ -328,10 +332,12 @@ def _row(record: Record) -> EvidenceRecord | None:
             draft = proposal.update
             window_key = "{}/{}".format(*draft.window)
             return _computed("proposal", draft, draft.status, gap=draft.gap, std=draft.std, window=window_key)
-        case ActRecord(act, refused):
-            status = f"{act.sentence} (refused: {refused})" if refused else act.sentence
+        case ActRecord(act, refused, later):
+            came = f" ({'not sent' if later else 'refused'}: {refused})" if refused else " (sent)" if later else ""
             window_key = "" if act.window is None else "{}/{}".format(*act.window)
-            return _computed("act", {"act": act, "refused": refused}, status, window=window_key)
+            return _computed(
+                "act", {"act": act, "refused": refused, "later": later}, act.sentence + came, window=window_key
+            )
         case Update():
             window_key = "{}/{}".format(*record.window)
             row = _sent("update", record, record.status, record.version)

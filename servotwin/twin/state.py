@@ -275,6 +275,20 @@ def decode_state(servo: str, data: bytes) -> TwinState:
     return state
 
 
+def oversight_within(servo: str, data: bytes) -> Oversight | None:
+    """Read what engineers have set, without a proposal, from a state that is not understood as a whole.
+
+    None where this part is not understood either, or belongs to another servo.
+    """
+    try:
+        document = msgspec.msgpack.decode(data)
+        if document["servo"] != servo:
+            return None
+        return msgspec.convert({**document.get("oversight", {}), "proposal": None}, Oversight, dec_hook=decoded_part)
+    except (msgspec.MsgspecError, ValueError, RecursionError, OverflowError, LookupError, TypeError, AttributeError):
+        return None
+
+
 def _upgraded(old: dict[str, Any]) -> dict[str, Any]:
     """Convert a document of the previous schema, in which a known setting was a whole controller."""
     versions, wear, requests = old["versions"], old["wear"], old["requests"]

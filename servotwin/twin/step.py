@@ -43,6 +43,7 @@ from servotwin.twin.answers import (
 )
 from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
+    ActRecord,
     AlarmRecord,
     DisturbanceRecord,
     ExcitationRecord,
@@ -199,7 +200,10 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
     if why_none := _OVERTAKEN if event.overtaken else event.too_late:
         redesign = Redesign(None, math.nan, why_none)
     else:
+        again = state.oversight.again
         state, redesign = _redesign(model, state, evidence, stale)
+        if again is not None and state.oversight.again is None:
+            records.append(ActRecord(again, redesign.reason if redesign.setting is None else "", later=True))
     overseen = state.oversight
     if learnt.disturbance.known and not stale:
         state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])

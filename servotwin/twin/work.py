@@ -11,6 +11,8 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from msgspec.structs import replace
+
 from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, Hello, Message, WindowMessage
@@ -18,16 +20,19 @@ from servotwin.messages.acts import Act, ActKind, decode_act
 from servotwin.messages.codec import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
-from servotwin.twin.evidence import failure_row, rows
+from servotwin.twin.evidence import ActRecord, failure_row, rows
 from servotwin.twin.lookups import VerificationRequest, decode_request, encode_request
 from servotwin.twin.model import TwinModel
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
-from servotwin.twin.state import TwinState, encode_state
+from servotwin.twin.oversight import Oversight
+from servotwin.twin.state import TwinState, encode_state, oversight_within
 from servotwin.twin.step import Event, Wake, WindowArrival, next_wake, step
 
 ONE_BY_ONE, ABANDON_AFTER = 3, 5
 """Attempts of a lease from which on it is processed message by message, which isolates the message that kills its
 workers; attempts from which on that message is abandoned."""
+
+_LOST = "the twin's state could not be read: what an engineer had set before is lost, set it again"
 
 
 @dataclass(frozen=True)
@@ -65,7 +70,7 @@ def work(registry: ModelRegistry, lease: Lease, now: float, urgency: Urgency | N
     """
     batch = lease.messages[:1] if lease.attempts >= ONE_BY_ONE else lease.messages
     try:
-        return _Worker(registry.model_of(lease.servo), lease).result(batch, now, urgency)
+        return _Worker(registry.model_of(lease.servo), lease, now).result(batch, now, urgency)
     except InvalidInput as error:
         evidence = tuple(failure_row(stored.id, str(error)) for stored in batch)
         return WorkResult(lease.servo, lease.serial, lease.state, None, tuple(stored.id for stored in batch), evidence)
@@ -74,13 +79,13 @@ def work(registry: ModelRegistry, lease: Lease, now: float, urgency: Urgency | N
 class _Worker:
     """State and results of one servo's twin for the length of one lease."""
 
-    def __init__(self, model: ServoModel, lease: Lease) -> None:
+    def __init__(self, model: ServoModel, lease: Lease, now: float) -> None:
         self.servo_model, self.lease = model, lease
         self.context = context_of(model.servo, model.settings)
         self.evidence: list[EvidenceRecord] = []
         self.unverified: list[VerificationRequest] = []
         self.sent: list[Message] = []
-        self.model, self.state = self._restored()
+        self.model, self.state = self._restored(now)
 
     def result(self, batch: Sequence[StoredMessage], now: float, urgency: Urgency | None) -> WorkResult:
         """Process the messages and whatever is overdue, and return the result."""
@@ -104,21 +109,27 @@ class _Worker:
             contexts=(self.context,) if any(row.context for row in self.evidence) else (),
         )
 
-    def _restored(self) -> tuple[TwinModel, TwinState]:
+    def _restored(self, now: float) -> tuple[TwinModel, TwinState]:
         """Restore the twin from the last result.
 
         Where the state cannot be read the twin begins anew, and the old state is stored with the reason. The edge's
-        next message brings version number and boot back.
+        next message brings version number and boot back. What engineers have set stays where it can be read; otherwise
+        its end is stored like an act, so that nobody relies on a hold that is lost.
         """
         servo, data = self.lease.servo, self.lease.state
+        kept: Oversight | None = Oversight()
         if data:
             model = self.servo_model.twin(restored=True)
             try:
                 return model, model.restored(servo, data)
             except InvalidInput as error:
                 self.evidence.append(failure_row(0, f"{error}; the twin begins anew", {"state": data}))
+            kept = oversight_within(servo, data)
+            if kept is None:
+                ended = (ActKind.RELEASE, ActKind.ASK_NO_MORE)
+                self._note(0, *(ActRecord(Act(servo, kind, "servotwin", _LOST, now), "") for kind in ended))
         model = self.servo_model.twin(restored=False)
-        return model, model.initial_state(servo)
+        return model, replace(model.initial_state(servo), oversight=kept or Oversight())
 
     def _process(self, batch: Sequence[StoredMessage], now: float, urgency: Urgency | None) -> None:
         """Decode the messages and step; a twin that is switched off does nothing."""
@@ -129,8 +140,12 @@ class _Worker:
             decoded = iter(_urgent(events, self.state, self.model.settings.validity, now, urgency))
         for message, event in decoded:
             # Acts are kept although the twin is switched off, but for the one that sends something.
-            if not self.model.settings.enabled and not (isinstance(event, Act) and event.act is not ActKind.APPROVE):
-                continue
+            if not self.model.settings.enabled:
+                if not isinstance(event, Act):
+                    continue
+                if event.act is ActKind.APPROVE:
+                    self._note(message, ActRecord(event, "the twin of this servo is switched off"))
+                    continue
             if urgency is not None and isinstance(event, WindowArrival) and self.state.has_overtaken(event.window):
                 event = event._replace(overtaken=True, unseen=urgency.others_wait)
             self._step(message, event, now)
@@ -142,6 +157,9 @@ class _Worker:
                 yield stored.id, _event(stored)
             except Exception as error:
                 self.evidence.append(failure_row(stored.id, f"{type(error).__name__}: {error}"))
+
+    def _note(self, message: int, *records: ActRecord) -> None:
+        self.evidence += rows(records, message, self.context[0])
 
     def _step(self, message: int, event: Event, now: float) -> bool:
         """Step; after an error the state is as before the event, and the result is False."""

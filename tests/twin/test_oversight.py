@@ -80,6 +80,7 @@ def test_an_earlier_setting_is_sent_as_a_new_version_on_the_next_window_and_stay
     again = overseen.window()
     assert (again.version, again.base_version, again.setting) == (3, 2, first.setting)
     assert again.data_time == 30.0  # on new data, which the edge's guard demands
+    assert overseen.log.acts[-1] == (overseen.log.acts[-2].act, "", True)
     assert overseen.window() is None
     assert overseen.why().startswith("rolled back by eva")
     overseen.do(ActKind.RELEASE)

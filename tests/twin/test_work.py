@@ -35,6 +35,7 @@ from servotwin.messages import (
     decode,
     encode,
 )
+from servotwin.messages.acts import Act, ActKind, encode_act
 from servotwin.messages.codec import DEFLATE, ZSTD, compress
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
@@ -318,8 +319,25 @@ def test_a_state_that_cannot_be_read_is_stored_and_the_twin_begins_anew():
     assert (first.message, first.kind) == (0, "estimate")
     assert first.status.startswith("failed: the state of servo 'axis' is not understood")
     assert msgspec.msgpack.decode(first.body)["state"] == b"\x81\xa4typeonce"
-    assert [row.kind for row in rest] == ["estimate", "disturbance", "trend", "machine", "motor", "redesign", "update"]
+    assert [row.status.partition(":")[0] for row in rest[:2]] == ["released by servotwin", "ask no more by servotwin"]
+    assert [row.kind for row in rest[2:]] == [
+        *("estimate", "disturbance", "trend", "machine", "motor", "redesign", "update"),
+    ]
     assert decode(outcome.outgoing[0]).version == 41
+
+
+def test_a_hold_outlives_the_other_parts_of_a_state_that_cannot_be_read():
+    hold = Act("axis", ActKind.HOLD, "eva", "the bearing is replaced", 5.0)
+    sent = StoredMessage(2, MessageKind.ACT, encode_act(hold), "", 0.0)
+    held = work(fleet(), claim()._replace(messages=(sent,)), 0.0)
+    document = msgspec.msgpack.decode(held.state)
+    outcome = work(fleet(), claim(windows()[1], state=msgspec.msgpack.encode(document | {"wear": 7})), 0.0)
+    assert statuses(outcome)[0].startswith("failed: the state of servo 'axis' is not understood")
+    assert "act" not in [row.kind for row in outcome.evidence]
+    assert outcome.outgoing == ()
+    assert msgspec.msgpack.decode(outcome.state)["oversight"]["held"] == hold.sentence
+    of_another = msgspec.msgpack.encode(document | {"servo": "another"})
+    assert work(fleet(), claim(windows()[1], state=of_another), 0.0).outgoing
 
 
 def test_a_servo_without_a_model_fails_without_a_word_to_it():
@@ -335,6 +353,10 @@ def test_a_twin_that_is_switched_off_leaves_windows_as_they_are():
     outcome = work(fleet(enabled=False), claim(*windows()), 0.0)
     assert (outcome.evidence, outcome.outgoing, outcome.contexts) == ((), (), ())
     assert outcome.done == tuple(range(1, len(windows()) + 1))
+    approval = Act("axis", ActKind.APPROVE, "eva", "looks right", 5.0, window=("boot-1", 1))
+    sent = StoredMessage(1, MessageKind.ACT, encode_act(approval), "", 0.0)
+    (row,) = work(fleet(enabled=False), claim()._replace(messages=(sent,)), 0.0).evidence
+    assert row.status.endswith("(refused: the twin of this servo is switched off)")
 
 
 def test_what_kills_its_workers_is_found_and_abandoned():

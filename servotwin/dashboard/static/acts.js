@@ -19,13 +19,15 @@ export class ActsPanel {
     this.approving = button("Approve", () => "approve", () => ({ window: this.oversight.proposal.window }));
     this.back = button("Roll back to", () => "roll back", () => ({ version: this.version.value === "fallback" ? null : Number(this.version.value) }));
     this.error = element("p", { class: "error", role: "alert" });
+    this.sent = element("p", { role: "status" });
     this.form = element("div", { class: "acts", hidden: true }, this.why, this.holding, this.asking, this.approving, element("span", { class: "together" }, this.back, this.version));
     this.list = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Acts" });
-    this.content = [this.state, this.waiting, this.form, this.error, this.list];
+    this.content = [this.state, this.waiting, this.form, this.error, this.sent, this.list];
   }
 
   show(oversight, versions, unit) {
     this.oversight = oversight;
+    if (oversight.acts[0]?.done !== this.before) setText(this.sent, "");
     const { held, ask_first: asks, proposal, acts } = oversight;
     const holds = held ? `Held by ${held.who} since ${stamp(held.time)}: ${held.why}. No new version is sent.` : "";
     setText(this.state, [holds, asks ? "Each new version waits for an engineer's approval." : "", !held && !asks ? "Updates are sent as soon as they are verified." : ""].filter(Boolean).join(" "));
@@ -44,7 +46,7 @@ export class ActsPanel {
     }
     const rows = acts.slice(0, 50).map((act) => element("tr", {},
       element("td", { class: "number" }, stamp(act.time ?? act.done)), element("td", {}, act.who ?? "?"),
-      element("td", {}, actText(act)), element("td", {}, act.why ?? ""), element("td", {}, act.refused ? `refused: ${act.refused}` : "done")));
+      element("td", {}, actText(act)), element("td", {}, act.why ?? ""), element("td", {}, act.outcome)));
     const heads = ["When", "Who", "What", "Why", "Outcome"];
     this.list.replaceChildren(rows.length
       ? element("table", {}, element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))), element("tbody", {}, rows))
@@ -59,7 +61,9 @@ export class ActsPanel {
       return;
     }
     try {
+      this.before = this.oversight.acts[0]?.done;
       await api.act(this.name, { act, why, ...named });
+      setText(this.sent, `"${act}" is stored; the twin carries it out as soon as it works on this machine.`);
       this.why.value = "";
       setText(this.error, "");
     } catch (error) {
