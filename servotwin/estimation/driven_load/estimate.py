@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, slowest_and_fastest
@@ -14,21 +15,23 @@ from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.estimation.kinematic.strokes import counts_of, play_and_side
+from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.estimation.output_error.models import DELAY, HALF
 from servotwin.plant.signals import Array
 
 MODEL = "two masses"
 """`model_kind` of an answer that this model gave."""
-_MOST = 10_000  # samples, from the first on
-_PAUSE = 5.0  # usual intervals
-_LEAST = 6  # strokes within them
+_MOST = 10_000  # samples
+_PAUSE = 12.0  # usual intervals, over which nothing says how the load moved
+_LEAST, _ENOUGH = 6, 12  # strokes within them
+_DAMPED = 2.0  # of the critical damping: beyond, the load does not swing
 _FOLDS = 8  # parts of the recording, whose errors are compared
 _EVIDENCE = 2.0  # standard errors
 _BETTER = 0.5  # of the error of a model without dynamics: a larger one is no evidence for dynamics
 _OTHERS = (0.8, 1.25)  # gaps over the best one that the recording must rule out
-_COUNTS = 2.0  # that a model may leave, white or not
+_COUNTS = 0.7  # that a model may leave, white or not; rounding leaves less
+_NOISE = 4.0  # of what differs from sample to sample in the recording: a model may leave so much
 _WHITE = 0.5  # of the variance of what is left, which its past must not predict
 _AT_BOUND = 0.98
 _WIDEST = 0.3  # of the gap: half an interval
@@ -62,14 +65,15 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
     Parameters
     ----------
     recording : EncoderRecording
-        Its first 10 000 samples count.
+        Of its longest part without a pause 10 000 samples count: from the first on, or every k-th one where these hold
+        fewer than twelve strokes.
     lost : LostMotion
         Its answer without dynamics: ratio, lag and cyclic errors.
     """
     if not math.isfinite(lost.ratio) or lost.ratio == 0.0:
         return DrivenGap(None, None, "the load does not follow the motor")
-    piece = _first(recording)
-    strokes = sum(each.time <= piece.time[-1] for each in lost.local) or _strokes(piece)
+    piece = _piece(recording, lost)
+    strokes = _strokes(piece, lost)
     if strokes < _LEAST:
         return DrivenGap(
             None,
@@ -84,15 +88,22 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
     if found is None:
         return DrivenGap(None, None, "too few samples a stroke to see how the load moves: record faster")
     counts = _counts(recording, abs(lost.ratio))
-    reason = _doubt(found, quasi_static, counts)
+    noise = math.hypot(noise_of(recording.motor) * abs(lost.ratio), noise_of(recording.load))
+    reason = _doubt(found, quasi_static, counts, noise, strokes)
+    if reason:
+        return DrivenGap(None, found.dynamics, reason)
     slower = found.again(_STEPS, rate=SLOWER * found.rate)
     # Friction is never as constant as the model has it: as with a known machine, what it winds up is doubtful.
     half = math.hypot(NORMAL_95 * _std(found, slower, counts), found.lost - found.gap)
-    if not reason and half > _WIDEST * found.gap:
+    if half > _WIDEST * found.gap:
         reason = f"the gap is known to {100.0 * half / found.gap:.0f} % only with the load's dynamics"
-    if reason:
         return DrivenGap(None, found.dynamics, reason)
     return DrivenGap(_answer(found, half, lost), found.dynamics, "")
+
+
+def swings(found: TransmissionGap) -> bool:
+    """True where the motion alone shows not even the lost motion, for the load swings or winds up."""
+    return not (found.ok or found.lost.ok or found.status is GapStatus.LOWER_BOUND)
 
 
 def with_dynamics(recording: EncoderRecording, found: TransmissionGap) -> TransmissionGap:
@@ -107,15 +118,29 @@ def with_dynamics(recording: EncoderRecording, found: TransmissionGap) -> Transm
     return replace(found, reasons=tuple(reason for reason in reasons if reason))
 
 
-def _first(recording: EncoderRecording) -> EncoderRecording:
-    """The samples before the first pause; nothing says how the load moved in one."""
-    intervals = np.diff(recording.time[:_MOST])
-    pauses = np.flatnonzero(intervals > _PAUSE * np.median(intervals)) if intervals.size else intervals
-    part = slice(0, int(pauses[0]) + 1 if pauses.size else _MOST)
-    return replace(recording, time=recording.time[part], motor=recording.motor[part], load=recording.load[part])
+def _piece(recording: EncoderRecording, lost: LostMotion) -> EncoderRecording:
+    """At most 10 000 samples of the longest part without a pause; nothing says how the load moved in one."""
+    intervals = np.diff(recording.time)
+    pauses = np.flatnonzero(intervals > _PAUSE * np.median(intervals)) + 1 if intervals.size else intervals
+    parts = np.split(np.arange(recording.time.size), pauses.astype(int))
+    rows = max(parts, key=len)
+    whole = _rows(recording, rows)
+    if rows.size > _MOST:
+        # Strokes that last longer than the samples go are worth more than every sample of few strokes.
+        wanted = _ENOUGH * rows.size / (max(_strokes(whole, lost), 1) * _MOST)
+        every = min(max(1, math.ceil(wanted)), math.ceil(rows.size / _MOST))
+        whole = _rows(recording, rows[::every][:_MOST])
+    return whole
 
 
-def _strokes(piece: EncoderRecording) -> int:
+def _rows(recording: EncoderRecording, rows: NDArray[np.int_]) -> EncoderRecording:
+    return replace(recording, time=recording.time[rows], motor=recording.motor[rows], load=recording.load[rows])
+
+
+def _strokes(piece: EncoderRecording, lost: LostMotion) -> int:
+    first, last = piece.time[0], piece.time[-1]
+    if lost.local:
+        return sum(first <= each.time <= last for each in lost.local)
     side = np.zeros(piece.motor.size, dtype=np.int8)
     play_and_side(piece.motor, 0.1 * float(np.ptp(piece.motor)), side)
     return int(np.count_nonzero(np.diff(side[side != 0]))) + 1
@@ -129,13 +154,13 @@ def _quasi_static(problem: DrivenLoad, lost: LostMotion) -> Array:
     return np.asarray(late - np.mean(late - problem.position))
 
 
-def _doubt(found: LoadFit, quasi_static: Array, counts: float) -> str:
-    """Reason not to believe the fit; empty: none. `counts` is one of both encoders, at the load."""
+def _doubt(found: LoadFit, quasi_static: Array, counts: float, noise: float, strokes: int) -> str:
+    """Reason not to believe the fit; empty: none. `counts` is one of both encoders, at the load, as `noise` is."""
     problem = found.problem
     bare = problem.quasi_static_misfit(quasi_static, found.rate)
     if not found.rms < _BETTER * float(np.std(bare)) or not _worse(bare, found.fit.raw):
         return "a load on a spring predicts its motion no better than play alone"
-    fastest = slowest_and_fastest(problem, 1)[1]
+    slowest, fastest = slowest_and_fastest(problem, strokes)
     if found.dynamics.frequency > fastest:
         rate = found.dynamics.frequency / fastest / problem.interval
         return f"the load swings too fast for the recording: record at {rate:.2g} Hz or more"
@@ -145,9 +170,15 @@ def _doubt(found: LoadFit, quasi_static: Array, counts: float) -> str:
         for unknown, value, limit in zip(problem.model.unknowns, found.fit.values, limits, strict=True)
         if math.isfinite(limit) and (value if unknown.unit == "damping" else abs(value)) > _AT_BOUND * limit
     ]
+    # The fit begins again at what it found, which its bounds move along with.
+    dynamics = found.dynamics
+    bound += ["frequency"] if dynamics.frequency < slowest else []
+    bound += ["damping"] if max(dynamics.damping, dynamics.viscous) > _DAMPED else []
     if bound:
         return f"the fit of the load's dynamics ends at a bound ({', '.join(bound)})"
-    if found.rms > _COUNTS * counts and burg(found.fit.raw[None], 24).unpredicted < _WHITE:
+    # Impacts of a wrong model, far apart, may look white: they are larger than what differs from sample to sample.
+    coloured = burg(found.fit.raw[None], 24).unpredicted < _WHITE
+    if found.rms > _COUNTS * counts and (coloured or found.rms > _NOISE * noise):
         return "the load on a spring leaves more than noise: it has other dynamics too"
     for other in _OTHERS:
         tried = found.split(other * found.gap, _STEPS, gap_free=False)
