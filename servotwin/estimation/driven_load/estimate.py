@@ -14,10 +14,13 @@ from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, slow
 from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.kinematic.lost_motion import LostMotion
+from servotwin.estimation.kinematic.models import ModelTrial
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side
-from servotwin.estimation.kinematic.wind_up import TransmissionGap
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, units_of
 from servotwin.estimation.output_error.models import DELAY, HALF
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 
 MODEL = "two masses"
@@ -48,14 +51,25 @@ class DrivenGap(NamedTuple):
     dynamics : LoadDynamics or None
         None: nothing was fitted.
     reason : str
+    share : float
+        Error of the next samples that it predicts, over that of play alone; NaN where nothing was fitted.
     """
 
     gap: TransmissionGap | None
     dynamics: LoadDynamics | None
     reason: str
+    share: float = math.nan
+
+    def trial(self) -> ModelTrial:
+        """A line for the table of models."""
+        found = math.nan if self.gap is None else self.gap.lost.at_motor
+        tried = f"{100.0 * self.share:.3g} % of the error of play alone in the next samples"
+        swings = "" if self.dynamics is None else f", {self.dynamics.frequency / (2.0 * math.pi):.3g} Hz"
+        said = "taken: " + tried + swings if self.gap is not None else f"not taken: {self.reason}"
+        return ModelTrial(MODEL, found, math.nan, said)
 
 
-def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenGap:
+def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion, known: LoadDynamics | None = None) -> DrivenGap:
     """Fit a load behind play and spring to the motor's and the load's motion, and judge if it shows the gap.
 
     While the load swings freely in the gap, nothing but its friction brakes it; while the transmission winds up, the
@@ -69,6 +83,8 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
         fewer than twelve strokes.
     lost : LostMotion
         Its answer without dynamics: ratio, lag and cyclic errors.
+    known : LoadDynamics, optional
+        Of the machine as far as it is known, in the recording's units: where the search also begins.
     """
     if not math.isfinite(lost.ratio) or lost.ratio == 0.0:
         return DrivenGap(None, None, "the load does not follow the motor")
@@ -84,21 +100,24 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
     cycles = lost.cycles if "cyclic" in lost.model else ()
     problem = DrivenLoad(LoadDynamics(1.0, 1.0, 1.0), piece, lost.ratio, 0.0, cycles)
     quasi_static = _quasi_static(problem, lost)
-    found = best_fit(problem, quasi_static, strokes)
+    if known is not None and known.frequency > problem.fastest:
+        return DrivenGap(None, known, _too_fast(known.frequency, problem))
+    found = best_fit(problem, quasi_static, strokes, known)
     if found is None:
         return DrivenGap(None, None, "too few samples a stroke to see how the load moves: record faster")
     counts = _counts(recording, abs(lost.ratio))
+    share = found.rms / float(np.std(problem.quasi_static_misfit(quasi_static, found.rate)))
     noise = math.hypot(noise_of(recording.motor) * abs(lost.ratio), noise_of(recording.load))
     reason = _doubt(found, quasi_static, counts, noise, strokes)
     if reason:
-        return DrivenGap(None, found.dynamics, reason)
+        return DrivenGap(None, found.dynamics, reason, share)
     slower = found.again(_STEPS, rate=SLOWER * found.rate)
     # Friction is never as constant as the model has it: as with a known machine, what it winds up is doubtful.
     half = math.hypot(NORMAL_95 * _std(found, slower, counts), found.lost - found.gap)
     if half > _WIDEST * found.gap:
         reason = f"the gap is known to {100.0 * half / found.gap:.0f} % only with the load's dynamics"
-        return DrivenGap(None, found.dynamics, reason)
-    return DrivenGap(_answer(found, half, lost), found.dynamics, "")
+        return DrivenGap(None, found.dynamics, reason, share)
+    return DrivenGap(_answer(found, half, lost), found.dynamics, "", share)
 
 
 def swings(found: TransmissionGap) -> bool:
@@ -106,16 +125,38 @@ def swings(found: TransmissionGap) -> bool:
     return not (found.ok or found.lost.ok or found.status is GapStatus.LOWER_BOUND)
 
 
-def with_dynamics(recording: EncoderRecording, found: TransmissionGap) -> TransmissionGap:
-    """The gap that the load's dynamics show where the motion alone does not; else what is known, and the reason."""
+def load_of(machine: Plant, load_unit: float) -> LoadDynamics | None:
+    """Dynamics of a machine's load, its masses taken for one; None where nothing between motor and load gives way.
+
+    `load_unit` is the recording's unit of the load in SI units.
+    """
+    if not isinstance(machine, Axis) or math.isinf(machine.transmission.k_d):
+        return None
+    stiffness, mass = machine.transmission.k_d, float(np.sum(machine.load.masses))
+    frequency = math.sqrt(stiffness / mass)
+    critical = 2.0 * mass * frequency
+    return LoadDynamics(
+        frequency,
+        machine.transmission.c_d / critical,
+        machine.guide.friction / stiffness / load_unit,
+        float(np.sum(machine.load.dampings)) / critical,
+    )
+
+
+def with_dynamics(recording: EncoderRecording, found: TransmissionGap, machine: Plant | None = None) -> TransmissionGap:
+    """The gap that the load's dynamics show where the motion alone does not; else what is known, and the reason.
+
+    With a `machine` the search also begins at its load.
+    """
     if found.ok or found.status is GapStatus.LOWER_BOUND:
         return found
-    driven = gap_of_driven_load(recording, found.lost)
+    known = None if machine is None else load_of(machine, units_of(recording, machine)[1])
+    driven = gap_of_driven_load(recording, found.lost, known)
     if driven.gap is not None:
-        return driven.gap
+        return replace(driven.gap, dynamics=driven.trial())
     *others, last = found.reasons or ("",)
     reasons = (*others, f"the load's dynamics do not show the gap: {driven.reason}", last)
-    return replace(found, reasons=tuple(reason for reason in reasons if reason))
+    return replace(found, reasons=tuple(reason for reason in reasons if reason), dynamics=driven.trial())
 
 
 def _piece(recording: EncoderRecording, lost: LostMotion) -> EncoderRecording:
@@ -162,8 +203,7 @@ def _doubt(found: LoadFit, quasi_static: Array, counts: float, noise: float, str
         return "a load on a spring predicts its motion no better than play alone"
     slowest, fastest = slowest_and_fastest(problem, strokes)
     if found.dynamics.frequency > fastest:
-        rate = found.dynamics.frequency / fastest / problem.interval
-        return f"the load swings too fast for the recording: record at {rate:.2g} Hz or more"
+        return _too_fast(found.dynamics.frequency, problem)
     limits = problem.limits()
     bound = [
         unknown.name
@@ -188,6 +228,11 @@ def _doubt(found: LoadFit, quasi_static: Array, counts: float, noise: float, str
                 "the gap explain the recording as well; record faster reversals too"
             )
     return ""
+
+
+def _too_fast(frequency: float, problem: DrivenLoad) -> str:
+    rate = frequency / problem.fastest / problem.interval
+    return f"the load swings too fast for the recording: record at {rate:.2g} Hz or more"
 
 
 def _worse(raw: Array, best: Array) -> bool:

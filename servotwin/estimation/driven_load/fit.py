@@ -106,20 +106,29 @@ def slowest_and_fastest(problem: DrivenLoad, strokes: int) -> tuple[float, float
     return low, problem.fastest
 
 
-def best_fit(problem: DrivenLoad, quasi_static: Array, strokes: int) -> LoadFit | None:
-    """The load that predicts its motion best, compared with a model (N,) without dynamics; None: none can show."""
+def best_fit(
+    problem: DrivenLoad, quasi_static: Array, strokes: int, known: LoadDynamics | None = None
+) -> LoadFit | None:
+    """The load that predicts its motion best, compared with a model (N,) without dynamics; None: none can show.
+
+    The search begins at all frequencies that the recording may show, and at a load that is `known`.
+    """
     low, high = slowest_and_fastest(problem, strokes)
     if not high > 2.0 * low:
         return None
     reach, middle = problem.range, -0.5 * float(np.max(problem.lead) + np.min(problem.lead))
+    begins = [
+        [LoadDynamics(each, _DAMPING, friction * reach) for friction in _FRICTIONS]
+        for each in np.geomspace(low, high, _FREQUENCIES).tolist()
+    ]
     kept = []
-    for frequency in np.geomspace(low, high, _FREQUENCIES).tolist():
-        rate = OBSERVER * frequency
+    for loads in begins if known is None else [[known], *begins]:
+        rate = OBSERVER * loads[0].frequency
         bare = float(np.std(problem.quasi_static_misfit(quasi_static, rate)))
         tried: list[tuple[float, int, DrivenLoad, Array, float]] = []
         for gap in _GAPS:
-            for friction in _FRICTIONS:
-                begun = problem.with_load(LoadDynamics(frequency, _DAMPING, friction * reach))
+            for load in loads:
+                begun = problem.with_load(load)
                 values = begun.start(0.5 * gap * reach, middle)
                 tried.append((float(np.std(begun.misfit(values, rate))) / bare, len(tried), begun, values, rate))
         kept.append(min(tried, key=lambda each: each[:2]))
