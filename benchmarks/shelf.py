@@ -1,5 +1,7 @@
 """Every preset of the shelf with its twin in the loop, while its gap grows from nothing to ten times the healthy one.
 
+The gap grows in levels, between windows where they leave room: a machine that wears in years has one gap in a window.
+
 ``python -m benchmarks.batch shelf --seed 5 --count 45 FILE`` measures the twin's estimates while the preset's own
 controller runs; ``shelf-certified`` instead of ``shelf`` lets the twin send verified settings to machines worn
 by any amount. The blocks are the presets.
@@ -9,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,7 +28,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.plant.axis import Axis
-from servotwin.plant.signals import SCurve, SquareWave
+from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.simulation import Run, Simulation
 from servotwin.twin.settings import TwinSettings
@@ -34,7 +36,9 @@ from servotwin.twin.settings import TwinSettings
 NAME, CERTIFIED = "shelf", "shelf-certified"
 WORN = 10.0
 """Largest gap over the healthy one."""
-STEPS, CERTIFIED_STEPS = 12, 4
+LEVELS, CERTIFIED_STEPS = 12, 4
+_MOVES = (0.6, 0.9)
+"""Part of a half period in which the gap moves to its next level: after the windows that end 0.55 past a step."""
 
 
 class Duty(NamedTuple):
@@ -49,12 +53,15 @@ class Duty(NamedTuple):
     before, window : float
         Of the half period: part of a window before a step, and length of a window. A motor that comes to rest without
         overshoot touches one flank in each step, so that a window must hold two of them.
+    hold : int
+        Half periods of each level of the gap. Windows longer than a half period overlap: one of them sees each move.
     """
 
     gap: float
     half_period: float
     before: float = 0.05
     window: float = 0.5
+    hold: int = 1
 
 
 _ARC_SECOND = math.radians(1.0 / 3600.0)
@@ -63,10 +70,10 @@ SHELF: Mapping[str, Duty] = {
     "ball-screw": Duty(5e-6, 0.4),
     "robot-joint": Duty(math.radians(0.05), 4.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
-    "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5),
-    "micro-positioner": Duty(200e-9, 3.0, 0.95, 1.5),
+    "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3),
+    "micro-positioner": Duty(200e-9, 3.0, 0.95, 1.5, 3),
     "gantry": Duty(5e-5, 5.0),
-    "emps": Duty(1e-5, 0.4),
+    "emps": Duty(1e-5, 1.0),
 }
 # Model's errors, relative; amplitudes of the reference in healthy gaps.
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1}
@@ -93,6 +100,7 @@ class ShelfMachine:
     worn : (float, float)
         First and last gap over the healthy one.
     steps : int
+        0: as many as the levels take.
     certified : bool
         True where the twin sends verified settings; otherwise the preset's own controller runs on.
     """
@@ -101,8 +109,12 @@ class ShelfMachine:
     plant: Axis
     amplitude: float
     worn: tuple[float, float] = (0.0, WORN)
-    steps: int = STEPS
+    steps: int = 0
     certified: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.steps:
+            object.__setattr__(self, "steps", LEVELS * SHELF[self.name].hold)
 
     @property
     def model(self) -> Axis:
@@ -115,10 +127,19 @@ class ShelfMachine:
         return self.steps * SHELF[self.name].half_period
 
     @property
-    def gap(self) -> SCurve:
-        """Total gap, rad at the motor."""
-        healthy = SHELF[self.name].gap / self.model.p
-        return SCurve(self.worn[0] * healthy, self.worn[1] * healthy, self.duration)
+    def gap(self) -> PiecewiseCubic:
+        """Total gap, rad at the motor, level after level."""
+        duty, healthy = SHELF[self.name], SHELF[self.name].gap / self.model.p
+        count = -(-self.steps // duty.hold)
+        levels = healthy * np.linspace(*self.worn, count)
+        times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
+        for place in range(1, count) if self.worn[0] != self.worn[1] else ():
+            begin, end = (duty.half_period * (place * duty.hold - 1.0 + part) for part in _MOVES)
+            rise, length = levels[place] - levels[place - 1], end - begin
+            times += [begin, end]
+            pieces += [[levels[place - 1], 0.0, 3.0 * rise / length**2, -2.0 * rise / length**3]]
+            pieces += [[levels[place], 0.0, 0.0, 0.0]]
+        return PiecewiseCubic(np.array(times), np.array(pieces))
 
     @property
     def reference(self) -> SquareWave:
@@ -251,12 +272,14 @@ def judged(estimate: GapEstimate, gaps: tuple[float, float, float], count: float
     """An accepted estimate: gap (rad) in the middle of its window, error, and 1.0 where the interval contains that gap.
 
     It is near where it is off by at most 1 % or two counts from a gap that the machine had within the window, from the
-    first to the last of `gaps`: here a gap that wears in years grows by up to a tenth in one window.
+    first to the last of `gaps`; steady where they are the same, as in all windows that see no move.
     """
     (first, gap, last), (low, high) = gaps, estimate.interval
     error = max(first - estimate.gap, estimate.gap - last, 0.0)
     near = error <= max(_EXACT * gap, _COUNTS * count)
-    return {"gap": gap, "error": error, "inside": float(low <= gap <= high), "near": float(near)}
+    return {"gap": gap, "error": error, "inside": float(low <= gap <= high), "near": float(near)} | {
+        "steady": float(first == last)
+    }
 
 
 def steps_of(machine: ShelfMachine, run: Run) -> dict[str, list[float]]:
@@ -305,6 +328,11 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
         console.print(note, markup=False, highlight=False)
 
 
+def _share(ones: Iterable[float]) -> str:
+    ones = list(ones)
+    return f"{100.0 * sum(ones) / max(1, len(ones)):.1f}"
+
+
 def _line(ran: Sequence[Mapping[str, Any]], machines: Sequence[Mapping[str, Any]]) -> list[str]:
     own = ["", ""] if not machines else [_settled(machines, "own"), _cost(machines, "own")]
     if not ran:
@@ -313,11 +341,11 @@ def _line(ran: Sequence[Mapping[str, Any]], machines: Sequence[Mapping[str, Any]
     windows = sum(len(machine["statuses"]) for machine in ran)
     false = sum(not each["near"] and not each["inside"] for each in estimates)
     worst = max((each["error"] / each["gap"] for each in estimates if not each["near"]), default=0.0)
-    count = max(1, len(estimates))
+    steady = [each for each in estimates if each["steady"]]
     return [
         str(windows),
         str(len(estimates)),
-        *(f"{100.0 * sum(each[name] for each in estimates) / count:.1f}" for name in ("inside", "near")),
+        *(_share(each[name] for each in part) for name, part in (("inside", steady), ("near", estimates))),
         str(false),
         f"{100.0 * worst:.2g}",
         _settled(ran, "twin"),

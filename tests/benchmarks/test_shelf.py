@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from benchmarks.shelf import SHELF, certified_machines, judged, measured, shelf_machines
@@ -19,12 +20,25 @@ def test_every_preset_has_a_duty_and_machines_near_it() -> None:
     for name in SHELF:
         machines = shelf_machines(name, 3, 5)
         assert machines == shelf_machines(name, 4, 5)[:3]
-        assert machines[0].gap.end_value == pytest.approx(10.0 * SHELF[name].gap / machines[0].model.p)
+        assert machines[0].gap.value(machines[0].duration) == pytest.approx(
+            10.0 * SHELF[name].gap / machines[0].model.p
+        )
         worn = certified_machines(name, 3, 5)
         assert [each.plant for each in worn] == [each.plant for each in machines]
         # A stepper goes where it is told, and its load follows: none of the numbers that are off is in its model.
         assert (machines[0].plant == machines[0].model) == (name == "stepper-stage")
         assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
+
+
+@pytest.mark.parametrize("name", SHELF)
+def test_no_window_between_two_levels_sees_the_gap_move(name: str) -> None:
+    """Windows longer than a half period overlap; one in `hold` of them may see a move."""
+    (machine,), duty = shelf_machines(name, 1, 5), SHELF[name]
+    starts = np.maximum(np.arange(duty.hold > 1, machine.steps) - duty.before, 0.0) * duty.half_period
+    moving = [machine.gap.constant_between(start, start + duty.window * duty.half_period) is None for start in starts]
+    assert sum(moving) <= (0 if duty.hold == 1 else machine.steps / duty.hold)
+    levels = {round(float(machine.gap.value(start) / machine.gap.value(machine.duration)), 9) for start in starts}
+    assert {0.0, 1.0} <= levels
 
 
 @pytest.mark.slow
@@ -55,7 +69,7 @@ def test_an_estimate_is_judged_by_gap_interval_and_counts() -> None:
         estimate = GapEstimate(gap, 0.1 * half, half, (gap - half, gap + half), GapStatus.OK, 1.0)
         return judged(estimate, (0.9, 1.0, 1.1), 1e-3)
 
-    assert at(1.0, 0.1) == {"gap": 1.0, "error": 0.0, "inside": 1.0, "near": 1.0}
+    assert at(1.0, 0.1) == {"gap": 1.0, "error": 0.0, "inside": 1.0, "near": 1.0, "steady": 0.0}
     assert at(1.109, 0.05)["near"] == 1.0
     assert at(1.109, 0.05)["inside"] == 0.0
     assert at(0.5, 0.1)["near"] == 0.0
