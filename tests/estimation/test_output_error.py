@@ -194,6 +194,22 @@ def test_growth_within_a_window_with_rests_counts_for_the_whole_window() -> None
     assert grown(found, rate) == pytest.approx(rate * 4.0 / math.sqrt(12.0), rel=1e-3)
 
 
+@pytest.mark.parametrize(("far", "accepted"), [(55.2e-6, False), (70e-6, True)])
+def test_a_motor_that_creeps_through_its_gap_repeats_one_error_of_rounding(far: float, accepted: bool) -> None:
+    """The load rests at one count meanwhile: taken for many small errors these said 3.03 +- 0.05 deg for 3.6."""
+    axis, gap, time = Axis.preset("stepper-stage"), math.radians(3.6), np.arange(6000) / 1000.0
+    creep = 2e-6 * (np.clip(time - 1.0, 0.0, 1.5) - np.clip(time - 4.5, 0.0, 1.0))
+    there = far * (2.0 * np.exp(-6.0 * time) - 1.0)
+    back = there[2499] + 2.0 * far * (1.0 - np.exp(-6.0 * (time - 2.5)))
+    angle = (np.where(time < 2.5, there, back) + creep) / axis.p
+    position = axis.p * play(angle, gap, angle[0] - 0.5 * gap)
+    steps = axis.sensors.position_resolution, axis.sensors.encoder_resolution
+    seen = [step * np.round(values / step) for values, step in zip((position, angle), steps, strict=True)]
+    estimate = estimate_gap(Window(*seen, sample_rate=1000.0), axis)
+    assert estimate.ok == accepted
+    assert estimate.interval[0] <= gap <= estimate.interval[1]
+
+
 def test_halves_that_differ_by_the_growth_that_is_told_are_no_mismatch() -> None:
     time = np.arange(4000) / 1000.0
     angle, gap = np.sin(6.0 * time), 0.05 * (1.0 + 0.02 * time)

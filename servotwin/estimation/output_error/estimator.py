@@ -115,17 +115,23 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
     model: MotionModel = ShaftModel(axis, priors) if free else PlayModel(axis, priors)
     count = math.hypot(axis.p * at_motor, at_load)
     # Play does not depend on time: samples of a rest repeat one error, which the fit would take for many small ones.
-    told = slice(None) if free else _moving(theta_m, window.position)
+    told = slice(None) if free else _moving(axis.p * theta_m, window.position, 0.5 * at_load)
     return Problem(model, axis.p * theta_m[told], window.position[told], interval, count, window.duration)
 
 
-def _moving(theta_m: Array, position: Array) -> NDArray[np.bool_]:
-    """(N,) samples near one at which a channel changes; all where these are too few."""
-    changes = np.zeros(theta_m.size)
-    changes[1:] = (np.diff(theta_m) != 0.0) | (np.diff(position) != 0.0)
+def _moving(drive: Array, position: Array, slow: float) -> NDArray[np.bool_]:
+    """(N,) samples near one at which the load moves or the motor does by more than `slow`; all where these are too few.
+
+    A motor that creeps through its gap leaves the load at one rounding error too. Its turning points stay.
+    """
+    changes = np.zeros(drive.size)
+    changes[1:] = (np.abs(np.diff(drive)) > slow) | (np.diff(position) != 0.0)
     near = np.convolve(changes, np.ones(2 * _NEAR + 1), "same") > 0.0
     near[: _NEAR + 1] = near[-_NEAR:] = True
-    return near if np.count_nonzero(near) >= SHORTEST else np.ones(theta_m.size, dtype=bool)
+    edges = np.flatnonzero(np.diff(near)) + 1
+    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        near[[first + int(np.argmin(drive[first:last])), first + int(np.argmax(drive[first:last]))]] = True
+    return near if np.count_nonzero(near) >= SHORTEST else np.ones(drive.size, dtype=bool)
 
 
 def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:
