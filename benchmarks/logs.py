@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +24,9 @@ from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
 from benchmarks.shelf import SHELF
 from servotwin.errors import InvalidInput
+from servotwin.estimation.driven_load.estimate import swings, with_dynamics
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
-from servotwin.estimation.kinematic.wind_up import gap_of_machine, gap_within, wind_up
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within, wind_up
 from servotwin.logs.recordings import read_recording
 from servotwin.plant.axis import Axis
 from servotwin.plant.shown import position_unit
@@ -164,15 +166,35 @@ def measured(case: LogCase) -> dict[str, Any]:
             return found | {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
     unit = position_unit(case.plant).si
     answer = gap_within(lost, None)
-    known = gap_of_machine(replace(recording, load_unit=unit), lost, Axis.preset(case.name))
+    in_si = replace(recording, load_unit=unit)
+    begun = time.process_time()
+    dynamics = with_dynamics(in_si, answer) if swings(answer) else answer
+    seconds = time.process_time() - begun
+    try:
+        known = gap_of_machine(in_si, lost, Axis.preset(case.name))
+        of_axis = _said(known) | {"dynamics": _said(with_dynamics(in_si, known) if swings(known) else known)}
+    except InvalidInput as error:
+        of_axis = {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
     return found | {
-        "axis": {"status": known.status.value, "interval": _numbers(known.interval_motor)},
+        "axis": of_axis,
+        "dynamics": _said(dynamics) | {"seconds": seconds},
+        "ratio": lost.ratio / case.plant.p,
         "status": answer.status.value,
         "reasons": list(answer.reasons),
         "model": lost.model,
         "lost_motion": lost.at_motor if math.isfinite(lost.at_motor) else None,
         "lost_motion_interval": _numbers(lost.interval_motor),
         "interval": _numbers(answer.interval_motor),
+    }
+
+
+def _said(found: TransmissionGap) -> dict[str, Any]:
+    return {
+        "status": found.status.value,
+        "interval": _numbers(found.interval_motor),
+        "ratio_found": found.lost.ratio,
+        "reasons": list(found.reasons),
+        "model": found.lost.model,
     }
 
 

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import with_dynamics
+from servotwin.estimation.driven_load.estimate import swings, with_dynamics
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
@@ -45,9 +45,12 @@ def show(
     axis: str | None = None,
     dates: str | None = None,
     stiff: bool = False,
-    dynamics: bool = False,
+    dynamics: bool | None = None,
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
+
+    The load's dynamics are fitted always (`dynamics`), never, or (None) where it swings so that play alone shows
+    nothing.
 
     Raises
     ------
@@ -73,9 +76,9 @@ def show(
             lost = estimate_lost_motion(log.recording)
             known = 0.0 if stiff else None
             found = gap_within(lost, known) if machine is None else gap_of_machine(log.recording, lost, machine)
-            if dynamics:
+            if dynamics or (dynamics is None and not stiff and swings(found)):
                 status.update(f"{path.name}: dynamics of the load")
-                found = with_dynamics(log.recording, found)
+                found = with_dynamics(log.recording, found, machine)
             answers.append((log, found))
     if page is not None:
         log, found = answers[-1]
@@ -238,11 +241,12 @@ def as_dict(log: RecordedLog, found: TransmissionGap) -> dict[str, Any]:
         "rms_load": _number(lost.rms),
         "models": [
             {
-                "model_kind": each.model.name,
+                "model_kind": each.name,
                 "lost_motion_motor": _number(each.gap),
                 "rms_out_of_sample_load": _number(each.rms),
+                "evidence": each.evidence,
             }
-            for each in lost.comparisons
+            for each in found.trials
         ],
         "segments": [
             {"time_s": each.time, "position_load": each.position, "lost_motion_motor": each.gap} for each in lost.local
@@ -276,7 +280,7 @@ def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
         f"lag {1e3 * lost.lag:.3g} ms{shown}, rms left {lost.rms:.3g} {unit}",
         highlight=False,
     )
-    console.print(_models(lost, unit), highlight=False)
+    console.print(_models(found, unit), highlight=False)
     if len(lost.local) > 1:
         console.print(_local(lost, unit), highlight=False)
 
@@ -301,12 +305,23 @@ def headline(found: TransmissionGap, unit: str, motor_unit: str) -> str:
     )
 
 
-def _models(found: LostMotion, unit: str) -> Table:
-    table = Table("model", f"lost motion, {unit}", f"error on unseen strokes, {unit}", box=None, pad_edge=False)
-    for each in found.comparisons:
-        name = f"[bold]{each.model.name}[/]" if each.model.name == found.model else each.model.name
-        table.add_row(name, f"{each.gap * abs(found.ratio):.4g}", f"{each.rms:.4g}")
+def _models(found: TransmissionGap, unit: str) -> Table:
+    lost = f"lost motion, {unit}"
+    table = Table("model", lost, f"error on unseen strokes, {unit}", "evidence", box=None, pad_edge=False)
+    for row in model_rows(found):
+        name = f"[bold]{row[0]}[/]" if row[0] == found.lost.model else row[0]
+        table.add_row(name, *row[1:])
     return table
+
+
+def model_rows(found: TransmissionGap) -> list[list[str]]:
+    """Name, lost motion and error at the load, and evidence of each model that was tried."""
+    scale = abs(found.lost.ratio)
+    return [
+        [each.name, *(f"{value:.4g}" if math.isfinite(value) else "-" for value in (each.gap * scale, each.rms)),
+         each.evidence]
+        for each in found.trials
+    ]  # fmt: skip
 
 
 def _local(found: LostMotion, unit: str) -> Table:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from servotwin.cli.lost_motion import model_rows
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.recordings import RecordedLog
 from servotwin.report import page, style
@@ -67,9 +68,8 @@ def picture(log: RecordedLog, found: TransmissionGap) -> Any:
 
 
 def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes) -> str:
-    unit, scale = log.recording.load_unit, abs(found.lost.ratio)
+    unit = log.recording.load_unit
     defects = [[str(count), defect] for defect, count in log.found.items()]
-    models = [[each.model.name, f"{each.gap * scale:.4g}", f"{each.rms:.4g}"] for each in found.lost.comparisons]
     body = [
         f"<h1>Gap of {escape(log.recording.source.removeprefix('log '))}</h1>",
         f"<p>{escape(headline)}</p>",
@@ -82,7 +82,9 @@ def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes
             "error for other lost motions; shaded: 95 % interval.",
         ),
         "<h2>Models</h2>",
-        page.table(["model", f"lost motion, {unit}", f"error on unseen strokes, {unit}"], models),
+        page.table(
+            ["model", f"lost motion, {unit}", f"error on unseen strokes, {unit}", "evidence"], model_rows(found)
+        ),
     ]
     if defects:
         body += ["<h2>Defects of the log</h2>", page.table(["number", "what"], defects)]

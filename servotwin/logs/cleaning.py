@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ _Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
 _STALE = 50.0  # times the usual interval: a first sample so far before the others is an old one
 _DROPOUT = 5.0  # times the usual interval
+_EDGE = 4  # samples on either side of a pause that show the speed
 _SPIKE = 20.0  # times the usual step between samples, there and back
 _FASTEST, _UNSURE = 0.99, 0.35  # quantile of the steps, and turns: beyond, half a turn more is not told from one less
 NEAR_TURN = 0.2
@@ -37,11 +38,14 @@ class Cleaned(NamedTuple):
         (n,) arrays by name.
     found : mapping
         Number of samples by defect, in words; only defects that occur.
+    parted : list of float
+        Times, s, of the samples behind pauses in which angles that wrap turned by nobody knows how much.
     """
 
     time: Array
     channels: Mapping[str, Array]
     found: Mapping[str, int]
+    parted: Sequence[float] = ()
 
 
 def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float], first: bool = True) -> Cleaned:
@@ -81,11 +85,14 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     back = table[:, 0] < latest
     keep(~back, "earlier than the sample before")
     keep(~repeated[~back], "at the time of the sample before")
+    parted: list[float] = []
     for place, name in enumerate(names, 1):
         if name in turns:
             table[:, place], count = _unwrapped(table[:, place], turns[name])
             if count:
                 _check_followed(name, table[:, place], turns[name])
+                table[:, place], lost = _bridged(table[:, 0], table[:, place], turns[name])
+                parted += lost
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
         keep(~_spikes(table[:, place]), f"spikes of {name}")
@@ -94,10 +101,9 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
         held = _repeats(table[:, place]) if name in _MEASURED else 0
         if held:
             found[f"repeats of a {name} that is written more often than it is measured"] = held
-    gaps = _dropouts(table[:, 0])
-    if gaps:
-        found["pauses longer than five intervals"] = gaps
-    return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found)
+    if gaps := pauses(table[:, 0]):
+        found["pauses longer than five intervals"] = len(gaps)
+    return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found, parted)
 
 
 def unwrapped_turns(name: str) -> str:
@@ -123,6 +129,44 @@ def _check_followed(name: str, angle: Array, turn: float) -> None:
             f"the {name}'s angle wraps, and moves by up to {step / turn:.2f} turns from one sample to the next: its "
             "turns cannot be counted; record it unwrapped, or with more samples"
         )
+
+
+def pauses(time: Array) -> list[int]:
+    """Samples behind pauses of more than five usual intervals."""
+    intervals = np.diff(time)
+    usual = np.median(intervals) if intervals.size else 0.0
+    return [int(row) + 1 for row in np.flatnonzero(intervals > _DROPOUT * usual)]
+
+
+def _bridged(time: Array, angle: Array, turn: float) -> tuple[Array, list[float]]:
+    """An unwrapped angle with the turns that it made in pauses, and the times behind those whose turns are not known.
+
+    In a pause it goes on with the mean of the speeds before and behind it. By how much that is wrong shows wherever
+    the log has no pause.
+    """
+    angle, lost, span = angle.copy(), list[float](), 2 * _EDGE
+    usual = float(np.median(np.diff(time))) if time.size > 1 else 0.0
+    for row in pauses(time):
+        length = float(time[row] - time[row - 1])
+        grid = np.arange(time[0], time[-1], usual)
+        steps = round(length / usual)
+        whole = np.interp(grid, time, angle)
+        speed = (whole[_EDGE:] - whole[:-_EDGE]) / _EDGE
+        # From sample i to i + steps, with the speeds over _EDGE samples before i and behind i + steps.
+        usable = whole.size - steps - span
+        if row < _EDGE + 1 or row + _EDGE >= time.size or usable < steps:
+            lost.append(float(time[row]))
+            continue
+        guesses = 0.5 * steps * (speed[:usable] + speed[_EDGE + steps :][:usable])
+        wrong = np.abs(whole[_EDGE + steps :][:usable] - whole[_EDGE:][:usable] - guesses)
+        if np.quantile(wrong, _FASTEST) > _UNSURE * turn:
+            lost.append(float(time[row]))
+            continue
+        before = (angle[row - 1] - angle[row - 1 - _EDGE]) / (time[row - 1] - time[row - 1 - _EDGE])
+        behind = (angle[row + _EDGE] - angle[row]) / (time[row + _EDGE] - time[row])
+        guess = 0.5 * length * (before + behind) - (angle[row] - angle[row - 1])
+        angle[row:] += turn * np.round(guess / turn)
+    return angle, lost
 
 
 def _spikes(values: Array) -> _Mask:
@@ -151,8 +195,3 @@ def _repeats(values: Array) -> int:
         return 0
     # A channel at rest goes on being measured: of a longer run one in so many samples is new.
     return int(np.sum(lengths - lengths // usual))
-
-
-def _dropouts(time: Array) -> int:
-    intervals = np.diff(time)
-    return int(np.sum(intervals > _DROPOUT * np.median(intervals))) if intervals.size else 0

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from servotwin.logs.cleaning import NEAR_TURN, WITHIN, Cleaned, cleaned, unwrapped_turns
+from servotwin.logs.cleaning import NEAR_TURN, WITHIN, Cleaned, cleaned, pauses, unwrapped_turns
 from servotwin.plant.signals import Array
 
 MOST = 1_500_000
@@ -15,6 +15,7 @@ MOST = 1_500_000
 _GROUP = 6  # samples, of which the first, and the lowest and the highest of the motor stay
 _BULK = (0.01, 0.99)  # quantiles of an angle, between which no spike counts
 THINNED = "left out of a long log, turning points kept"
+PARTED = "apart from the longest part: in a pause turns of an angle that wraps may have been lost"
 
 
 class Gathering:
@@ -35,6 +36,7 @@ class Gathering:
         self._last: Array | None = None
         self._found: Counter[str] = Counter()
         self._thinnings = 0
+        self._parted: list[float] = []  # times, before which turns may have been lost
         # Decided once for the log: angles that wrap, and those that cannot, for they go beyond a turn.
         self._wrapped: set[str] = set()
         self._ranges: dict[str, tuple[float, float]] = {}
@@ -51,6 +53,9 @@ class Gathering:
         table = self._after_last(np.column_stack([part.time, *part.channels.values()]))
         if not len(table):
             return
+        self._parted += part.parted
+        if self._wrapped and self._last is not None and pauses(np.append(self._last[0], table[:, 0]))[:1] == [1]:
+            self._parted.append(float(table[0, 0]))
         self._last = table[-1].copy()
         for _ in range(self._thinnings):
             table = self._thin(table)
@@ -60,10 +65,14 @@ class Gathering:
             self._thinnings += 1
 
     def cleaned(self) -> Cleaned:
-        """All samples so far."""
+        """All samples so far; of a log that falls apart the longest part."""
         empty = np.empty((0, 1 + len(self._names)))
-        table = np.concatenate([empty, *self._parts])
-        return Cleaned(table[:, 0], dict(zip(self._names, table[:, 1:].T, strict=True)), dict(self._found))
+        table, found = np.concatenate([empty, *self._parts]), dict(self._found)
+        if self._parted:
+            longest = max(np.split(table, np.searchsorted(table[:, 0], self._parted)), key=len)
+            found[PARTED] = len(table) - len(longest)
+            table = longest
+        return Cleaned(table[:, 0], dict(zip(self._names, table[:, 1:].T, strict=True)), found)
 
     def _within_a_turn(self, channels: Mapping[str, Array]) -> dict[str, float]:
         """Full turns of the angles that have stayed within one so far."""

@@ -15,7 +15,7 @@ from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.logs.cleaning import Cleaned
 from servotwin.logs.columns import LogColumns
-from servotwin.logs.gathering import THINNED, Gathering
+from servotwin.logs.gathering import PARTED, THINNED, Gathering
 from servotwin.logs.log import read_blocks, read_columns
 from servotwin.plant.signals import Array
 
@@ -146,7 +146,8 @@ def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[
 
 def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]) -> None:
     left = clean.time.size
-    if left >= max(_LEAST, _MOST_LOST * (size - clean.found.get(THINNED, 0))):
+    whole = size - clean.found.get(THINNED, 0) - clean.found.get(PARTED, 0)
+    if left >= max(_LEAST, _MOST_LOST * whole):
         return
     what = "; ".join(f"{count} {defect}" for defect, count in clean.found.items()) or "the log is short"
     first = next(iter(damaged.items()), None)

@@ -8,7 +8,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.logs import csv_file
-from servotwin.logs.gathering import THINNED, Gathering
+from servotwin.logs.gathering import PARTED, THINNED, Gathering
 from servotwin.logs.log import read_blocks, read_columns
 
 TURN = {"motor": 2.0 * np.pi}
@@ -72,6 +72,20 @@ def test_a_thinned_log_keeps_its_turning_points_and_its_gap(made):
     low, high = estimate_lost_motion(thin).interval_motor
     assert low <= 0.05 <= high
     assert high - low < 0.01
+
+
+@pytest.mark.parametrize("size", [500, 10_000])
+def test_of_a_log_whose_turns_were_lost_in_a_pause_the_longest_part_stays(made, size):
+    kept = np.delete(np.arange(made.time.size), np.s_[1500:2300])
+    motor = 3.0 * made.motor
+    broken = EncoderRecording(made.time[kept], motor[kept] % (2.0 * np.pi), made.load[kept])
+    clean = gathered(broken, size)
+    assert np.array_equal(clean.time, made.time[2300:])
+    assert clean.found[PARTED] == 1500
+    turns = (clean.channels["motor"] - motor[2300:]) / (2.0 * np.pi)
+    assert np.allclose(turns, np.round(turns[0]), atol=1e-6)
+    whole = gathered(EncoderRecording(made.time[kept], motor[kept], made.load[kept]), size)
+    assert PARTED not in whole.found
 
 
 def test_an_angle_whose_turns_cannot_be_counted_is_refused(made):

@@ -7,28 +7,34 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, slowest_and_fastest
 from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.kinematic.lost_motion import LostMotion
+from servotwin.estimation.kinematic.models import ModelTrial
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.estimation.kinematic.strokes import counts_of, play_and_side
-from servotwin.estimation.kinematic.wind_up import TransmissionGap
+from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, units_of
 from servotwin.estimation.output_error.models import DELAY, HALF
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 
 MODEL = "two masses"
 """`model_kind` of an answer that this model gave."""
-_MOST = 10_000  # samples, from the first on
-_PAUSE = 5.0  # usual intervals
-_LEAST = 6  # strokes within them
+_MOST = 10_000  # samples
+_PAUSE = 12.0  # usual intervals, over which nothing says how the load moved
+_LEAST, _ENOUGH = 6, 12  # strokes within them
+_DAMPED = 2.0  # of the critical damping: beyond, the load does not swing
 _FOLDS = 8  # parts of the recording, whose errors are compared
 _EVIDENCE = 2.0  # standard errors
 _BETTER = 0.5  # of the error of a model without dynamics: a larger one is no evidence for dynamics
 _OTHERS = (0.8, 1.25)  # gaps over the best one that the recording must rule out
-_COUNTS = 2.0  # that a model may leave, white or not
+_COUNTS = 0.7  # that a model may leave, white or not; rounding leaves less
+_NOISE = 4.0  # of what differs from sample to sample in the recording: a model may leave so much
 _WHITE = 0.5  # of the variance of what is left, which its past must not predict
 _AT_BOUND = 0.98
 _WIDEST = 0.3  # of the gap: half an interval
@@ -45,14 +51,25 @@ class DrivenGap(NamedTuple):
     dynamics : LoadDynamics or None
         None: nothing was fitted.
     reason : str
+    share : float
+        Error of the next samples that it predicts, over that of play alone; NaN where nothing was fitted.
     """
 
     gap: TransmissionGap | None
     dynamics: LoadDynamics | None
     reason: str
+    share: float = math.nan
+
+    def trial(self) -> ModelTrial:
+        """A line for the table of models."""
+        found = math.nan if self.gap is None else self.gap.lost.at_motor
+        tried = f"{100.0 * self.share:.3g} % of the error of play alone in the next samples"
+        swings = "" if self.dynamics is None else f", {self.dynamics.frequency / (2.0 * math.pi):.3g} Hz"
+        said = "taken: " + tried + swings if self.gap is not None else f"not taken: {self.reason}"
+        return ModelTrial(MODEL, found, math.nan, said)
 
 
-def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenGap:
+def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion, known: LoadDynamics | None = None) -> DrivenGap:
     """Fit a load behind play and spring to the motor's and the load's motion, and judge if it shows the gap.
 
     While the load swings freely in the gap, nothing but its friction brakes it; while the transmission winds up, the
@@ -62,14 +79,17 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
     Parameters
     ----------
     recording : EncoderRecording
-        Its first 10 000 samples count.
+        Of its longest part without a pause 10 000 samples count: from the first on, or every k-th one where these hold
+        fewer than twelve strokes.
     lost : LostMotion
         Its answer without dynamics: ratio, lag and cyclic errors.
+    known : LoadDynamics, optional
+        Of the machine as far as it is known, in the recording's units: where the search also begins.
     """
     if not math.isfinite(lost.ratio) or lost.ratio == 0.0:
         return DrivenGap(None, None, "the load does not follow the motor")
-    piece = _first(recording)
-    strokes = sum(each.time <= piece.time[-1] for each in lost.local) or _strokes(piece)
+    piece = _piece(recording, lost)
+    strokes = _strokes(piece, lost)
     if strokes < _LEAST:
         return DrivenGap(
             None,
@@ -80,42 +100,88 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion) -> DrivenG
     cycles = lost.cycles if "cyclic" in lost.model else ()
     problem = DrivenLoad(LoadDynamics(1.0, 1.0, 1.0), piece, lost.ratio, 0.0, cycles)
     quasi_static = _quasi_static(problem, lost)
-    found = best_fit(problem, quasi_static, strokes)
+    if known is not None and known.frequency > problem.fastest:
+        return DrivenGap(None, known, _too_fast(known.frequency, problem))
+    found = best_fit(problem, quasi_static, strokes, known)
     if found is None:
         return DrivenGap(None, None, "too few samples a stroke to see how the load moves: record faster")
     counts = _counts(recording, abs(lost.ratio))
-    reason = _doubt(found, quasi_static, counts)
+    share = found.rms / float(np.std(problem.quasi_static_misfit(quasi_static, found.rate)))
+    noise = math.hypot(noise_of(recording.motor) * abs(lost.ratio), noise_of(recording.load))
+    reason = _doubt(found, quasi_static, counts, noise, strokes)
+    if reason:
+        return DrivenGap(None, found.dynamics, reason, share)
     slower = found.again(_STEPS, rate=SLOWER * found.rate)
     # Friction is never as constant as the model has it: as with a known machine, what it winds up is doubtful.
     half = math.hypot(NORMAL_95 * _std(found, slower, counts), found.lost - found.gap)
-    if not reason and half > _WIDEST * found.gap:
+    if half > _WIDEST * found.gap:
         reason = f"the gap is known to {100.0 * half / found.gap:.0f} % only with the load's dynamics"
-    if reason:
-        return DrivenGap(None, found.dynamics, reason)
-    return DrivenGap(_answer(found, half, lost), found.dynamics, "")
+        return DrivenGap(None, found.dynamics, reason, share)
+    return DrivenGap(_answer(found, half, lost), found.dynamics, "", share)
 
 
-def with_dynamics(recording: EncoderRecording, found: TransmissionGap) -> TransmissionGap:
-    """The gap that the load's dynamics show where the motion alone does not; else what is known, and the reason."""
+def swings(found: TransmissionGap) -> bool:
+    """True where the motion alone shows not even the lost motion, for the load swings or winds up."""
+    return not (found.ok or found.lost.ok or found.status is GapStatus.LOWER_BOUND)
+
+
+def load_of(machine: Plant, load_unit: float) -> LoadDynamics | None:
+    """Dynamics of a machine's load, its masses taken for one; None where nothing between motor and load gives way.
+
+    `load_unit` is the recording's unit of the load in SI units.
+    """
+    if not isinstance(machine, Axis) or math.isinf(machine.transmission.k_d):
+        return None
+    stiffness, mass = machine.transmission.k_d, float(np.sum(machine.load.masses))
+    frequency = math.sqrt(stiffness / mass)
+    critical = 2.0 * mass * frequency
+    return LoadDynamics(
+        frequency,
+        machine.transmission.c_d / critical,
+        machine.guide.friction / stiffness / load_unit,
+        float(np.sum(machine.load.dampings)) / critical,
+    )
+
+
+def with_dynamics(recording: EncoderRecording, found: TransmissionGap, machine: Plant | None = None) -> TransmissionGap:
+    """The gap that the load's dynamics show where the motion alone does not; else what is known, and the reason.
+
+    With a `machine` the search also begins at its load.
+    """
     if found.ok or found.status is GapStatus.LOWER_BOUND:
         return found
-    driven = gap_of_driven_load(recording, found.lost)
+    known = None if machine is None else load_of(machine, units_of(recording, machine)[1])
+    driven = gap_of_driven_load(recording, found.lost, known)
     if driven.gap is not None:
-        return driven.gap
+        return replace(driven.gap, dynamics=driven.trial())
     *others, last = found.reasons or ("",)
     reasons = (*others, f"the load's dynamics do not show the gap: {driven.reason}", last)
-    return replace(found, reasons=tuple(reason for reason in reasons if reason))
+    return replace(found, reasons=tuple(reason for reason in reasons if reason), dynamics=driven.trial())
 
 
-def _first(recording: EncoderRecording) -> EncoderRecording:
-    """The samples before the first pause; nothing says how the load moved in one."""
-    intervals = np.diff(recording.time[:_MOST])
-    pauses = np.flatnonzero(intervals > _PAUSE * np.median(intervals)) if intervals.size else intervals
-    part = slice(0, int(pauses[0]) + 1 if pauses.size else _MOST)
-    return replace(recording, time=recording.time[part], motor=recording.motor[part], load=recording.load[part])
+def _piece(recording: EncoderRecording, lost: LostMotion) -> EncoderRecording:
+    """At most 10 000 samples of the longest part without a pause; nothing says how the load moved in one."""
+    intervals = np.diff(recording.time)
+    pauses = np.flatnonzero(intervals > _PAUSE * np.median(intervals)) + 1 if intervals.size else intervals
+    parts = np.split(np.arange(recording.time.size), pauses.astype(int))
+    rows = max(parts, key=len)
+    whole = _rows(recording, rows)
+    if rows.size > _MOST:
+        # Strokes that last longer than the samples go are worth more than every sample of few strokes.
+        wanted = _ENOUGH * rows.size / (max(_strokes(whole, lost), 1) * _MOST)
+        every = min(max(1, math.ceil(wanted)), math.ceil(rows.size / _MOST))
+        whole = _rows(recording, rows[::every][:_MOST])
+    return whole
 
 
-def _strokes(piece: EncoderRecording) -> int:
+def _rows(recording: EncoderRecording, rows: NDArray[np.int_]) -> EncoderRecording:
+    return replace(recording, time=recording.time[rows], motor=recording.motor[rows], load=recording.load[rows])
+
+
+def _strokes(piece: EncoderRecording, lost: LostMotion) -> int:
+    first, last = piece.time[0], piece.time[-1]
+    if lost.local:
+        return sum(first <= each.time <= last for each in lost.local)
     side = np.zeros(piece.motor.size, dtype=np.int8)
     play_and_side(piece.motor, 0.1 * float(np.ptp(piece.motor)), side)
     return int(np.count_nonzero(np.diff(side[side != 0]))) + 1
@@ -129,25 +195,30 @@ def _quasi_static(problem: DrivenLoad, lost: LostMotion) -> Array:
     return np.asarray(late - np.mean(late - problem.position))
 
 
-def _doubt(found: LoadFit, quasi_static: Array, counts: float) -> str:
-    """Reason not to believe the fit; empty: none. `counts` is one of both encoders, at the load."""
+def _doubt(found: LoadFit, quasi_static: Array, counts: float, noise: float, strokes: int) -> str:
+    """Reason not to believe the fit; empty: none. `counts` is one of both encoders, at the load, as `noise` is."""
     problem = found.problem
     bare = problem.quasi_static_misfit(quasi_static, found.rate)
     if not found.rms < _BETTER * float(np.std(bare)) or not _worse(bare, found.fit.raw):
         return "a load on a spring predicts its motion no better than play alone"
-    fastest = slowest_and_fastest(problem, 1)[1]
+    slowest, fastest = slowest_and_fastest(problem, strokes)
     if found.dynamics.frequency > fastest:
-        rate = found.dynamics.frequency / fastest / problem.interval
-        return f"the load swings too fast for the recording: record at {rate:.2g} Hz or more"
+        return _too_fast(found.dynamics.frequency, problem)
     limits = problem.limits()
     bound = [
         unknown.name
         for unknown, value, limit in zip(problem.model.unknowns, found.fit.values, limits, strict=True)
         if math.isfinite(limit) and (value if unknown.unit == "damping" else abs(value)) > _AT_BOUND * limit
     ]
+    # The fit begins again at what it found, which its bounds move along with.
+    dynamics = found.dynamics
+    bound += ["frequency"] if dynamics.frequency < slowest else []
+    bound += ["damping"] if max(dynamics.damping, dynamics.viscous) > _DAMPED else []
     if bound:
         return f"the fit of the load's dynamics ends at a bound ({', '.join(bound)})"
-    if found.rms > _COUNTS * counts and burg(found.fit.raw[None], 24).unpredicted < _WHITE:
+    # Impacts of a wrong model, far apart, may look white: they are larger than what differs from sample to sample.
+    coloured = burg(found.fit.raw[None], 24).unpredicted < _WHITE
+    if found.rms > _COUNTS * counts and (coloured or found.rms > _NOISE * noise):
         return "the load on a spring leaves more than noise: it has other dynamics too"
     for other in _OTHERS:
         tried = found.split(other * found.gap, _STEPS, gap_free=False)
@@ -157,6 +228,11 @@ def _doubt(found: LoadFit, quasi_static: Array, counts: float) -> str:
                 "the gap explain the recording as well; record faster reversals too"
             )
     return ""
+
+
+def _too_fast(frequency: float, problem: DrivenLoad) -> str:
+    rate = frequency / problem.fastest / problem.interval
+    return f"the load swings too fast for the recording: record at {rate:.2g} Hz or more"
 
 
 def _worse(raw: Array, best: Array) -> bool:

@@ -19,11 +19,12 @@ SLOWER = 0.4
 """Rate of another observer over that one, which must show the same gap."""
 _FREQUENCIES = 10
 _SWINGS = 0.5  # periods of the slowest load within a mean stroke
-_SAMPLES = 12.0  # samples in a period of the fastest: between two the motor is taken to move evenly
 _GAPS = (0.8, 0.4, 0.15, 0.05)  # of the lead's range, where the search begins
 _FRICTIONS = (0.1, 0.003)  # of the lead's range
 _DAMPING = 0.05
 _KEPT = 3
+_HOPELESS = (5.0, 0.75)  # of the error without dynamics, where the search begins, and after a first descent
+_TOO_FAST = 1.2  # of the fastest load that the samples show
 _ROUNDS, _GAIN = 4, 0.98  # further descents while they bring the error down to so much
 _NEAR = (0.96, 1.04)  # of the gap
 _SHARES = (1.0, 0.75, 0.5, 0.25, 0.02)  # of the lost motion: gap
@@ -102,33 +103,47 @@ def descended(problem: DrivenLoad, values: Array, steps: int, rate: float, gap_f
 def slowest_and_fastest(problem: DrivenLoad, strokes: int) -> tuple[float, float]:
     """Natural frequencies between which a recording may show the load's, rad/s."""
     low = 2.0 * math.pi * _SWINGS * max(strokes, 1) / problem.duration
-    return low, 2.0 * math.pi / (_SAMPLES * problem.interval)
+    return low, problem.fastest
 
 
-def best_fit(problem: DrivenLoad, quasi_static: Array, strokes: int) -> LoadFit | None:
-    """The load that predicts its motion best, compared with a model (N,) without dynamics; None: none can show."""
+def best_fit(
+    problem: DrivenLoad, quasi_static: Array, strokes: int, known: LoadDynamics | None = None
+) -> LoadFit | None:
+    """The load that predicts its motion best, compared with a model (N,) without dynamics; None: none can show.
+
+    The search begins at all frequencies that the recording may show, and at a load that is `known`.
+    """
     low, high = slowest_and_fastest(problem, strokes)
     if not high > 2.0 * low:
         return None
     reach, middle = problem.range, -0.5 * float(np.max(problem.lead) + np.min(problem.lead))
+    begins = [
+        [LoadDynamics(each, _DAMPING, friction * reach) for friction in _FRICTIONS]
+        for each in np.geomspace(low, high, _FREQUENCIES).tolist()
+    ]
     kept = []
-    for frequency in np.geomspace(low, high, _FREQUENCIES).tolist():
-        rate = OBSERVER * frequency
+    for loads in begins if known is None else [[known], *begins]:
+        rate = OBSERVER * loads[0].frequency
         bare = float(np.std(problem.quasi_static_misfit(quasi_static, rate)))
         tried: list[tuple[float, int, DrivenLoad, Array, float]] = []
         for gap in _GAPS:
-            for friction in _FRICTIONS:
-                begun = problem.with_load(LoadDynamics(frequency, _DAMPING, friction * reach))
+            for load in loads:
+                begun = problem.with_load(load)
                 values = begun.start(0.5 * gap * reach, middle)
                 tried.append((float(np.std(begun.misfit(values, rate))) / bare, len(tried), begun, values, rate))
         kept.append(min(tried, key=lambda each: each[:2]))
     kept.sort(key=lambda each: each[:2])
+    if kept[0][0] > _HOPELESS[0]:
+        _, _, begun, values, rate = kept[0]
+        return descended(begun, values, 0, rate)
     found: list[tuple[float, int, LoadFit]] = []
     for _, _, begun, values, rate in kept[:_KEPT]:
         fit = _own_rate(descended(begun, values, _STEPS[0], rate))
         bare = float(np.std(problem.quasi_static_misfit(quasi_static, fit.rate)))
         found.append((fit.rms / bare, len(found), fit))
-    return best_split(min(found, key=lambda each: each[:2])[2])
+    share, _, best = min(found, key=lambda each: each[:2])
+    hopeless = share > _HOPELESS[1] or best.dynamics.frequency > _TOO_FAST * high
+    return best if hopeless else best_split(best)
 
 
 def _own_rate(found: LoadFit) -> LoadFit:

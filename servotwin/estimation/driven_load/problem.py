@@ -26,6 +26,8 @@ WIDE = Priors(stiffness=1.0, damping=2.0, mass_ratio=1.0, ratio=0.05, delay=0.0)
 _LATE = 1.0  # samples by which a channel may be late besides the lag
 _FIRST = 0.02  # of the recording: what shows the first speed
 _VISCOUS = 0.05  # of the critical damping: where the load's own damping begins
+_SAMPLES = 12.0  # in a period of the fastest load: between two the motor is taken to move evenly
+_BEYOND, _LEAST_LIMIT = 1.5, 0.1  # times that one: a faster load costs time, and says nothing; least limit
 _ENDS = (0.002, 0.998)
 _NONE = Controller(0.0, 0.0, 0.0, 1.0)
 
@@ -151,6 +153,11 @@ class DrivenLoad:
         return float(np.ptp(self.recording.time))
 
     @property
+    def fastest(self) -> float:
+        """Natural frequency of the fastest load that the samples show, rad/s."""
+        return 2.0 * math.pi / (_SAMPLES * self.interval)
+
+    @property
     def count(self) -> float:
         return 0.0
 
@@ -166,8 +173,15 @@ class DrivenLoad:
         return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
 
     def limits(self) -> Array:
-        """(u,) largest sizes of the unknowns."""
-        return np.array([LARGEST * unknown.std for unknown in self.model.unknowns])
+        """(u,) largest sizes of the unknowns; of the stiffness such that the samples nearly show the load."""
+        fastest = 2.0 * math.log(_BEYOND * self.fastest / self.dynamics.frequency)
+        stiffness = max(fastest, _LEAST_LIMIT)
+        return np.array(
+            [
+                min(LARGEST * unknown.std, stiffness if unknown.name == "shaft stiffness" else math.inf)
+                for unknown in self.model.unknowns
+            ]
+        )
 
     def start(self, half: float, offset: float) -> Array:
         """Unknowns (u,) of a half gap and an offset of the motor, both at the load."""

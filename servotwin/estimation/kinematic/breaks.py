@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.estimation.kinematic.regression import OFFSET, RATIO, Regression, columns, solved
+from servotwin.estimation.kinematic.regression import INERTIA, LAG, LOAD, OFFSET, RATIO, Regression, columns, solved
 from servotwin.plant.signals import Array
 
 _EXPLAINED = 0.8  # of what the model leaves, by one step
 _STEP = 0.5  # of the gap, at least
 _RATIO = 0.03  # between the halves of a recording
+_SURE = 5.0  # standard deviations of that
+_BLOCKS = 16  # of the recording, of which each is left out once
 _TRAVEL = 10.0  # gaps, from which on the ratio is known
 
 
@@ -42,16 +45,17 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
     InvalidInput
     """
     values, _ = columns(prepared, gap)
-    used = [prepared.names.index(RATIO), prepared.names.index(OFFSET)]
-    halves = [solved(part @ part.T, used).coefficients[0] for part in np.array_split(values, 2, axis=1)]
     reach, unit = float(np.ptp(recording.motor)), recording.load_unit
     known = min(float(np.ptp(part[1])) for part in np.array_split(values, 2, axis=1)) > max(_TRAVEL * gap, 0.1 * reach)
-    if known and abs(halves[1] / halves[0] - 1.0) > _RATIO:
+    halves = _halves(values, prepared)
+    if known and abs(halves.change) > max(_RATIO, _SURE * halves.std):
+        second = halves.ratio * (1.0 + halves.change)
         raise InvalidInput(
-            f"{recording.source}: the load moves by {halves[0]:.4g} {unit} per {recording.motor_unit} in its first "
-            f"half and by {halves[1]:.4g} in its second: two machines or units in one log, or turns lost in a pause; "
+            f"{recording.source}: the load moves by {halves.ratio:.4g} {unit} per {recording.motor_unit} in its first "
+            f"half and by {second:.4g} in its second: two machines or units in one log, or turns lost in a pause; "
             "give each part by itself"
         )
+    used = [prepared.names.index(RATIO), prepared.names.index(OFFSET)]
     fit = solved(values @ values.T, used)
     step = largest_step(values[0] - fit.coefficients @ values[used])
     least = _STEP * gap * abs(float(fit.coefficients[0]))
@@ -62,6 +66,33 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
             "it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were joined; give each part "
             "by itself"
         )
+
+
+class _Halves(NamedTuple):
+    """Load per motor in the first half of a recording, its change to the second as a share, and that one's spread."""
+
+    ratio: float
+    change: float
+    std: float
+
+
+def _halves(values: Array, prepared: Regression) -> _Halves:
+    """Fit columns (p, k) of a regression with a ratio and an offset for each half, and with what is one for both.
+
+    A load that swings moves further than its ratio says, by as much as it is accelerated: faster strokes of the same
+    machine are no other ratio. Blocks of time that are left out by turns give the spread.
+    """
+    load, output, offset, lag, inertia = (
+        values[prepared.names.index(name)] for name in (LOAD, RATIO, OFFSET, LAG, INERTIA)
+    )
+    second = np.arange(load.size) >= load.size - load.size // 2
+    table = np.array([load, output, second * output, offset, second * offset, lag, inertia])
+    blocks = np.array([part @ part.T for part in np.array_split(table, _BLOCKS, axis=1)])
+    used, whole = range(1, len(table)), blocks.sum(axis=0)
+    ratio, change = solved(whole, used).coefficients[:2]
+    others = solved(whole - blocks, used).coefficients
+    std = math.sqrt(_BLOCKS - 1.0) * float(np.std(others[:, 1] / others[:, 0]))
+    return _Halves(float(ratio), float(change / ratio), std)
 
 
 def largest_step(residual: Array) -> ResidualStep:

@@ -29,7 +29,7 @@ from servotwin.estimation.kinematic.regression import (
     regression,
     solved,
 )
-from servotwin.estimation.kinematic.strokes import counts_of, play_and_side, strokes_of
+from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
@@ -170,13 +170,7 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
 
 def _least_motion(values: Array, count: float) -> float:
     """Motion that is more than an encoder's counts and noise."""
-    return max(_COUNTS * count, 3.0 * _COUNTS * _noise(values), 1e-4 * float(np.ptp(values)))
-
-
-def _noise(values: Array) -> float:
-    """Standard deviation of what differs from sample to sample."""
-    second = np.diff(values, 2)
-    return 1.4826 * float(np.median(np.abs(second - np.median(second)))) / math.sqrt(6.0)
+    return max(_COUNTS * count, 3.0 * _COUNTS * noise_of(values), 1e-4 * float(np.ptp(values)))
 
 
 def _follows(load: Array, count: float, reversals: int) -> bool:
@@ -186,7 +180,7 @@ def _follows(load: Array, count: float, reversals: int) -> bool:
     """
     size = max(1, load.size // (_PIECES * (reversals + 1)))
     means = load[: load.size // size * size].reshape(-1, size).mean(axis=1)
-    return float(np.ptp(means)) > max(_COUNTS * count, 3.0 * _COUNTS * _noise(load) / math.sqrt(size))
+    return float(np.ptp(means)) > max(_COUNTS * count, 3.0 * _COUNTS * noise_of(load) / math.sqrt(size))
 
 
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:

@@ -130,8 +130,69 @@ def chosen(comparisons: Sequence[ModelScore]) -> ModelScore:
     """The simplest model that no richer one beats by two standard errors."""
     best = comparisons[0]
     for each in comparisons[1:]:
-        gain = best.squares - each.squares
-        error = gain.std(ddof=1) / np.sqrt(gain.size) if gain.size > 1 else np.inf
-        if gain.mean() > _EVIDENCE * error and gain.mean() > _WORTH * best.squares.mean():
+        if _gain(best, each).enough:
             best = each
     return best
+
+
+class _Gain(NamedTuple):
+    """Mean square error of a model over that of a simpler one, and standard errors by which it is less."""
+
+    share: float
+    errors: float
+
+    @property
+    def enough(self) -> bool:
+        return self.errors > _EVIDENCE and 1.0 - self.share > _WORTH
+
+    def said(self, before: ModelScore) -> str:
+        """In words."""
+        return (
+            f"{100.0 * self.share:.3g} % of the square error of {before.model.name}, better by {self.errors:.1f} "
+            "standard errors"
+        )
+
+
+def _gain(before: ModelScore, after: ModelScore) -> _Gain:
+    gain = before.squares - after.squares
+    error = float(gain.std(ddof=1)) / np.sqrt(gain.size) if gain.size > 1 else np.inf
+    least = np.finfo(float).tiny
+    return _Gain(
+        float(after.squares.mean() / max(before.squares.mean(), least)), float(gain.mean() / max(error, least))
+    )
+
+
+class ModelTrial(NamedTuple):
+    """A model that was tried, and what speaks for it or against it.
+
+    Attributes
+    ----------
+    name : str
+    gap : float
+        Lost motion that it finds, the motor's unit; NaN for none.
+    rms : float
+        Error on unseen strokes, the load's unit; NaN where it was judged otherwise.
+    evidence : str
+    """
+
+    name: str
+    gap: float
+    rms: float
+    evidence: str
+
+
+def trials(comparisons: Sequence[ModelScore]) -> tuple[ModelTrial, ...]:
+    """Say of each model of `compared` why `chosen` took it or did not; the last one has no gap."""
+    if not comparisons:
+        return ()
+    best, said = comparisons[0], ["the simplest"]
+    for each in comparisons[1:-1]:
+        gain = _gain(best, each)
+        said.append(f"{'taken' if gain.enough else 'not taken'}: {gain.said(best)}")
+        best = each if gain.enough else best
+    without = comparisons[-1]
+    needed = best.rms < without.rms
+    said.append(f"{'a gap is needed' if needed else 'no gap is needed'}: {_gain(without, best).said(without)} with one")
+    return tuple(
+        ModelTrial(each.model.name, each.gap, each.rms, words) for each, words in zip(comparisons, said, strict=True)
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -61,6 +62,12 @@ def resolution(values: Array) -> float:
     steps = np.abs(np.diff(values))
     steps = steps[steps > 1e-9 * np.ptp(values)] if values.size > 1 else steps
     return float(np.quantile(steps, 0.01)) if steps.size else 0.0
+
+
+def noise_of(values: Array) -> float:
+    """Standard deviation of what differs from sample to sample."""
+    second = np.diff(values, 2)
+    return 1.4826 * float(np.median(np.abs(second - np.median(second)))) / math.sqrt(6.0)
 
 
 def counts_of(recording: EncoderRecording) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic.lost_motion import LostMotion
+from servotwin.estimation.kinematic.models import ModelTrial, trials
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
@@ -17,7 +18,8 @@ ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "°": math.pi / 180.
 """Radians per unit."""
 LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
 """Metres per unit."""
-_RATIO = 0.05  # by which the recording's load per motor may differ from the machine's
+# By how much the recording's load per motor may differ from the machine's; where the load swings it is not well known.
+_RATIO, _RATIO_OF_SWINGING = 0.05, 0.25
 _DOUBT = 1.0  # of the wind-up: friction changes, and a load that swings leaves less of it
 _SHARE = 0.5  # of the lost motion: a larger wind-up leaves no gap that is known
 _UNKNOWN = (
@@ -40,6 +42,8 @@ class TransmissionGap:
     status : GapStatus
         LOST_MOTION: the lost motion is known, and how much of it is gap is not.
     reasons : tuple of str
+    dynamics : ModelTrial or None
+        The load's dynamics, where they were tried.
     """
 
     lost: LostMotion
@@ -48,6 +52,13 @@ class TransmissionGap:
     interval_motor: Interval
     status: GapStatus
     reasons: tuple[str, ...] = ()
+    dynamics: ModelTrial | None = None
+
+    @property
+    def trials(self) -> tuple[ModelTrial, ...]:
+        """All models that were tried, from simple to rich, and one without a gap."""
+        tried = () if self.dynamics is None else (self.dynamics,)
+        return (*trials(self.lost.comparisons), *tried)
 
     @property
     def gap_load(self) -> float:
@@ -126,9 +137,9 @@ def gap_of_machine(recording: EncoderRecording, lost: LostMotion, machine: Plant
     """
     if lost.interval_motor == NOTHING_KNOWN:
         return gap_within(lost, None)
-    motor_unit, load_unit = _units(recording, machine)
+    motor_unit, load_unit = units_of(recording, machine)
     ratio = abs(lost.ratio) * load_unit / motor_unit
-    if abs(ratio / machine.p - 1.0) > _RATIO:
+    if abs(ratio / machine.p - 1.0) > (_RATIO if lost.ok else _RATIO_OF_SWINGING):
         raise InvalidInput(
             f"{recording.source}: its load moves by {ratio:.4g} per rad of the motor, in SI units, and that of --axis "
             f"by {machine.p:.4g}: check the units of both columns (--motor-unit, --load-unit) and the axis"
@@ -136,8 +147,14 @@ def gap_of_machine(recording: EncoderRecording, lost: LostMotion, machine: Plant
     return gap_within(lost, wind_up(machine) / motor_unit, recording.motor_unit)
 
 
-def _units(recording: EncoderRecording, machine: Plant) -> tuple[float, float]:
-    """SI units in one unit of the motor and of the load."""
+def units_of(recording: EncoderRecording, machine: Plant) -> tuple[float, float]:
+    """SI units in one unit of the motor and of the load.
+
+    Raises
+    ------
+    InvalidInput
+        A unit that is not known.
+    """
     loads = ANGLES if position_unit(machine).si == "rad" else LENGTHS
     for part, unit, known in (("motor", recording.motor_unit, ANGLES), ("load", recording.load_unit, loads)):
         if unit not in known:

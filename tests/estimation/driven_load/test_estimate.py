@@ -1,18 +1,20 @@
 """Gaps between two encoders, told from wind-up by friction with the load's dynamics."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from recordings import recording
 
-from servotwin.estimation.driven_load.estimate import MODEL, gap_of_driven_load, with_dynamics
+from servotwin.estimation.driven_load.estimate import MODEL, gap_of_driven_load, load_of, with_dynamics
 from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.wind_up import gap_within
+from servotwin.plant.axis import Axis
 
 GAP, FREQUENCY, FRICTION = 0.02, 60.0, 0.002  # rad, rad/s, rad: the wind-up is a fifth of the gap
 UNKNOWN = LostMotion(math.nan, math.inf, (0.0, math.inf), 1.03, 0.0, GapStatus.MODEL_MISMATCH, ("it swings",))
@@ -76,6 +78,35 @@ def test_too_few_strokes_are_said_to_be_too_few(made):
     answer = gap_of_driven_load(short, UNKNOWN)
     assert answer.gap is None
     assert "too few" in answer.reason
+
+
+def test_the_longest_part_without_a_pause_counts(made, found):
+    later = replace(made, time=made.time + 60.0)
+    parts = [(made, slice(0, 200)), (later, slice(None))]
+    joined = EncoderRecording(
+        *(np.concatenate([getattr(each, name)[part] for each, part in parts]) for name in ("time", "motor", "load"))
+    )
+    answer = gap_of_driven_load(joined, UNKNOWN)
+    assert answer.gap.gap_motor == pytest.approx(found.gap.gap_motor, rel=1e-3)
+
+
+def test_the_table_of_models_says_why_the_dynamics_were_taken_or_not(found, made):
+    taken = found.trial()
+    assert (taken.name, taken.gap) == (MODEL, found.gap.lost.at_motor)
+    assert re.match(r"taken: \d+(\.\d+)? % of the error of play alone in the next samples, 9\.5\d? Hz", taken.evidence)
+    known = LoadDynamics(1e4, 0.1, 0.0)
+    fast = gap_of_driven_load(made, UNKNOWN, known)
+    assert fast.trial().evidence.startswith("not taken: the load swings too fast for the recording: record at ")
+
+
+def test_a_machines_load_is_its_masses_on_its_stiffness_with_its_friction():
+    axis = Axis.preset("two-mass-drive")
+    load = load_of(axis, 1e-3)
+    mass = sum(axis.load.m)
+    assert load.frequency == pytest.approx(math.sqrt(axis.transmission.k_d / mass))
+    assert load.friction == pytest.approx(1e3 * axis.guide.friction / axis.transmission.k_d)
+    stiff = axis.replace(transmission=replace(axis.transmission, k_d=math.inf, c_d=0.0, in_gap="held"))
+    assert load_of(stiff, 1.0) is None
 
 
 def test_a_gap_that_is_known_is_left_as_it_is(made):

@@ -26,13 +26,22 @@ def test_a_slipped_encoder_is_told_with_its_time():
 
 def test_two_machines_in_one_log_are_told():
     with pytest.raises(
-        InvalidInput, match=r"by 0\.09996 rad per rad in its first half and by 0\.1999 in its second: two"
+        InvalidInput, match=r"by 0\.0999 rad per rad in its first half and by 0\.1998 in its second: two"
     ):
         estimate_lost_motion(broken(lambda load: 2.0 * load))
 
 
 def test_a_drift_much_smaller_than_the_gap_is_none():
     assert np.isfinite(estimate_lost_motion(broken(lambda load: load + 2e-4)).at_motor)
+
+
+def test_a_load_that_swings_further_on_faster_strokes_is_one_machine():
+    time = np.arange(0.0, 24.0, 5e-3)
+    speed = 4.0 + np.tanh(2.0 * (time - 12.0)) * 2.0
+    motor = 5.0 * np.sin(np.cumsum(speed) * 5e-3)
+    load = 0.1 * (motor - 2.5e-3 * np.gradient(np.gradient(motor, time), time))
+    made = replace(recording(seconds=24.0, rate=200.0), time=time, motor=motor, load=load)
+    assert estimate_lost_motion(made).ratio == pytest.approx(0.1, rel=0.1)
 
 
 def test_the_largest_step_of_a_residual():
