@@ -24,7 +24,8 @@ from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
 from benchmarks.shelf import SHELF
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import swings, with_dynamics
+from servotwin.estimation.driven_load.estimate import with_dynamics
+from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within, wind_up
 from servotwin.logs.recordings import read_recording
@@ -115,6 +116,11 @@ class LogCase:
         )
 
 
+def _swings(found: TransmissionGap) -> bool:
+    """True where play alone shows not even the lost motion, for the load swings or winds up."""
+    return not (found.ok or found.lost.ok or found.status is GapStatus.LOWER_BOUND)
+
+
 def _counted(values: Array, count: float) -> Array:
     return np.round(values / count) * count if count else values
 
@@ -168,11 +174,11 @@ def measured(case: LogCase) -> dict[str, Any]:
     answer = gap_within(lost, None)
     in_si = replace(recording, load_unit=unit)
     begun = time.process_time()
-    dynamics = with_dynamics(in_si, answer) if swings(answer) else answer
+    dynamics = with_dynamics(in_si, answer) if _swings(answer) else answer
     seconds = time.process_time() - begun
     try:
         known = gap_of_machine(in_si, lost, Axis.preset(case.name))
-        of_axis = _said(known) | {"dynamics": _said(with_dynamics(in_si, known) if swings(known) else known)}
+        of_axis = _said(known) | {"dynamics": _said(with_dynamics(in_si, known) if _swings(known) else known)}
     except InvalidInput as error:
         of_axis = {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
     return found | {

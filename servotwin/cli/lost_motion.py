@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import swings, with_dynamics
+from servotwin.estimation.driven_load.estimate import with_dynamics
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
@@ -45,12 +45,11 @@ def show(
     axis: str | None = None,
     dates: str | None = None,
     stiff: bool = False,
-    dynamics: bool | None = None,
+    dynamics: bool = False,
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
-    The load's dynamics are fitted always (`dynamics`), never, or (None) where it swings so that play alone shows
-    nothing.
+    With `dynamics` the load's frequency, damping and friction are fitted beside the gap.
 
     Raises
     ------
@@ -76,7 +75,7 @@ def show(
             lost = estimate_lost_motion(log.recording)
             known = 0.0 if stiff else None
             found = gap_within(lost, known) if machine is None else gap_of_machine(log.recording, lost, machine)
-            if dynamics or (dynamics is None and not stiff and swings(found)):
+            if dynamics:
                 status.update(f"{path.name}: dynamics of the load")
                 found = with_dynamics(log.recording, found, machine)
             answers.append((log, found))

@@ -107,13 +107,8 @@ def identify(
         typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
     ] = False,
     dynamics: Annotated[
-        bool | None,
-        typer.Option(
-            "--dynamics/--no-dynamics",
-            help="Fit the load's frequency, damping and friction; by default where it swings so that play alone shows "
-            "nothing.",
-        ),
-    ] = None,
+        bool, typer.Option("--dynamics", help="Fit the load's frequency, damping and friction beside the gap.")
+    ] = False,
     dates: Annotated[
         str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")
     ] = None,
@@ -154,9 +149,7 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
-    without_model = (
-        columns != RecordingColumns() or axis is not None or stiff or dynamics is not None or dates is not None
-    )
+    without_model = columns != RecordingColumns() or axis is not None or stiff or dynamics or dates is not None
     if without_model or (servo is None and not describes_its_machine(logs[0])):
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(

@@ -120,11 +120,6 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion, known: Loa
     return DrivenGap(_answer(found, half, lost), found.dynamics, "", share)
 
 
-def swings(found: TransmissionGap) -> bool:
-    """True where the motion alone shows not even the lost motion, for the load swings or winds up."""
-    return not (found.ok or found.lost.ok or found.status is GapStatus.LOWER_BOUND)
-
-
 def load_of(machine: Plant, load_unit: float) -> LoadDynamics | None:
     """Dynamics of a machine's load, its masses taken for one; None where nothing between motor and load gives way.
 
