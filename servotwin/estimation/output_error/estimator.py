@@ -10,7 +10,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
@@ -19,6 +18,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
 from servotwin.estimation.output_error.problem import Problem
+from servotwin.estimation.output_error.rounding import possible_half
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
@@ -34,7 +34,7 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
-_NEAR = 5  # samples
+_ONE_STD = 0.683  # share of a normal distribution within one standard deviation
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -72,8 +72,10 @@ def estimate(
     expected = prior.gap if isinstance(prior, GapEstimate) else prior
     problem = _problem(window, theta_m, axis, settings)
     found = search(problem, 0.5 * axis.p * (expected or 0.0))
-    unit = 2.0 / axis.p
-    return _stated(blank, found, judge(found, settings, unit), unit)
+    at_motor, at_load, unit = _count_of_motor(axis, theta_m), _count_of_load(axis, window), 2.0 / axis.p
+    possible = possible_half(found, 0.5 * (axis.p * at_motor + at_load))
+    jitter = 0.0 if axis.play is Play.FREE else axis.p * _jitter(theta_m, at_motor)
+    return _stated(blank, found, judge(found, settings, unit, possible, jitter), unit)
 
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
@@ -101,11 +103,20 @@ def _checked(window: Window, axis: Axis | Servo) -> Array:
     return window.theta_m
 
 
+def _count_of_motor(axis: Axis, theta_m: Array) -> float:
+    """Rad."""
+    return max(axis.encoder_resolution, counted(theta_m))
+
+
+def _count_of_load(axis: Axis, window: Window) -> float:
+    """M or rad."""
+    return max(axis.sensors.position_resolution, counted(window.position))
+
+
 def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings) -> Problem:
     """The window with its model."""
     interval = 1.0 / window.sample_rate
-    at_motor = max(axis.encoder_resolution, counted(theta_m))
-    at_load = max(axis.sensors.position_resolution, counted(window.position))
+    at_motor, at_load = _count_of_motor(axis, theta_m), _count_of_load(axis, window)
     free, late = axis.play is Play.FREE, _SAMPLES_LATE * interval
     if free:
         own = math.sqrt(axis.transmission.k_d / axis.load.m[0])
@@ -114,24 +125,13 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
     priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
     model: MotionModel = ShaftModel(axis, priors) if free else PlayModel(axis, priors)
     count = math.hypot(axis.p * at_motor, at_load)
-    # Play does not depend on time: samples of a rest repeat one error, which the fit would take for many small ones.
-    told = slice(None) if free else _moving(axis.p * theta_m, window.position, 0.5 * at_load)
-    return Problem(model, axis.p * theta_m[told], window.position[told], interval, count, window.duration)
+    return Problem(model, axis.p * theta_m, window.position, interval, count)
 
 
-def _moving(drive: Array, position: Array, slow: float) -> NDArray[np.bool_]:
-    """(N,) samples near one at which the load moves or the motor does by more than `slow`; all where these are too few.
-
-    A motor that creeps through its gap leaves the load at one rounding error too. Its turning points stay.
-    """
-    changes = np.zeros(drive.size)
-    changes[1:] = (np.abs(np.diff(drive)) > slow) | (np.diff(position) != 0.0)
-    near = np.convolve(changes, np.ones(2 * _NEAR + 1), "same") > 0.0
-    near[: _NEAR + 1] = near[-_NEAR:] = True
-    edges = np.flatnonzero(np.diff(near)) + 1
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        near[[first + int(np.argmin(drive[first:last])), first + int(np.argmax(drive[first:last]))]] = True
-    return near if np.count_nonzero(near) >= SHORTEST else np.ones(drive.size, dtype=bool)
+def _jitter(theta_m: Array, count: float) -> float:
+    """Standard deviation (rad) of an angle's noise, without that of its counts: of what third differences leave."""
+    spread = float(np.quantile(np.abs(np.diff(theta_m, 3)), _ONE_STD)) / math.sqrt(20.0)
+    return math.sqrt(max(0.0, spread**2 - count**2 / 12.0))
 
 
 def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:

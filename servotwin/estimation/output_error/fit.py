@@ -17,6 +17,7 @@ _PASSES = 3
 _STEP = 1e-6  # of an unknown's size: difference that makes a derivative
 _FIRST, _SECOND = 4, 2  # minima that are followed in white noise, and in the window's own
 _SINGLE_STEPS = 8
+_ROUNDED_STEPS = 20
 _AGAIN = ((3, 3), (10, 2))  # steps in the noise that was learnt, from each start of the grid, and minima kept
 _SAME = 0.02  # of a gap: minima that are one
 _GAIN = 1e-3  # of the residual's variance: what a step must promise
@@ -153,6 +154,11 @@ def descend(
     return Fit(values, residual, rows, cost, raw, count)
 
 
+def only_rounding(problem: FitProblem, fit: Fit) -> bool:
+    """Tell whether rounding explains what the fit of a motion without dynamics leaves."""
+    return problem.model.speed == 0.0 and float(np.std(fit.raw)) < _ROUNDING * problem.count
+
+
 def noise_in(problem: FitProblem, fit: Fit) -> Autoregression:
     """Noise that a fit leaves, no quieter than the model's own error.
 
@@ -160,9 +166,8 @@ def noise_in(problem: FitProblem, fit: Fit) -> Autoregression:
     spoke for it.
     """
     floor = max(_FLOOR * fit.values[HALF], 1e-9 * problem.range, 1e-300)
-    rms = float(np.std(fit.raw))
-    if problem.model.speed == 0.0 and rms < _ROUNDING * problem.count:
-        return Autoregression.white(max(floor, rms, problem.count / math.sqrt(12.0)))
+    if only_rounding(problem, fit):
+        return Autoregression.white(max(floor, float(np.std(fit.raw)), problem.count / math.sqrt(12.0)))
     dither = np.random.default_rng(0).normal(0.0, floor, fit.raw.size)
     return burg((fit.raw + dither)[None], min(_ORDER, fit.raw.size // 10))
 
@@ -220,6 +225,9 @@ def _distinct(fits: list[Fit]) -> list[Fit]:
 def search(problem: FitProblem, gap: float) -> Search:
     """Fit a window: `gap` as in `starts`."""
     free, speed = problem.free, problem.model.speed
+    rounded = _in_rounding(problem, gap)
+    if rounded is not None:
+        return rounded
     tried = starts(problem, gap)[:_FIRST]
     rough = math.sqrt(_plain(problem, tried[0], speed) / problem.position.size)
     noise = Autoregression.white(max(0.3 * rough, 1e-9 * problem.range))
@@ -242,6 +250,16 @@ def search(problem: FitProblem, gap: float) -> Search:
         fits = [descend(problem, fit.values, noise, free, 10, rate) for fit in fits]
     fits = _distinct(sorted([*fits, *again], key=lambda fit: fit.cost))
     return Search(problem, noise, fits[0], tuple(fits[1:]), free)
+
+
+def _in_rounding(problem: FitProblem, gap: float) -> Search | None:
+    """Fit of a window in errors of rounding; None where they do not explain it, and other noise is to be learnt."""
+    if problem.model.speed > 0.0 or problem.count == 0.0:
+        return None
+    noise = Autoregression.white(problem.count / math.sqrt(12.0))
+    fits = [descend(problem, values, noise, problem.free, _ROUNDED_STEPS) for values in starts(problem, gap)]
+    fits = _distinct(sorted(fits, key=lambda fit: fit.cost))
+    return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free) if only_rounding(problem, fits[0]) else None
 
 
 def _from_anew(problem: FitProblem, noise: Autoregression, free: Flags, gap: float) -> list[Fit]:

@@ -16,6 +16,7 @@ _LARGEST_DELAY = 0.03  # of the window
 _HALVES = (0.5, 0.4, 0.3, 0.22, 0.15, 0.1, 0.06, 0.03, 0.015, 0.005)  # of the lead's range
 _PLACES = tuple(0.1 * step for step in range(-5, 6))  # of the lead's range
 _WIDE = 5.0  # of the lead's range
+_SLOW = 0.1  # of the motor's largest speed
 _MOVED = 0.02  # of the window: what shows the first speed
 
 
@@ -32,8 +33,6 @@ class Problem:
         s.
     count : float
         One count of either channel, seen at the load.
-    duration : float
-        s, of the window; samples of a rest may be left out.
     """
 
     model: MotionModel
@@ -41,7 +40,11 @@ class Problem:
     position: Array
     interval: float
     count: float
-    duration: float
+
+    @property
+    def duration(self) -> float:
+        """Of the window, s."""
+        return self.interval * self.position.size
 
     @property
     def lead(self) -> Array:
@@ -95,7 +98,9 @@ class Problem:
         return np.asarray((self.motion(values, rate).position - self.position)[part])
 
     def first(self) -> tuple[float, float]:
-        """First position and speed of the load, by a line through the first samples."""
+        """First position and speed of the load, by a line through the first samples where it has dynamics."""
+        if self.model.speed == 0.0:
+            return float(self.position[0]), 0.0
         size = max(8, round(_MOVED * self.position.size))
         slope, value = np.polyfit(self.interval * np.arange(size), self.position[:size], 1)
         return float(value), float(slope)
@@ -110,7 +115,13 @@ class Problem:
         lead, reach, first = self.lead, self.range, self.first()
         middle = -0.5 * float(lead.max() + lead.min())
         halves = [share * reach for share in _HALVES] + ([gap] if gap > 0.0 else [])
-        return [[self.model.start(half, middle + place * reach, first) for place in _PLACES] for half in halves]
+        tables = [[self.model.start(half, middle + place * reach, first) for place in _PLACES] for half in halves]
+        if self.model.speed > 0.0:
+            return tables
+        # Without dynamics the load is on a flank wherever the motor turns, and a delay shows least there.
+        speed = np.abs(np.gradient(self.drive))
+        slow = lead[speed <= _SLOW * speed.max()]
+        return [*tables, [self.model.start(0.5 * float(np.ptp(slow)), -0.5 * float(slow.max() + slow.min()), first)]]
 
     def on_one_flank(self, values: Array) -> list[list[Array]]:
         """Unknowns (u,) of a gap whose other flank is out of reach, a list for each flank, the lower one first."""

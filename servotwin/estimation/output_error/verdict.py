@@ -12,6 +12,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
 from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.rounding import PossibleHalf
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.plant.signals import Array
 
@@ -20,12 +21,14 @@ _RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
 _APART = 4.0  # standard deviations between the halves of a window
 _UNEXPLAINED = 0.05  # of the position's variation
+_OUTLYING = 7.0  # standard deviations
 _CHANCE = 2.0  # times the usual variance of an average of white noise
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0  # interval over the computed one
-_EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in a window, of its length
+_RATCHET = 2.0  # of the motor's noise: its extremes push the load, so that the gap seems wider
+_EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
 
 
@@ -50,13 +53,35 @@ class JudgedFit:
     reasons: tuple[str, ...] = ()
 
 
-def judge(found: Search, settings: OutputErrorSettings, unit: float) -> JudgedFit:
-    """Decide on a fit; `unit` is the total gap at the motor (rad) per half gap at the load, for the words."""
+def judge(
+    found: Search,
+    settings: OutputErrorSettings,
+    unit: float,
+    possible: PossibleHalf | None = None,
+    jitter: float = 0.0,
+) -> JudgedFit:
+    """Decide on a fit.
+
+    Parameters
+    ----------
+    found : Search
+    settings : OutputErrorSettings
+    unit : float
+        Total gap at the motor (rad) per half gap at the load, for the words.
+    possible : PossibleHalf, optional
+        What the encoders' rounding leaves possible.
+    jitter : float
+        Standard deviation of the noise of the motor's angle beyond its counts, at the load (m or rad), where nothing
+        smooths it.
+    """
     best, problem = found.best, found.problem
-    half = float(best.values[HALF])
-    std = settings.calibration * math.hypot(best.std(HALF, found.free), rounded(found))
+    half, std = float(best.values[HALF]), math.hypot(best.std(HALF, found.free), rounded(found))
+    if possible is not None:
+        half, std = possible.mean, math.hypot(std, possible.std)
+    std *= settings.calibration
     growth = grown(found, settings.gap_rate / unit)
-    total = math.hypot(_DOUBT * std, settings.model_share * half, 0.5 * _ROUNDED * problem.count, growth)
+    floor = 0.5 * _ROUNDED * problem.count
+    total = math.hypot(_DOUBT * std, settings.model_share * half, floor, growth, _RATCHET * jitter)
     mismatches = _mismatches(found, settings.gap_rate / unit)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
@@ -102,6 +127,7 @@ def _mismatches(found: Search, rate: float) -> tuple[str, ...]:
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
     sentences += unusual_numbers(found)
+    sentences += _outliers(found)
     sentences += differing_halves(found, rate)
     return tuple(sentences)
 
@@ -125,6 +151,15 @@ def differing_halves(found: Search, rate: float) -> tuple[str, ...]:
     difference, spread = between_halves(found)
     apart = abs(difference) / math.hypot(spread, 0.5 * rate * found.problem.duration)
     return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > _APART else ()
+
+
+def _outliers(found: Search) -> tuple[str, ...]:
+    """Sentence for a motion without dynamics whose model errs in a few places: play errs evenly, or hardly at all."""
+    raw = found.best.raw
+    most, rms = float(np.max(np.abs(raw))), float(np.sqrt(np.mean(raw**2)))
+    if found.problem.model.speed > 0.0 or most <= _OUTLYING * max(rms, found.problem.count):
+        return ()
+    return (f"in a few places the model errs by {most / rms:.2g} times as much as in the others",)
 
 
 def _slow(raw: Array) -> float:
