@@ -16,6 +16,7 @@ from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
+from servotwin.plant.shown import MILLIMETRES, ShownUnit
 
 _ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a little shorter than requested
 _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
@@ -201,10 +202,13 @@ class ExcitationPolicy:
     pitch : float
         m/rad, travel per angle of the screw.
     settings : ExcitationSettings
+    unit : ShownUnit
+        Unit of the moves in the reasons.
     """
 
     pitch: float
     settings: ExcitationSettings
+    unit: ShownUnit = MILLIMETRES
 
     def decide(self, state: ExcitationState, window: WindowSummary) -> Decision:
         """Decide after one more window."""
@@ -226,6 +230,9 @@ class ExcitationPolicy:
         within the hold time takes an error of the gap's size.
         """
         return window.slack + self.pitch * (window.upper + self.settings.margin)
+
+    def _shown(self, move: float) -> str:
+        return f"{self.unit.factor * move:.3g} {self.unit.name}"
 
     def _missed(self, state: ExcitationState) -> str:
         several = f"{state.misses} windows in a row tell" if state.misses > 1 else "1 window tells"
@@ -250,7 +257,8 @@ class ExcitationPolicy:
         if why_not:
             return Decision(state, None, f"{self._missed(state)}, and {why_not}")
         after = replace(state, misses=0, probing=Stage.REQUESTED, probed=window.time)
-        why = f"{self._missed(state)}: a move of {_mm(needed)} crosses a gap of {math.degrees(window.upper):.3g} deg"
+        why = f"{self._missed(state)}: a move of {self._shown(needed)} crosses "
+        why += f"a gap of {math.degrees(window.upper):.3g} deg"
         return Decision(after, Probe(needed, s.times.hold, s.strokes), why)
 
     def _why_not(self, state: ExcitationState, window: WindowSummary, needed: float) -> str:
@@ -266,7 +274,7 @@ class ExcitationPolicy:
         if not math.isfinite(needed):
             return "gap and dead zone are not bounded well enough to size a probing move"
         if needed > s.probe:
-            return f"a probing move must be {_mm(needed)}, and at most {_mm(s.probe)} are allowed"
+            return f"a probing move must be {self._shown(needed)}, and at most {self._shown(s.probe)} are allowed"
         return ""
 
 
@@ -275,7 +283,3 @@ def long_enough(length: float, pre_trigger: float, settings: ExcitationSettings)
     times = settings.times
     rounding = _ROUNDING * times.window
     return length >= times.window - rounding and pre_trigger >= times.pre_trigger - rounding
-
-
-def _mm(metres: float) -> str:
-    return f"{1e3 * metres:.3g} mm"

@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
 from servotwin.plant.plants import Plant
+from servotwin.plant.shown import position_unit
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
 
@@ -101,7 +102,7 @@ class Requests:
         """Make the part that a twin's settings describe; None: the twin requests nothing."""
         if settings.excitation is None:
             return None
-        policy = ExcitationPolicy(servo.p, settings.excitation)
+        policy = ExcitationPolicy(servo.p, settings.excitation, position_unit(servo))
         return cls(policy, settings.retry, settings.attempts, settings.validity, settings.uncertainty.gap[1])
 
     def decide(

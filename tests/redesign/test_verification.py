@@ -18,6 +18,7 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.plant.axis import Axis
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
@@ -96,7 +97,7 @@ def test_a_slower_setting_is_verified_at_the_rate_of_the_axis() -> None:
     assert found.setting.controller.Kp < 0.2 * inert_axis(50.0).controller.Kp
     assert found.loop is not None
     assert found.loop.Ms_worst <= 2.2
-    assert "at 50 Hz" in found.tried
+    assert "at 50 Hz" in found.tried(inert_axis(50.0))
 
 
 def test_a_sampled_setting_is_simulated_with_its_ticks_counts_and_limits() -> None:
@@ -344,7 +345,11 @@ def test_the_certificate_says_what_was_tried_and_what_leaving_out_integral_actio
     assert found.beyond is not None
     assert (found.beyond.machines, found.beyond.settled) == (4, 1.0)
     assert found.error_per_volt == pytest.approx(1.0 / law.Kp)
-    assert "verified on 16 simulated machines in continuous time" in found.tried
+    assert "verified on 16 simulated machines in continuous time: steps of" in found.tried(SERVO)
+    assert " mm from rest" in found.tried(SERVO)
+    turning = found.tried(Axis.preset("robot-joint"))
+    assert " deg from rest" in turning
+    assert " N m, friction" in turning
     assert found.ramp is not None
     assert found.ramp.settled == 1.0
     # A loop that lags by so much of a second is off by that on a ramp of twelve periods; the gap adds to it.
@@ -366,3 +371,13 @@ def test_a_loop_that_meets_the_circle_criterion_has_no_limit_cycle_in_any_gap() 
         settled, hunting = assess([Design(calm), Design(OWN)], members, Trial(200.0, 20.0))
         assert settled.at_rest.all()
         assert not hunting.at_rest.any()
+
+
+def test_a_shaft_without_any_gap_is_simulated_with_a_tiny_one() -> None:
+    """Its flanks change without end wherever the torque changes sign: a verification ended in an error."""
+    axis = Axis.preset("robot-joint")
+    known = Uncertainty(gap=(0.0, 0.0), step=(0.02, 0.17))
+    members = draw(axis, known, 2, 2)
+    assert np.all(members.gap > 0.0)
+    assert np.all(axis.p * members.gap < 1e-5 * 0.02)
+    assert np.all(draw(SERVO, known.replace(step=(1e-4, 1e-3)), 2, 2).gap == 0.0)

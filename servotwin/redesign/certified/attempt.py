@@ -15,6 +15,7 @@ from servotwin.control.retuning import answer, filter_time, integrates, unfed
 from servotwin.errors import InvalidInput
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
+from servotwin.plant.shown import position_unit
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
 from servotwin.redesign.certified.certificate import (
@@ -67,7 +68,9 @@ class Question:
             )
         allowed = self.largest_error(tried.setting)
         if tried.tail > ROUNDED * allowed:
-            return f"is off by {1e3 * tried.tail:.3g} mm in the end, and {1e3 * allowed:.3g} mm are allowed"
+            unit = position_unit(self.servo)
+            off, most = (f"{unit.factor * error:.3g} {unit.name}" for error in (tried.tail, allowed))
+            return f"is off by {off} in the end, and {most} are allowed"
         if tried.overshoot > demands.overshoot:
             return f"overshoots by {100.0 * tried.overshoot:.0f} %, and {100.0 * demands.overshoot:.0f} % are allowed"
         if tried.ramp is not None and tried.ramp.settled < 1.0:

@@ -8,6 +8,8 @@ from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
 from servotwin.messages import Verification
+from servotwin.plant.plants import Plant
+from servotwin.plant.shown import command_unit, position_unit
 from servotwin.redesign.certified.uncertainty import LARGEST_DELAY
 from servotwin.redesign.design import Design
 
@@ -339,15 +341,15 @@ class Certificate:
     error_per_volt: float = 0.0
     lag: float = 0.0
 
-    @property
-    def tried(self) -> str:
-        """Sentence on what was tried, with ranges."""
+    def tried(self, servo: Plant) -> str:
+        """Sentence on what was tried, with ranges in the units of the servo or axis that was verified."""
+        unit, command = position_unit(servo), command_unit(servo)
         law = "in continuous time" if self.rate is None else f"at {self.rate:g} Hz, up to {self.delay} samples late"
         low, high = (math.degrees(end) for end in self.gap)
         text = (
-            f"verified on {self.members} simulated machines {law}: steps of {1e3 * self.step[0]:.3g} to "
-            f"{1e3 * self.step[1]:.3g} mm from rest, gaps of {low:.4g} to {high:.4g} deg, input bias of "
-            f"{self.input_bias[0]:.3g} to {self.input_bias[1]:.3g} V, friction of {self.friction[0]:.3g} to "
+            f"verified on {self.members} simulated machines {law}: steps of {unit.factor * self.step[0]:.3g} to "
+            f"{unit.factor * self.step[1]:.3g} {unit.name} from rest, gaps of {low:.4g} to {high:.4g} deg, "
+            f"input bias of {self.input_bias[0]:.3g} to {self.input_bias[1]:.3g} {command}, friction of {self.friction[0]:.3g} to "
             f"{self.friction[1]:.3g} N m; {100.0 * self.settled_least:.4g} % settle at least, with "
             f"{100.0 * self.confidence:g} % confidence"
         )

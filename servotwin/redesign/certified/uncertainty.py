@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.basis import Play
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.sobol import sobol
@@ -25,6 +26,7 @@ PARAMETERS = ("k", "c", "k_B", "m", "k_T", "p")
 """Numbers of the plant that are uncertain, in the order of the drawn factors."""
 # Standard deviations beyond which a learnt factor is not drawn.
 _TAILS = 3.0
+_LEAST_GAP = 1e-6  # of the smallest step
 _CONDITION_NAMES = ("gap", "step", "input_bias", "theta_d0", "friction", "delay")
 _CONDITIONS = len(_CONDITION_NAMES)
 _UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
@@ -307,7 +309,12 @@ def _factors(uncertainty: Uncertainty, places: Array) -> Array:
 
 def _machines(plants: tuple[Plant, ...], uncertainty: Uncertainty, places: Array) -> SimulatedMachines:
     """Machines of plants for (P, C, conditions) places in 0 .. 1."""
-    gap = _spread(uncertainty.gap, places[..., 0])
+    low, high = uncertainty.gap
+    if plants[0].play is Play.FREE:
+        # A shaft without any gap changes its flank without end wherever its torque changes sign.
+        least = _LEAST_GAP * uncertainty.step[0] / plants[0].p
+        low, high = max(low, least), max(high, least)
+    gap = _spread((low, high), places[..., 0])
     step = np.exp(_spread((math.log(uncertainty.step[0]), math.log(uncertainty.step[1])), places[..., 1]))
     return SimulatedMachines(
         plants,
