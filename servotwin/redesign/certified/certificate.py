@@ -349,9 +349,9 @@ class Certificate:
         text = (
             f"verified on {self.members} simulated machines {law}: steps of {unit.factor * self.step[0]:.3g} to "
             f"{unit.factor * self.step[1]:.3g} {unit.name} from rest, gaps of {low:.4g} to {high:.4g} deg, "
-            f"input bias of {self.input_bias[0]:.3g} to {self.input_bias[1]:.3g} {command}, friction of {self.friction[0]:.3g} to "
-            f"{self.friction[1]:.3g} N m; {100.0 * self.settled_least:.4g} % settle at least, with "
-            f"{100.0 * self.confidence:g} % confidence"
+            f"input bias of {self.input_bias[0]:.3g} to {self.input_bias[1]:.3g} {command}, "
+            f"friction of {self.friction[0]:.3g} to {self.friction[1]:.3g} N m; "
+            f"{100.0 * self.settled_least:.4g} % settle at least, with {100.0 * self.confidence:g} % confidence"
         )
         if self.loop is not None:
             text += f"; Ms at most {self.loop.Ms_worst:.3g} on {self.loop.plants} plants without a gap"
