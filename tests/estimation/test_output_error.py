@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from typing import NamedTuple
@@ -278,6 +279,20 @@ def test_the_gaps_that_rounding_leaves_possible() -> None:
     assert loud.theta_m is not None
     found = search(_problem(loud, loud.theta_m, axis, OutputErrorSettings()), 0.0)
     assert possible_half(found, bound) is None
+
+
+def test_errors_of_floating_point_are_no_mismatch_and_errors_in_a_few_places_are_one() -> None:
+    axis, time = Axis.preset("stepper-stage"), np.arange(4000) / 1000.0
+    axis = axis.replace(sensors=replace(axis.sensors, encoder_resolution=0.0, position_resolution=0.0))
+    angle, gap = 0.5 * np.sin(6.0 * time), 0.05
+    position = axis.p * play(angle, gap, -0.02)
+    exact = estimate_gap(Window(position, angle, sample_rate=1000.0), axis)
+    assert exact.ok, exact.reasons
+    assert exact.gap == pytest.approx(gap, rel=1e-6)
+    position[2000:2004] += 0.3 * axis.p * gap
+    slipped = estimate_gap(Window(position, angle, sample_rate=1000.0), axis)
+    assert slipped.status is GapStatus.MODEL_MISMATCH
+    assert any("in a few places" in reason for reason in slipped.reasons), slipped.reasons
 
 
 def test_noise_of_the_motor_that_pushes_the_load_widens_the_interval() -> None:

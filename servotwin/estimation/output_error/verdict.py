@@ -82,7 +82,7 @@ def judge(
     growth = grown(found, settings.gap_rate / unit)
     floor = 0.5 * _ROUNDED * problem.count
     total = math.hypot(_DOUBT * std, settings.model_share * half, floor, growth, _RATCHET * jitter)
-    mismatches = _mismatches(found, settings.gap_rate / unit)
+    mismatches = _mismatches(found, settings.gap_rate / unit, settings.model_share * half)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     single = one_flank(found)
@@ -118,8 +118,8 @@ def _rival(found: Search, half: float, total: float, unit: float) -> str:
     return ""
 
 
-def _mismatches(found: Search, rate: float) -> tuple[str, ...]:
-    """List the signs that the model is not that of the machine."""
+def _mismatches(found: Search, rate: float, least: float) -> tuple[str, ...]:
+    """List the signs that the model is not that of the machine; a `least` error (m or rad at the load) is none."""
     best, problem = found.best, found.problem
     sentences = []
     variation = float(np.std(problem.position))
@@ -127,7 +127,7 @@ def _mismatches(found: Search, rate: float) -> tuple[str, ...]:
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
     sentences += unusual_numbers(found)
-    sentences += _outliers(found)
+    sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
     return tuple(sentences)
 
@@ -153,11 +153,14 @@ def differing_halves(found: Search, rate: float) -> tuple[str, ...]:
     return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > _APART else ()
 
 
-def _outliers(found: Search) -> tuple[str, ...]:
-    """Sentence for a motion without dynamics whose model errs in a few places: play errs evenly, or hardly at all."""
+def _outliers(found: Search, least: float) -> tuple[str, ...]:
+    """Sentence for a motion without dynamics whose model errs in a few places: play errs evenly.
+
+    Errors up to a `least` one (m or rad at the load) count as none.
+    """
     raw = found.best.raw
     most, rms = float(np.max(np.abs(raw))), float(np.sqrt(np.mean(raw**2)))
-    if found.problem.model.speed > 0.0 or most <= _OUTLYING * max(rms, found.problem.count):
+    if found.problem.model.speed > 0.0 or most <= _OUTLYING * max(rms, found.problem.count, least):
         return ()
     return (f"in a few places the model errs by {most / rms:.2g} times as much as in the others",)
 
