@@ -21,7 +21,7 @@ from servotwin.estimation.output_error.estimator import _problem
 from servotwin.estimation.output_error.fit import search
 from servotwin.estimation.output_error.models import Priors, ShaftModel
 from servotwin.estimation.output_error.rounding import possible_half
-from servotwin.estimation.output_error.verdict import grown
+from servotwin.estimation.output_error.verdict import _slow, grown
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
@@ -279,6 +279,12 @@ def test_the_gaps_that_rounding_leaves_possible() -> None:
     assert loud.theta_m is not None
     found = search(_problem(loud, loud.theta_m, axis, OutputErrorSettings()), 0.0)
     assert possible_half(found, bound) is None
+
+
+def test_slow_errors_are_told_from_white_noise() -> None:
+    noise, time = np.random.default_rng(5).normal(size=4000), np.arange(4000) / 4000.0
+    assert _slow(noise) < 0.05
+    assert _slow(noise + 0.3 * np.sin(6.0 * time)) > 0.1
 
 
 def test_errors_of_floating_point_are_no_mismatch_and_errors_in_a_few_places_are_one() -> None:
