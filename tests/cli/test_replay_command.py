@@ -23,9 +23,9 @@ from servotwin.store.store import open_store
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a twin that has worked through a scenario in lock-step."""
     folder = tmp_path_factory.mktemp("recorded")
-    text = SCENARIO.format(twin='policy = "paper"', duration=24.0, period=4.0, fine="false")
+    text = SCENARIO.format(twin='policy = "paper"', duration=16.0, period=4.0, fine="false")
     (folder / "scenario.toml").write_text(text)
-    deployed(folder, Scenario.load(folder / "scenario.toml"), 'policy = "paper"')
+    deployed(folder, Scenario.load(folder / "scenario.toml"), 'policy = "paper"', thread=True)
     return folder
 
 

@@ -4,13 +4,14 @@ import socket
 import sqlite3
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
 import pytest
 from lock_step import HttpTwin, LockStep, lock_step
-from machines import machine
+from machines import machine, served
 from services import service
 
 from servotwin.cosim import Loop, cosimulate
@@ -71,13 +72,16 @@ axis = "paper"
 """
 
 
-def deployed(folder: Path, scenario: Scenario, twin: str) -> LockStep:
-    """The scenario on a machine and a twin in processes of their own."""
+def deployed(folder: Path, scenario: Scenario, twin: str, *, thread: bool = False) -> LockStep:
+    """The scenario on a machine and a twin in processes of their own, or on a machine in a `thread` of this one."""
     (folder / "machine.toml").write_text(
         'scenario = "scenario.toml"\nrole = "supervise"\nlisten = "127.0.0.1:0"\nspeed = 0.0\nendless = false\n'
     )
     (folder / "twin.toml").write_text(TWIN.format(twin=twin))
-    with machine(folder / "machine.toml") as (address, _), service(folder / "twin.toml") as url:
+    with ExitStack() as stack:
+        path = folder / "machine.toml"
+        address = stack.enter_context(served(path)) if thread else stack.enter_context(machine(path))[0]
+        url = stack.enter_context(service(folder / "twin.toml"))
         drive, remote = SimulatedSupervised(address), HttpTwin(url, "axis")
         try:
             drive.connect()
