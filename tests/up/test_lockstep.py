@@ -53,9 +53,9 @@ hold_s = 2.0
 {twin}
 """
 CERTIFIED = """policy = "certified"
-demands = {velocity_feedforward = false}
+demands = {velocity_feedforward = false, friction_feedforward = false, notch = false}
 """
-"""With half of the candidates: both sides verify them all."""
+"""With fewer candidates: both sides verify them all."""
 TWIN = """
 [service]
 store = "sqlite:///twin.db"
