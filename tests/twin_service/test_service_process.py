@@ -158,6 +158,7 @@ def check_that_a_second_twin_is_refused(path, monkeypatch):
         for name in ("configure_logging", "raise_descriptor_limit"):
             patch.setattr(service, name, lambda *_: None)
         patch.setattr(WorkerPool, "launched", lambda _: nullcontext())
+        patch.setattr(service, "HttpServer", lambda *_: pytest.fail("it serves"))
         with pytest.raises(InvalidInput, match="another twin works on it"):
             service.run(path)
 
