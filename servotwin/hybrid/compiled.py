@@ -17,6 +17,7 @@ from numba import njit
 from numba.core.compiler import CompilerBase
 
 from servotwin.errors import InvalidInput
+from servotwin.hybrid.cached_code import load_fast
 from servotwin.hybrid.compile_lock import compile_once
 from servotwin.hybrid.compile_progress import show_compilation
 from servotwin.hybrid.subroutine import TRIED, SubroutineCompiler, UnoptimisedCompiler
@@ -100,6 +101,8 @@ def _compile(function: _Function, **options: Any) -> _Function:
     index = dispatcher._cache._cache_file
     index._source_stamp = dispatcher.stamp
     index._load_index = partial(_load_index, index._load_index)
+    if TRIED and "pipeline_class" not in options:
+        load_fast(dispatcher, options.get("_nrt", True))
     compile_once(dispatcher)
     return cast(_Function, dispatcher)
 

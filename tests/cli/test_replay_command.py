@@ -7,32 +7,41 @@ from contextlib import closing
 from importlib.metadata import version
 from math import inf
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import pytest
-from test_lockstep import SCENARIO, deployed
+from lock_step import LockStep
+from test_lockstep import SCENARIO, check_deployed_is_simulated, deployed
 from typer.testing import CliRunner
 
 from servotwin.cli import app as cli
+from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import open_store
 
 
+class Recorded(NamedTuple):
+    """The folder of a twin that has worked through a scenario in lock-step, and what it was sent and sent."""
+
+    folder: Path
+    scenario: Scenario
+    messages: LockStep
+
+
 @pytest.fixture(scope="module")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a twin that has worked through a scenario in lock-step."""
-    folder = tmp_path_factory.mktemp("recorded")
-    text = SCENARIO.format(twin='policy = "paper"', duration=24.0, period=4.0, fine="false")
-    (folder / "scenario.toml").write_text(text)
-    deployed(folder, Scenario.load(folder / "scenario.toml"), 'policy = "paper"')
-    return folder
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    folder, twin = tmp_path_factory.mktemp("recorded"), 'policy = "paper"'
+    (folder / "scenario.toml").write_text(SCENARIO.format(twin=twin, duration=16.0, period=4.0, fine="false"))
+    scenario = Scenario.load(folder / "scenario.toml")
+    return Recorded(folder, scenario, deployed(folder, scenario, twin, thread=True))
 
 
 @pytest.fixture
-def folder(recorded: Path, tmp_path: Path) -> Path:
+def folder(recorded: Recorded, tmp_path: Path) -> Path:
     """A copy that may be spoiled."""
-    for file in recorded.glob("twin.*"):
+    for file in recorded.folder.glob("twin.*"):
         shutil.copy(file, tmp_path)
     return tmp_path
 
@@ -59,6 +68,13 @@ def windows(folder: Path) -> int:
     assert isinstance(number, int)
     assert number > 5
     return number
+
+
+@pytest.mark.slow
+def test_deployed_is_simulated_under_the_paper_s_policy(recorded: Recorded) -> None:
+    loop = cosimulate(recorded.scenario)
+    assert len(loop.updates) >= 2
+    check_deployed_is_simulated(loop, recorded.messages, recorded.folder)
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 
 import pytest
@@ -103,6 +103,8 @@ def test_a_twin_with_an_invalid_file_names_the_fault_and_does_not_start(
     for name in ("configure_logging", "raise_descriptor_limit"):
         monkeypatch.setattr(command, name, lambda *_: None)
     monkeypatch.setattr(command, "HttpServer", lambda *_: pytest.fail("it serves"))
+    # None of these is a fault of a model, which a worker would find.
+    monkeypatch.setattr(command.WorkerPool, "launched", lambda _: nullcontext())
     path = twin_file(tmp_path, "port = 0\n" + (service if isinstance(service, str) else service(tmp_path)))
     with pytest.raises(InvalidInput) as refused:
         command.run(path)

@@ -253,7 +253,8 @@ def run_line(line: str, folder: Path) -> tuple[int, str]:
 
 @pytest.mark.slow
 def test_the_first_five_minutes(tmp_path: Path) -> None:
-    """Every file and every command as printed, but for the port, which somebody else may have, and the speed.
+    """Every file and every command as printed, but for the port, which somebody else may have, the speed, and the
+    number of workers: a second one would have nothing to do.
 
     At five times real time a busy machine verifies settings more slowly than windows come: every update is then late.
     """
@@ -263,7 +264,7 @@ def test_the_first_five_minutes(tmp_path: Path) -> None:
     twin, machine = (text.replace("\nspeed = 5.0", "\nspeed = 2.0") for text in blocks("toml", title))
     assert "speed = 2.0" in twin
     assert "speed = 2.0" in machine
-    (tmp_path / "twin.toml").write_text(twin.replace("[service]\n", f"[service]\nport = {port}\n"))
+    (tmp_path / "twin.toml").write_text(twin.replace("[service]\n", f"[service]\nport = {port}\nworkers = 1\n"))
     (tmp_path / "machine.toml").write_text(machine)
     enroll, services, looks = ([line for line in block.splitlines() if line] for block in blocks("bash", title))
     assert [run_line(line, tmp_path)[0] for line in enroll] == [0]

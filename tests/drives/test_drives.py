@@ -75,7 +75,7 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
     path = plant_file(tmp_path, "supervise", 5.0)
     scenario = Scenario.load(tmp_path / "scenario.toml")
     controller = scenario.start_law.replace(**SOFTER)
-    with machine(path) as (address, process), closing(SimulatedSupervised(address)) as drive:
+    with served(path) as address, closing(SimulatedSupervised(address)) as drive:
         drive.connect()
         before = [drive.read(2345), drive.read(10_000)]
         changed = before[-1].last
@@ -84,7 +84,6 @@ def test_supervise_is_the_simulation_with_the_same_changes_at_the_same_samples(t
         moved = between[-1].last
         drive.move(2e-4)
         after = read_all(drive, 4000)
-        assert process.wait(10) == 0
     same = simulation_of(scenario)
     same.advance(changed)
     same.set_controller(controller, 2e-5)
@@ -156,7 +155,7 @@ def test_a_paced_machine_runs_on_without_its_edge(tmp_path: Path) -> None:
 def test_an_edge_that_sleeps_misses_its_ticks(tmp_path: Path) -> None:
     """Beyond the slack the machine does not wait: the next number says how many samples are missing."""
     path = plant_file(tmp_path, "control", speed=5.0, endless=True, slack_s=0.02)
-    with machine(path) as (address, process), closing(SimulatedControl(address)) as drive:
+    with served(path) as address, closing(SimulatedControl(address)) as drive:
         drive.connect()
         first = drive.read()
         found = first
@@ -168,8 +167,6 @@ def test_an_edge_that_sleeps_misses_its_ticks(tmp_path: Path) -> None:
                 break
         assert found.number > first.number + 100
         assert 0.0 <= drive.lag <= 0.02 * 5.0 + 1e-9
-        process.terminate()
-        assert process.wait(10) == 0
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -124,24 +124,9 @@ def test_samples_and_changes_are_the_simulation_s(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_drive_without_feedforwards_refuses_them_and_takes_other_gains(tmp_path: Path) -> None:
-    with server(tmp_path, optional=False) as (url, _), closing(drive_at(url)) as drive:
-        drive.connect()
-        law = Scenario.load(tmp_path / "scenario.toml").start_law
-        with pytest.raises(DriveRefused, match="VelocityFeedforward"):
-            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(velocity_feedforward=150.0)))))
-        with pytest.raises(DriveRefused, match="FrictionFeedforward"):
-            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(friction_feedforward=0.02)))))
-        with pytest.raises(DriveRefused, match="NotchHz"):
-            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(notch_hz=4.0)))))
-        with pytest.raises(DriveRefused, match="IntegralOnly"):
-            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(integral_only=True)))))
-        drive.write(Parameters(6, Setting(3e-5, gains_of(law))))
-
-
-@pytest.mark.slow
-def test_a_server_that_hangs_is_reconnected_without_missing_samples(tmp_path: Path) -> None:
-    with server(tmp_path, ring=LONG) as (url, process), closing(drive_at(url, silence_s=1.0)) as drive:
+def test_a_server_that_hangs_is_the_same_machine_and_a_restarted_one_another(tmp_path: Path) -> None:
+    url = free_url()
+    with server(tmp_path, url=url, ring=LONG) as (_, process), closing(drive_at(url, silence_s=1.0)) as drive:
         drive.connect()
         name, blocks = drive.machine, [drive.read()]
         os.killpg(process.pid, signal.SIGSTOP)
@@ -155,58 +140,66 @@ def test_a_server_that_hangs_is_reconnected_without_missing_samples(tmp_path: Pa
         blocks.append(drive.read())
         assert drive.machine == name
         assert [block.first for block in blocks[1:]] == [block.last for block in blocks[:-1]]
-
-
-@pytest.mark.slow
-def test_a_restarted_server_is_another_machine(tmp_path: Path) -> None:
-    url = free_url()
-    with server(tmp_path, url=url), closing(drive_at(url, silence_s=1.0)) as drive:
-        drive.connect()
-        first, name = drive.read(), drive.machine
     with closing(drive):
         _read_until_lost(drive, [])
-        with server(tmp_path, url=url):
+        with server(tmp_path, url=url, ring=500, speed=2.0):
             _connect(drive)
             assert drive.machine != name
             assert drive.read().version == 0
-    assert first.last > 0
+            _check_that_overwritten_samples_are_missing(drive, Scenario.load(tmp_path / "scenario.toml"))
 
 
-@pytest.mark.slow
-def test_overwritten_samples_are_missing_and_never_old_ones(tmp_path: Path) -> None:
-    with server(tmp_path, ring=500, speed=2.0) as (url, _), closing(drive_at(url)) as drive:
-        drive.connect()
-        blocks, holes = [drive.read()], 0
-        for _ in range(50):
-            time.sleep(0.05)
-            blocks.append(drive.read())
-            holes += blocks[-1].first > blocks[-2].last
-            assert blocks[-1].first >= blocks[-2].last
-            if holes > 2:
-                break
-        assert holes > 2
-    assert same(blocks, whole(simulation_of(Scenario.load(tmp_path / "scenario.toml"))))
+class Guarded(NamedTuple):
+    """A server with a password and a certificate, whose machine has no feedforwards; how a drive is let in."""
+
+    folder: Path
+    url: str
+    secured: dict[str, Any]
 
 
-@pytest.mark.slow
-def test_passwords_and_certificates(tmp_path: Path) -> None:
-    (mine, key), (other, _) = _certificate(tmp_path, "one"), _certificate(tmp_path, "two")
+@pytest.fixture(scope="module")
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Guarded]:
+    folder = tmp_path_factory.mktemp("guarded")
+    mine, key = _certificate(folder, "one")
     files = {"certificate": str(mine), "private_key": str(key)}
-    with server(tmp_path, user="edge", password="secret", **files) as (url, _):
-        secured = {"user": "edge", "certificate": mine, "private_key": key, "server_certificate": mine}
-        with closing(drive_at(url, password="secret", **secured)) as drive:
-            drive.connect()
-            drive.write(Parameters(1, Setting(1e-5)))
-            while drive.read().version != 1:
-                pass
-        for wrong in ({"password": "guessed"}, {"password": "secret", "server_certificate": other}):
-            with closing(drive_at(url, **{**secured, **wrong}, silence_s=3.0)) as drive:
-                with pytest.raises((InvalidInput, DriveLost)) as error:
-                    drive.connect()
-                assert "guessed" not in str(error.value)
-                assert "secret" not in str(error.value)
-        with closing(drive_at(url, silence_s=3.0)) as drive, pytest.raises((InvalidInput, DriveLost)):
-            drive.connect()
+    with server(folder, optional=False, user="edge", password="secret", **files) as (url, _):
+        yield Guarded(
+            folder, url, {"user": "edge", "certificate": mine, "private_key": key, "server_certificate": mine}
+        )
+
+
+@pytest.mark.slow
+def test_a_drive_without_feedforwards_refuses_them_and_takes_other_gains(guarded: Guarded) -> None:
+    with closing(drive_at(guarded.url, password="secret", **guarded.secured)) as drive:
+        drive.connect()
+        law = Scenario.load(guarded.folder / "scenario.toml").start_law
+        with pytest.raises(DriveRefused, match="VelocityFeedforward"):
+            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(velocity_feedforward=150.0)))))
+        with pytest.raises(DriveRefused, match="FrictionFeedforward"):
+            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(friction_feedforward=0.02)))))
+        with pytest.raises(DriveRefused, match="NotchHz"):
+            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(notch_hz=4.0)))))
+        with pytest.raises(DriveRefused, match="IntegralOnly"):
+            drive.write(Parameters(5, Setting(3e-5, gains_of(law.replace(integral_only=True)))))
+        drive.write(Parameters(6, Setting(3e-5, gains_of(law))))
+
+
+@pytest.mark.slow
+def test_passwords_and_certificates(guarded: Guarded, tmp_path: Path) -> None:
+    other, _ = _certificate(tmp_path, "two")
+    with closing(drive_at(guarded.url, password="secret", **guarded.secured)) as drive:
+        drive.connect()
+        drive.write(Parameters(7, Setting(1e-5)))
+        while drive.read().version != 7:
+            pass
+    for wrong in ({"password": "guessed"}, {"password": "secret", "server_certificate": other}):
+        with closing(drive_at(guarded.url, **{**guarded.secured, **wrong}, silence_s=3.0)) as drive:
+            with pytest.raises((InvalidInput, DriveLost)) as error:
+                drive.connect()
+            assert "guessed" not in str(error.value)
+            assert "secret" not in str(error.value)
+    with closing(drive_at(guarded.url, silence_s=3.0)) as drive, pytest.raises((InvalidInput, DriveLost)):
+        drive.connect()
 
 
 @pytest.mark.slow
@@ -261,6 +254,20 @@ def test_the_table_of_each_kind(tmp_path: Path) -> None:
     control_drive(Table("edge.toml", tables[2], "drive"), tmp_path).close()
     with pytest.raises(InvalidInput, match=r"drive\.kind = 'replay' is not allowed; give one of simulated"):
         control_drive(Table("edge.toml", tables[1], "drive"), tmp_path)
+
+
+def _check_that_overwritten_samples_are_missing(drive: OpcUaDrive, scenario: Scenario) -> None:
+    """And never old ones, on a machine whose ring holds less than is read at a time."""
+    blocks, holes = [drive.read()], 0
+    for _ in range(50):
+        time.sleep(0.05)
+        blocks.append(drive.read())
+        holes += blocks[-1].first > blocks[-2].last
+        assert blocks[-1].first >= blocks[-2].last
+        if holes > 2:
+            break
+    assert holes > 2
+    assert same(blocks, whole(simulation_of(scenario)))
 
 
 def _unchecked(parameters: Parameters, **changes: Any) -> Parameters:

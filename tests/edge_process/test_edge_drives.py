@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from machines import machine, plant_file
+from machines import plant_file, served
 from test_opcua import server
 
 from servotwin.cosim.machine import simulation_of
@@ -39,13 +39,12 @@ def replayed(folder: Path, _stack: ExitStack) -> dict[str, Any]:
 
 
 def simulated(folder: Path, stack: ExitStack) -> dict[str, Any]:
-    address, _ = stack.enter_context(machine(plant_file(folder, "supervise", SIMULATED)))
-    return {"kind": "simulated", "address": address}
+    return {"kind": "simulated", "address": stack.enter_context(served(plant_file(folder, "supervise", SIMULATED)))}
 
 
 def over_opcua(folder: Path, stack: ExitStack) -> dict[str, Any]:
     url, _ = stack.enter_context(server(folder, ring=20_000))
-    return {"kind": "opcua", "url": url, "poll_s": 0.03}
+    return {"kind": "opcua", "url": url, "poll_s": 0.1}
 
 
 def windows_of(folder: Path) -> list[WindowMessage]:

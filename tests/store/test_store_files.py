@@ -8,13 +8,13 @@ import sys
 import threading
 from pathlib import Path
 
-import postgres
 import psycopg
 import pytest
 import sqlalchemy as sa
 from alembic.autogenerate import compare_metadata
 from alembic.runtime.migration import MigrationContext
 from alembic.script import ScriptDirectory
+from postgres import Server
 from store_cases import MORE, NEXT, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
@@ -237,32 +237,32 @@ except InvalidInput as error:
 
 
 @pytest.mark.slow
-def test_a_server_that_cuts_its_connections_is_survived() -> None:
-    with postgres.running() as server:
-        store = open_store(server.database("cut"))
-        store.put([window()])
-        server.run("postgres", "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'cut'")
-        with pytest.raises(StoreUnavailable, match="not available now"):
-            store.put([window(sequence=2)])
-        assert store.put([window(sequence=2)]) == [PutResult.NEW]
-        assert store.servo("a").windows == 2
-        store.close()
+def test_a_server_that_cuts_its_connections_is_survived(postgres_server: Server) -> None:
+    store = open_store(postgres_server.database("cut"))
+    store.put([window()])
+    postgres_server.run("postgres", "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = 'cut'")
+    with pytest.raises(StoreUnavailable, match="not available now"):
+        store.put([window(sequence=2)])
+    assert store.put([window(sequence=2)]) == [PutResult.NEW]
+    assert store.servo("a").windows == 2
+    store.close()
 
 
 @pytest.mark.slow
-def test_servos_are_locked_in_one_order_whatever_language_the_database_sorts_in() -> None:
+def test_servos_are_locked_in_one_order_whatever_language_the_database_sorts_in(
+    postgres_server: Server,
+) -> None:
     """Two twins that lock rows in different orders wait for each other until the server ends one of them."""
     names = ["ax-1", "Ax-2", "AX-3", "b", "B"]
-    with postgres.running() as server:
-        try:
-            url = server.database("sorted", "en-US")
-        except psycopg.Error as error:
-            pytest.skip(f"this PostgreSQL has no ICU: {error}")
-        store = open_store(url)
-        store.put([window(name) for name in names])
-        with store.engines.reader.connect() as connection:
-            by_people = connection.scalars(sa.select(twins.c.servo).order_by(twins.c.servo)).all()
-            held = connection.execute(_locked_serials("postgresql"), {"_servos": names}).all()
-        store.close()
+    try:
+        url = postgres_server.database("sorted", "en-US")
+    except psycopg.Error as error:
+        pytest.skip(f"this PostgreSQL has no ICU: {error}")
+    store = open_store(url)
+    store.put([window(name) for name in names])
+    with store.engines.reader.connect() as connection:
+        by_people = connection.scalars(sa.select(twins.c.servo).order_by(twins.c.servo)).all()
+        held = connection.execute(_locked_serials("postgresql"), {"_servos": names}).all()
+    store.close()
     assert by_people != sorted(names)
     assert [row.servo for row in held] == sorted(names)

@@ -5,6 +5,7 @@ It prints "ready URL" when it listens.
 """
 
 import asyncio
+import gc
 import json
 import os
 import sys
@@ -122,7 +123,9 @@ class Machine:
 
 async def serve(options: dict[str, Any]) -> None:
     server = Server(user_manager=Users(options) if "user" in options else None)
+    gc.disable()  # searching the standard's thousands of nodes for garbage would take as long as making them
     await server.init()
+    gc.enable()
     server.set_endpoint(options["url"])
     if "certificate" in options:
         await server.load_certificate(options["certificate"])

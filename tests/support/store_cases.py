@@ -3,11 +3,10 @@
 import hashlib
 import itertools
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
-import postgres
+from postgres import Server
 
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, WorkResult
 from servotwin.store.schema import REVISION
@@ -30,14 +29,14 @@ def upgrade():
 _numbers = itertools.count()
 
 
-@contextmanager
-def addresses(system: str, folder: Path) -> Iterator[NewAddress]:
-    """URLs of new, empty databases."""
-    if system == "sqlite":
-        yield lambda: f"sqlite:///{folder}/store-{next(_numbers)}.db"
-    else:
-        with postgres.running() as server:
-            yield lambda: server.database(f"store{next(_numbers)}")
+def sqlite_addresses(folder: Path) -> NewAddress:
+    """Addresses of files in a folder."""
+    return lambda: f"sqlite:///{folder}/store-{next(_numbers)}.db"
+
+
+def postgresql_addresses(server: Server) -> NewAddress:
+    """Addresses on a server."""
+    return lambda: server.database(f"store{next(_numbers)}")
 
 
 def incoming(

@@ -4,9 +4,10 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
+import postgres
 import pytest
 import sqlalchemy as sa
-from store_cases import MORE, NEXT, SYSTEMS, NewAddress, addresses
+from store_cases import MORE, NEXT, SYSTEMS, NewAddress, postgresql_addresses, sqlite_addresses
 
 from servotwin.store import migrate as migrations
 from servotwin.store.engine import transaction
@@ -14,10 +15,18 @@ from servotwin.store.schema import metadata
 from servotwin.store.store import Store, open_store
 
 
+@pytest.fixture(scope="session")
+def postgres_server() -> Iterator[postgres.Server]:
+    """One for all tests of this process: its start takes longer than most of them."""
+    with postgres.running() as server:
+        yield server
+
+
 @pytest.fixture(scope="module", params=SYSTEMS)
-def new_address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[NewAddress]:
-    with addresses(request.param, tmp_path_factory.mktemp("stores")) as result:
-        yield result
+def new_address(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> NewAddress:
+    if request.param == "sqlite":
+        return sqlite_addresses(tmp_path_factory.mktemp("stores"))
+    return postgresql_addresses(request.getfixturevalue("postgres_server"))
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,6 @@ import httpx
 import msgspec
 import pytest
 from service_system import bearer, place, twin_file, unpacked, window
-from store_cases import SYSTEMS, addresses
 
 from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
@@ -19,6 +18,7 @@ from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker import WorkerPool
 
+pytest_plugins = ("store_fixtures",)
 WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
 PATIENCE = 60.0
 
@@ -119,8 +119,7 @@ def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", SYSTEMS)
-def test_windows_are_processed_and_the_edge_is_notified(tmp_path, kind):
+def test_windows_are_processed_and_the_edge_is_notified(tmp_path, new_address):
     async def body(url):
         async with working(twin_file(tmp_path, f'store = "{shown(url)}"'), url) as (system, client):
             request = client.get("/v1/servos/ax-1/outgoing?after=0&wait=30", headers=bearer())
@@ -130,8 +129,7 @@ def test_windows_are_processed_and_the_edge_is_notified(tmp_path, kind):
             assert len(unpacked((await poll).content)) == 1
             await until(lambda: done(system))
 
-    with addresses(kind, tmp_path) as new:
-        asyncio.run(body(new()))
+    asyncio.run(body(new_address()))
 
 
 def shown(url):
@@ -142,7 +140,7 @@ def shown(url):
 
 
 @pytest.mark.slow
-def test_processes_share_one_database_and_notify_each_other_s_edges(tmp_path):
+def test_processes_share_one_database_and_notify_each_other_s_edges(tmp_path, postgres_server):
     async def body(url):
         file = twin_file(tmp_path, f'store = "{shown(url)}"')
         async with working(file, url) as (one, here), working(file, url) as (two, there):
@@ -157,8 +155,7 @@ def test_processes_share_one_database_and_notify_each_other_s_edges(tmp_path):
             assert {len(each) for each in statuses(two).values()} == {1}
             assert one.store.servo("ax-1").posted == 40
 
-    with addresses("postgresql", tmp_path) as new:
-        asyncio.run(body(new()))
+    asyncio.run(body(postgres_server.database("shared")))
 
 
 def test_at_most_two_verifications_start_at_once_and_then_at_their_rate():

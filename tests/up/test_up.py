@@ -1,5 +1,6 @@
 """`servotwin up` with real processes: it runs, ends, resumes, and leaves nothing behind, however it ends."""
 
+import io
 import os
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from servotwin.cli.app import app
@@ -18,7 +20,9 @@ from servotwin.edge_process.config_file import load
 from servotwin.errors import InvalidInput
 from servotwin.store.store import open_store
 from servotwin.up import command, folder
+from servotwin.up.outages import Outages
 from servotwin.up.plan import SERVOS
+from servotwin.up.site import Site
 
 RUNNING = "x real time"
 PATIENCE_S = 120.0
@@ -105,44 +109,39 @@ def stored(path: Path) -> dict[str, set[str]]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
-def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_continues_after_a_kill_and_ends_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it finds after an orderly end is what it leaves at every time, and a kill is the worst one."""
     monkeypatch.setattr(folder, "SERVOS", STARTED)
     path = tmp_path / "up"
-    with started(path, "--for", "5", "--speed", "10") as first:
-        lines = lines_until(first, "all processes have ended")
-        assert first.wait(PATIENCE_S) == 0
-    assert "made: " in lines[0]
-    [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
-    assert lines.index(address) < min(i for i, line in enumerate(lines) if RUNNING in line)
-    assert sum(": gap" in line or "of machine time, gap" in line for line in lines) == NUMBER
-    assert not left_behind(path)
-    before = times(path)
-    assert min(before) > 5.0
-    secrets = [
-        path / "tokens.toml",
-        path / "operator.token",
-        *(path / servo.name / "token" for servo in STARTED),
-    ]
-    assert {file.stat().st_mode & 0o777 for file in secrets} == {0o600}
-
-    with started(path, "--speed", "10") as second:
-        lines = lines_until(second, RUNNING)
-        assert sum(line.startswith("continuing with") for line in lines) == NUMBER
-        in_use = f"in use by another servotwin up .process {second.pid}"
+    with started(path, "--speed", "10") as first:
+        lines = lines_until(first, RUNNING)
+        assert "made: " in lines[0]
+        [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
+        assert lines.index(address) < len(lines) - 1
+        assert eventually(lambda: min(times(path)) > 5.0)
+        secrets = [path / "tokens.toml", path / "operator.token", *(path / servo.name / "token" for servo in STARTED)]
+        assert {file.stat().st_mode & 0o777 for file in secrets} == {0o600}
+        in_use = f"in use by another servotwin up .process {first.pid}"
         with pytest.raises(InvalidInput, match=in_use), folder.opened(path):
             pass
-        second.kill()
-        second.wait()
-        with started(path, "--speed", "10") as third:
-            lines_until(third, RUNNING)
+        first.kill()
+        first.wait()
+        before = times(path)
+        # At once: what the kill left behind still ends.
+        with started(path, "--speed", "10") as second:
+            lines = lines_until(second, RUNNING)
+            assert sum(line.startswith("continuing with") for line in lines) == NUMBER
             # However slow this machine: each servo's windows come from a boot after the first.
             assert eventually(lambda: all(boots - {"b1"} for boots in stored(path).values()))
-            third.send_signal(signal.SIGINT)
-            assert "all processes have ended" in lines_until(third, "all processes have ended")[-1]
-            assert third.wait(PATIENCE_S) == 0
+            second.send_signal(signal.SIGINT)
+            lines = lines_until(second, "all processes have ended")
+            assert sum(": gap" in line or "of machine time, gap" in line for line in lines) == NUMBER
+            assert second.wait(PATIENCE_S) == 0
     assert eventually(lambda: not left_behind(path))
     assert all(after > former + 5.0 for former, after in zip(before, times(path), strict=True))
     assert not list(path.glob("*/drive.sock"))
+    with folder.opened(path) as left:
+        assert not left.new
 
 
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
@@ -165,24 +164,46 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
         pass
 
 
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of a first start, of which nothing was started."""
+    path = tmp_path_factory.mktemp("first") / "up"
+    with folder.opened(path) as first:
+        assert first.new
+    return path
+
+
 @pytest.mark.slow
-def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(tmp_path: Path) -> None:
-    path = tmp_path / "up"
-    with folder.opened(path) as made:
-        assert made.new
-        assert made.machine(SERVOS[0]) is None
-        with pytest.raises(InvalidInput, match=f"another servotwin up .process {os.getpid()}"), folder.opened(path):
+def test_it_ends_by_itself_after_the_time_that_is_given(made: Path) -> None:
+    with folder.opened(made) as opened:
+        site = Site(opened, Outages(), lambda: 0)
+        site.twin.address = "http://127.0.0.1:1"
+        console = Console(file=io.StringIO())
+        monitor = command._Monitor(opened, site, 10.0, console)
+        begun = time.monotonic()
+        monitor.run(lambda: int(time.monotonic() > begun + PATIENCE_S), 0.3)
+        assert 0.3 <= time.monotonic() - begun < PATIENCE_S
+        monitor.stop()
+        monitor.print_summary()
+    assert "all processes have ended" in console.file.getvalue()
+
+
+@pytest.mark.slow
+def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(made: Path) -> None:
+    with folder.opened(made) as opened:
+        assert opened.machine(SERVOS[0]) is None
+        with pytest.raises(InvalidInput, match=f"another servotwin up .process {os.getpid()}"), folder.opened(made):
             pass
-        made.connect(SERVOS[0], "http://127.0.0.1:4321")
-        assert 'url = "http://127.0.0.1:4321"' in (path / SERVOS[0].name / "edge.toml").read_text()
-    assert [each.name for each in tmp_path.iterdir()] == ["up"]
-    bands = {servo.name: load(path / servo.name / "edge.toml").agent.supervision.fallback for servo in SERVOS}
+        opened.connect(SERVOS[0], "http://127.0.0.1:4321")
+        assert 'url = "http://127.0.0.1:4321"' in (made / SERVOS[0].name / "edge.toml").read_text()
+    assert [each.name for each in made.parent.iterdir()] == ["up"]
+    bands = {servo.name: load(made / servo.name / "edge.toml").agent.supervision.fallback for servo in SERVOS}
     errors = {name: None if fallback is None else fallback.setting.band.error for name, fallback in bands.items()}
     assert errors["noisy"] == pytest.approx(errors["quick"] + 0.05e-3)  # the edge puts up with its encoder's noise
-    with folder.opened(path) as again:
+    with folder.opened(made) as again:
         assert not again.new
-    (path / SERVOS[1].name / "token").unlink()
-    with pytest.raises(InvalidInput, match=f"{SERVOS[1].name}/token is missing"), folder.opened(path):
+    (made / SERVOS[1].name / "token").unlink()
+    with pytest.raises(InvalidInput, match=f"{SERVOS[1].name}/token is missing"), folder.opened(made):
         pass
 
 
