@@ -28,7 +28,7 @@ def share_of_ticks(engine: LiftedEngine) -> float:
 
 @pytest.mark.slow
 @pytest.mark.random
-@pytest.mark.parametrize("first", range(0, extent(100, 600), 50))
+@pytest.mark.parametrize("first", range(0, extent(50, 600), 50))
 def test_random_loops_are_those_of_the_ticks(first: int) -> None:
     """Same events, switching ticks to the bit, states to 1e-9 of their range."""
     for seed in range(first, first + 50):
