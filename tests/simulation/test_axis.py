@@ -39,7 +39,7 @@ def undamped(stiffness: float) -> Axis:
     return TWO_MASS.replace(transmission=UNDAMPED, controller=SOFT, load=load, sensors=sensors)
 
 
-OTHERS = ("two masses", "undamped shaft", "friction that falls, of a motor on a screw", "velocity drive, one mass")
+OTHERS = ("two masses", "undamped shaft", "velocity drive, one mass")
 """Axes of which another one has every part: for `make fuzz`."""
 HALF = 1.5  # s, half a period
 # Axis, amplitude (m or rad) and gap (rad).
