@@ -94,7 +94,7 @@ def test_a_slow_neighbour_does_not_change_the_ratio():
 def written(tmp_path_factory):
     path = tmp_path_factory.mktemp("bench") / "bench.json"
     console = quiet()
-    names = ("w2", "W1", "W3", "sampled")
+    names = ("w2", "W1", "sampled")
     results = command.bench(names, "2026-01-02T03:04:05+00:00", path, 1, QUICK, console)
     return results, json.loads(path.read_text()), console.file.getvalue()
 
@@ -109,7 +109,6 @@ def test_json_holds_every_run(written):
     assert [workload["name"] for workload in document["workloads"]] == [
         "W1",
         "W2",
-        "W3",
         "sampled",
         "counts",
         "calm",

@@ -103,7 +103,7 @@ def test_spreads_and_the_trend_hold_what_they_say():
     """An encoder that is 40 deg off, 1 um of noise: the trend's gap and offset after one window of each kind."""
     settings = whitened.WhitenedSettings(model_error=0.0, largest_std=DEG)
     scores = []
-    for seed in range(20):
+    for seed in range(14):
         both = noisy(stretch(5.0, 2.0), seed, 40.0 * DEG)
         first = estimate_carrying(both, SERVO, None, settings, None)
         trend = Trend.start(0.0, TrendSettings(shared_error_rad=0.0)).update(first)

@@ -102,7 +102,7 @@ def coloured(rng: np.random.Generator, memory: float, size: int) -> np.ndarray:
 def test_the_spread_holds_what_it_says(memory, size):
     """Voltage noise of 1 V, white or with a memory of up to 20 ms, and a bias of 0.2 V."""
     rng, inside, errors = np.random.default_rng(1), [], []
-    for _ in range(300):
+    for _ in range(150):
         found = disturbance(by_hand(coloured(rng, memory, size) - 0.2), CALM)
         inside.append(abs(found.bias - 0.2) < 1.96 * found.bias_std)
         errors.append(found.bias - 0.2)

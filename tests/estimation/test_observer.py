@@ -80,7 +80,6 @@ def test_initial_state_has_the_given_derivatives():
 @pytest.mark.parametrize(
     "servo",
     [
-        PAPER,
         PAPER.replace(n=2, m=(1.0, 3.0), k=(1e4, 2e4), c=(1.0, 30.0)),
         PAPER.replace(n=5, m=(1.0, 3.0, 2.0, 4.0, 1.0), c=30.0),
         PAPER.replace(k_d=1e6),

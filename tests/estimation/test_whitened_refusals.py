@@ -182,10 +182,8 @@ def test_noise_at_rest_is_no_wrong_model(floor):
 @pytest.mark.slow
 def test_bounds_are_below_the_gap():
     """Calm loops show one contact: what they say of the gap is a bound, and never more than the gap."""
-    found = [estimate_gap(window, SERVO) for window, _ in one_contact()]
-    bounds = [
-        (e.gap, gap) for e, (_, gap) in zip(found, one_contact(), strict=True) if e.status is GapStatus.LOWER_BOUND
-    ]
+    found = [(estimate_gap(window, SERVO), gap) for window, gap in one_contact()]
+    bounds = [(estimate.gap, gap) for estimate, gap in found if estimate.status is GapStatus.LOWER_BOUND]
     assert len(bounds) > 10
     assert all(bound <= gap for bound, gap in bounds), bounds
 
@@ -193,7 +191,7 @@ def test_bounds_are_below_the_gap():
 def one_contact():
     """Windows of calm loops, 2 s long, with 1 um of noise or none."""
     calm = SERVO.controller.replace(Ki=0.0)
-    for degrees in (5.0, 10.0, 15.0):
+    for degrees in (5.0, 15.0):
         gap = math.radians(degrees)
         for tolerance in (None, SERVO.tolerance_for(gap), SERVO.tolerance_for(gap, 1.5)):
             run = simulate(SERVO, 5.0, controller=calm, reference=1e-3, gap=gap, tolerance=tolerance)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from exploration import explored
 from sending_agent import SendingAgent
 
 import servotwin as st
@@ -63,7 +64,7 @@ def test_fast_wear_has_every_window_sent_and_the_same_estimates() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fig15", "fig16"])
+@pytest.mark.parametrize("name", explored(["fig15", "fig16"], 0))
 def test_what_is_sent_keeps_the_twin_right(name: str) -> None:
     rules = NoveltyRules(worth=math.radians(0.5))
     every, news = (looped(name, 2.5, 200.0, each) for each in (None, rules))

@@ -6,7 +6,7 @@ import warnings
 import control
 import numpy as np
 import pytest
-from exploration import explored
+from exploration import examples, explored
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -94,6 +94,7 @@ def servos(draw: st.DrawFn) -> Servo:
 
 
 @pytest.mark.slow
+@examples(25)
 @given(servos(), st.sampled_from([None, 20.0]))
 def test_crossovers_and_margins_against_python_control(servo: Servo, filter_hz: float | None) -> None:
     law = servo.controller.replace(loop_filter_hz=filter_hz)
@@ -126,6 +127,7 @@ def test_a_long_chain_has_margins(n: int, k_d: float) -> None:
 
 
 @pytest.mark.slow
+@examples(25)
 @given(servos())
 def test_responses_agree_in_both_forms_and_with_python_control(servo: Servo) -> None:
     omega = np.logspace(-1, 3, 41)
@@ -135,6 +137,7 @@ def test_responses_agree_in_both_forms_and_with_python_control(servo: Servo) -> 
 
 
 @pytest.mark.slow
+@examples(25)
 @given(servos())
 def test_sensitivity_peak_against_a_fine_grid(servo: Servo) -> None:
     loop, found = servo.loop(), servo.margins()
@@ -148,6 +151,7 @@ def test_sensitivity_peak_against_a_fine_grid(servo: Servo) -> None:
 
 
 @pytest.mark.slow
+@examples(25)
 @given(servos())
 def test_bandwidth_is_the_first_fall_by_3_db(servo: Servo) -> None:
     closed, width = servo.closed_loop(), servo.margins().bandwidth

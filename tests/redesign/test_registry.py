@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from servotwin.config.table import Table, parse_toml
 from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.guard import Limits
@@ -17,7 +18,7 @@ from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
-from servotwin.twin.settings import TwinSettings
+from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 PAPER = Servo.preset("paper")
 TOML = """
@@ -82,9 +83,8 @@ def test_certified_designs_for_the_controller_that_runs():
     assert policy.fallback().Ms != pytest.approx(PAPER.margins(law.replace(loop_filter_hz=None)).Ms, rel=1e-2)
 
 
-@pytest.mark.slow
-def test_ranges_and_demands_carry_their_units(tmp_path):
-    twin = load(tmp_path, NARROW).twin
+def test_ranges_and_demands_carry_their_units():
+    twin = read_twin_settings(Table("axis.toml", parse_toml(NARROW, "axis.toml").values["twin"]))
     assert twin.uncertainty == Uncertainty(
         0.05, 0.2, 0.03, 0.02, (math.radians(1.0), math.radians(30.0)), (0.5e-3, 2e-3), (-0.02, 0.05), (0.0, 0.001)
     )

@@ -68,10 +68,9 @@ def test_the_sensitivity_is_the_derivative(drawn):
 
 
 @pytest.mark.slow
-def test_drawn(drawn, tmp_path):
+def test_drawn(drawn):
     with style.look():
         figure = estimator.plot(drawn)
-    assert style.save(figure, tmp_path, "estimator").stat().st_size > 10_000
-    assert (tmp_path / "estimator.png").stat().st_size > 10_000
+        figure.canvas.draw()
     titles = [axes.get_title(loc="right") for axes in figure.axes]
     assert any(title.startswith("OK: 10.0") for title in titles)

@@ -5,10 +5,11 @@ A small simulation of its own, so that readings which servotwin does not offer c
 
 import math
 
-import numba
 import numpy as np
 import pytest
+from exploration import explored
 
+from servotwin.hybrid.compiled import compiled
 from servotwin.plant.backlash import play_step
 from servotwin.plant.linear import zero_order_hold
 from servotwin.plant.servo import Servo
@@ -18,7 +19,7 @@ GAPS = (0.0, 5.0, 10.0, 15.0)
 GATED, UNGATED, KEPT, SHIFTED, SHIFTED_UNGATED, RESET = range(6)
 
 
-@numba.njit
+@compiled
 def position(reading, motor, structure, output, gains, half_gap, tolerance):
     """(N,) m, last mass after a step of the reference; `reading` says what is done inside the dead zone."""
     Kp, integral_step, derivative_gain, filter_step = gains
@@ -69,7 +70,7 @@ def swing(servo, reading, gap_deg):
     return 1e3 * np.ptp(positions[-round(5.0 / HOLD) :])
 
 
-@pytest.fixture(scope="module", params=["paper", "table1", "paper-gain2"])
+@pytest.fixture(scope="module", params=explored(["paper", "table1", "paper-gain2"], 0))
 def servo(request):
     return Servo.preset(request.param)
 

@@ -186,7 +186,7 @@ def test_stuck_is_stuck_and_slip_has_its_direction(**case: object) -> None:
 
 
 @pytest.mark.slow
-@examples(10)
+@examples(6)
 @given(**(FRICTION_CASES | {"rate": st.just(None)}))
 @example(degrees=9.864783163098648, volts=0.001, ki=18907.6, zone=4.0, rate=None, wearing=False)
 def test_torque_and_work(**case: object) -> None:

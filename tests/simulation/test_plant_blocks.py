@@ -41,7 +41,7 @@ def both(case: SampledCase, std: float, seed: int) -> tuple[SampledEngine, Plant
 
 @pytest.mark.slow
 @pytest.mark.random
-@pytest.mark.parametrize("first", range(0, extent(150, 600), 50))
+@pytest.mark.parametrize("first", range(0, extent(50, 600), 50))
 def test_random_loops_in_noise_are_those_of_the_ticks(first: int) -> None:
     """Same events, dead zone to the tick, states to 1e-8 of their range, measurements too."""
     for seed in range(first, first + 50):

@@ -1,11 +1,12 @@
 """Extent of random tests: few examples, always the same, in the suite; many fresh ones in `make fuzz`."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, TypeVar
 
 import pytest
 from hypothesis import settings
 
+T = TypeVar("T")
 FUZZ = 20
 """So many times as many."""
 
@@ -15,8 +16,8 @@ def examples(number: int, **others: Any) -> settings:
     return settings(max_examples=extent(number, number * FUZZ), **others)
 
 
-def extent(suite: int, fuzz: int) -> int:
-    """Return the first number in the suite, the second one in `make fuzz`; for tests marked `random`."""
+def extent(suite: T, fuzz: T) -> T:
+    """Return the first value in the suite, the second one in `make fuzz`; for tests marked `random`."""
     return fuzz if settings.get_current_profile_name() == "fuzz" else suite
 
 
@@ -31,5 +32,5 @@ def explored(cases: Iterable[Any], *kept: int) -> list[Any]:
 
 
 def _exploration(case: Any) -> Any:
-    values = case if isinstance(case, tuple) else (case,)
+    values = case if type(case) is tuple else (case,)  # a named tuple is one value
     return pytest.param(*values, marks=pytest.mark.exploration)

@@ -177,7 +177,7 @@ def test_the_trend_follows_the_wear():
     assert loop.trend is loop.trends[-1]
     until = loop.until_limit
     assert until.interval[0] < until.median < until.interval[1]
-    assert loop_of("fig15").until_limit is None
+    assert loop_of("fig15-sampled").until_limit is None
 
 
 def test_without_a_window_there_is_no_trend():
@@ -253,7 +253,7 @@ def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
 @pytest.mark.slow
 def test_sixteen_bits_for_the_angle_cost_hundredths_of_a_degree():
     """Decision 8: what the angle's rounding does, and that of the position does not."""
-    fine, coarse = (loop_of("fig15", fine_angle=fine) for fine in (True, False))
+    fine, coarse = (loop_of("fig15-sampled", fine_angle=fine) for fine in (True, False))
     found = [max(abs(q.gap_change) for q in quantisation(loop)) for loop in (fine, coarse)]
     assert found[0] < math.radians(0.003) < math.radians(0.005) < found[1]
     assert 0.005 < np.max(np.abs(errors_deg(coarse))) < 0.05

@@ -146,6 +146,9 @@ def test_intervals_cover():
         drift = np.cumsum(generator.standard_normal(made.time.size)) * 1e-5
         found = estimate_lost_motion(EncoderRecording(made.time, made.motor, made.load + drift))
         accepted += found.ok
-        inside += found.interval_motor[0] <= 0.08 <= found.interval_motor[1]
+        low, high = found.interval_motor
+        inside += low <= 0.08 <= high
+        # Student's quantile of 97.5 % for the number of cycles.
+        assert not found.ok or 1.96 < 0.5 * (high - low) / found.std_motor < 4.4
     assert inside >= 11
     assert accepted >= 6
