@@ -26,6 +26,7 @@ CREATE TABLE IF NOT EXISTS acknowledged (
     boot TEXT NOT NULL, sequence INTEGER NOT NULL, at REAL NOT NULL, PRIMARY KEY (boot, sequence)) WITHOUT ROWID;
 """
 INSERT = "INSERT OR IGNORE INTO windows (boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?)"
+INSERT_AT = "INSERT OR IGNORE INTO windows (place, boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?, ?)"
 DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
 ACKNOWLEDGE = "INSERT OR REPLACE INTO acknowledged (boot, sequence, at) VALUES (?, ?, ?)"
 AGAIN = -1.0

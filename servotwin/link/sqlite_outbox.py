@@ -11,7 +11,7 @@ import sqlite3
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import RLock
@@ -20,7 +20,8 @@ from typing import Any
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import FULL, Dropped, Key, letter_digest
 from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows, Entry, excess, is_uninformative
-from servotwin.link.salvage import Salvage, Salvaged, salvage
+from servotwin.link.rebuild import Rebuild, adopt
+from servotwin.link.salvage import Row, Salvage, Salvaged
 from servotwin.link.sqlite_file import (
     ACKNOWLEDGE,
     AGAIN,
@@ -34,7 +35,6 @@ from servotwin.link.sqlite_file import (
     Statement,
     connect,
     is_broken,
-    put_aside,
     was_read_only,
 )
 from servotwin.link.transport import Parcel
@@ -97,6 +97,7 @@ class SqliteOutbox:
         self._notes: dict[str, bytes] = {}
         self._in_transaction = False
         self._unwritten: dict[tuple[Any, ...], Statement] = {}
+        self._rebuild: tuple[Rebuild, int] | None = None
         self.faults: Counter[str] = Counter()
         self.trouble = ""
         self.flush()
@@ -274,6 +275,7 @@ class SqliteOutbox:
 
     def _write(self) -> None:
         if self._connection is None:
+            adopt(self._path)  # of a process that was killed between two renames
             self._connection = connect(self._path)
             self._load(self._connection)
         if self._read_only:
@@ -333,38 +335,49 @@ class SqliteOutbox:
     def _begin_anew(self) -> None:
         """Put the corrupt file aside and begin another, with all that can be read of it; count the rest as lost."""
         self.close()
-        self.faults[BROKEN] += 1
-        found = salvage(self._path)
+        if self._rebuild is None:
+            self.faults[BROKEN] += 1
+            self._salvage()
+        assert self._rebuild is not None
+        rebuild, lost = self._rebuild
+        try:
+            aside = rebuild.rename()
+        except OSError as error:  # a read-only disk: the next try renames it only
+            self.trouble = str(error)
+            return
+        self._rebuild = None
+        self.salvages.append(Salvage(aside, len(rebuild.found.windows), lost))
+        self.flush()
+
+    def _salvage(self) -> None:
+        """Read the corrupt file, and take over its letters, counts and values; what is in memory is newer."""
         in_memory = {key for kind, key in self._unwritten if kind == "window"}
-        rescued = {(row[0], row[1]): row for row in found.windows if (row[0], row[1]) not in in_memory}
+        rebuild = Rebuild(self._path, in_memory, MOST_UNWRITTEN)
+        found, known = rebuild.found, rebuild.found.windows | rebuild.dropped | in_memory
         # Known by name: from memory where the file was open before, and from what is left of the file.
-        lost = (self._index.keys() | found.lost) - in_memory - rescued.keys()
+        lost = (self._index.keys() | found.lost) - known
         # The number of the last status is old by up to a second: it counts only where the names are not known.
         unnamed = not (self._index or found.lost_is_complete)
-        number = max(len(lost), self._waiting - len(rescued) if unnamed else 0)
-        self._restore(found, rescued, in_memory)
+        number = max(len(lost), self._waiting - len(known - in_memory) if unnamed else 0)
+        self._restore(found, rebuild.in_memory, in_memory)
         self._count(_DROPPED + BROKEN, number)
+        self._count(_DROPPED + UNWRITABLE, len(rebuild.dropped))
         self._count(BROKEN)
         self._unwritten |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
         self._unwritten |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
         self._waiting = 0
-        try:
-            aside = put_aside(self._path)
-        except OSError as error:
-            self.trouble = str(error)
-            return
-        self.salvages.append(Salvage(aside, len(rescued), number))
-        self.flush()
+        rebuild.complete(self._unwritten.values())
+        self._rebuild = rebuild, number
 
-    def _restore(self, found: Salvaged, rescued: Mapping[Key, tuple[Any, ...]], in_memory: set[Key]) -> None:
-        """Take over what was read of a corrupt file; what is in memory is newer."""
+    def _restore(self, found: Salvaged, rows: Sequence[Row], in_memory: set[Key]) -> None:
+        """Take over letters, counts and values of a corrupt file, and windows that are in no new one."""
         unwritten: dict[tuple[Any, ...], Statement] = {
-            ("window", key): Statement(INSERT, row) for key, row in rescued.items()
+            ("window", (row[1], row[2])): Statement(INSERT, row[1:]) for row in rows
         }
         letters = {digest: body for digest, body in found.letters if ("letter", digest) not in self._unwritten}
         unwritten |= {("letter", digest): Statement(POST, (digest, body)) for digest, body in letters.items()}
         self._index = {
-            **{key: Entry(len(row[4]), is_uninformative(row[2])) for key, row in rescued.items()},
+            **{(row[1], row[2]): Entry(len(row[5]), is_uninformative(row[3])) for row in rows},
             **{key: entry for key, entry in self._index.items() if key in in_memory},
         }
         known = {digest for digest in self._letters if ("letter", digest) in self._unwritten}
