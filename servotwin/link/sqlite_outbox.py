@@ -66,6 +66,8 @@ class SqliteOutbox:
     waiting : int
         Windows that waited when the last process ended, as far as is known: those of a corrupt file that cannot be
         found even by name are counted from it.
+    clock : callable
+        Monotonic, s.
 
     Attributes
     ----------
@@ -81,11 +83,12 @@ class SqliteOutbox:
         size: int = 256_000_000,
         kept: AcknowledgedLimits | None = None,
         waiting: int = 0,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if windows < 1 or size < 1:
             raise InvalidInput(f"outbox of {windows!r} windows and {size!r} bytes: must be at least 1 of each")
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
-        self._kept = AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0))
+        self._kept = AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0), clock)
         self._waiting = waiting
         self.salvages: list[Salvage] = []
         self._lock = RLock()
@@ -419,7 +422,7 @@ class SqliteOutbox:
             self._forget(key)
             return
         del self._index[key]
-        now = time.time()
+        now = self._kept.now()
         self._unwritten["acknowledged", key] = Statement(ACKNOWLEDGE, (*key, now))
         for old in self._kept.add(key, entry.size, now):
             self._unwritten["window", old] = Statement(DELETE, old)

@@ -14,7 +14,7 @@ from uuid import uuid4
 
 from servotwin import __version__
 from servotwin.messages import NAME_PATTERN
-from servotwin.store.clock_gaps import received_before
+from servotwin.store.clock_gaps import old_messages
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import Backlog, OutgoingMessage, PutResult
@@ -320,11 +320,10 @@ class TwinService:
                     log.info("old window bodies deleted", extra=done._asdict())
 
     def _delete_old(self, age: float, most: int) -> RetentionResult:
-        now = self.clocks.wall()
-        before = received_before(self.store, now, age)
-        if (left_out := now - age - before) > 0.0 and not math.isinf(left_out):
-            log.warning("retention leaves out a gap", extra={"days": round(left_out / _DAY, 3)})
-        return delete_old_bodies(self.store, before, most=most)
+        old = old_messages(self.store, self.clocks.wall(), age)
+        if old.left_out > 0.0:
+            log.warning("retention leaves out a gap", extra={"days": round(old.left_out / _DAY, 3)})
+        return delete_old_bodies(self.store, old.through, most=most)
 
     def _add_gauges(self) -> None:
         add = self.metrics.add_gauge

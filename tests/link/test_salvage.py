@@ -4,7 +4,9 @@ import errno
 import os
 import shutil
 import sqlite3
+import time
 import tracemalloc
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -303,12 +305,48 @@ def test_an_acknowledged_window_is_kept_and_sent_again_when_the_twin_asks(tmp_pa
     few.close()
 
 
-def test_the_time_of_acknowledged_windows_is_bounded(tmp_path: Path) -> None:
-    box = SqliteOutbox(tmp_path / "outbox.sqlite", "axis-1", kept=AcknowledgedLimits(10**6, 0.0))
-    for k in range(3):
+def test_acknowledged_windows_stay_for_a_running_time_whatever_the_clock_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two windows an hour, kept for ten; the clock is 75 days ahead at every second start, and then right again."""
+    path, running, acknowledged = tmp_path / "outbox.sqlite", 0.0, 0
+    for start in range(6):
+        monkeypatch.setattr(time, "time", lambda: 1.8e9 + running + 75.0 * 86400.0 * (start % 2))  # noqa: B023
+        begun, boot = running, 1000.0 * start  # a monotonic clock begins anywhere
+        box = SqliteOutbox(
+            path,
+            "axis-1",
+            kept=AcknowledgedLimits(10**7, 36_000.0),
+            clock=lambda: boot + running - begun,  # noqa: B023
+        )
+        for _ in range(12):
+            running += 1800.0
+            box.put(window(acknowledged))
+            box.remove(("b0", acknowledged))
+            acknowledged += 1
+            # A start loses the time since the acknowledgement before it: half an hour at most.
+            assert min(acknowledged, 21) <= len(box._kept.entries) <= 21 + min(start, 2)
+        box.close()
+
+
+def test_files_with_times_of_day_are_read(tmp_path: Path) -> None:
+    """Versions before noted the time of day of an acknowledgement."""
+    path, limits = tmp_path / "outbox.sqlite", AcknowledgedLimits(10**6, 3600.0)
+    box = SqliteOutbox(path, "axis-1", kept=limits)
+    for k in range(4):
         box.put(window(k))
-        box.remove(("b0", k))
-    assert box.resend(lambda *_: True) <= 1
+    box.remove(("b0", 0))
+    box.remove(("b0", 1))
+    box.close()
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("UPDATE acknowledged SET at = 1.8e9 + 3000.0 * sequence")
+    now = 5.0
+    box = SqliteOutbox(path, "axis-1", kept=limits, clock=lambda: now)
+    box.remove(("b0", 2))
+    assert set(box._kept.entries) == {("b0", 0), ("b0", 1), ("b0", 2)}
+    now += 700.0
+    box.remove(("b0", 3))
+    assert set(box._kept.entries) == {("b0", 1), ("b0", 2), ("b0", 3)}
     box.close()
 
 
