@@ -20,6 +20,21 @@ class AcknowledgedLimits(NamedTuple):
     seconds: float
 
 
+class LastStatus(NamedTuple):
+    """Numbers of an edge's last status, which may be up to a second older than its files.
+
+    Attributes
+    ----------
+    waiting : int
+        Windows that waited.
+    stored : int
+        Windows that the file had stored so far.
+    """
+
+    waiting: int = 0
+    stored: int = 0
+
+
 class _Kept(NamedTuple):
     """An acknowledged window: its size in bytes, and when it was acknowledged, s of running time."""
 

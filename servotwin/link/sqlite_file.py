@@ -36,6 +36,7 @@ POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
 TAKE = "DELETE FROM letters WHERE digest = ?"
 COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
 NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
+STORED = "SELECT seq FROM sqlite_sequence WHERE name = 'windows'"
 _BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 BESIDE = ("-wal", "-shm")
 

@@ -19,7 +19,14 @@ from typing import Any
 
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import FULL, Dropped, Key, letter_digest
-from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows, Entry, excess, is_uninformative
+from servotwin.link.outbox_index import (
+    AcknowledgedLimits,
+    AcknowledgedWindows,
+    Entry,
+    LastStatus,
+    excess,
+    is_uninformative,
+)
 from servotwin.link.rebuild import Rebuild, adopt
 from servotwin.link.salvage import Row, Salvage, Salvaged
 from servotwin.link.sqlite_file import (
@@ -31,6 +38,7 @@ from servotwin.link.sqlite_file import (
     INSERT,
     NOTE,
     POST,
+    STORED,
     TAKE,
     Statement,
     connect,
@@ -41,7 +49,8 @@ from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, decode, encode
 from servotwin.messages.codec import DEFLATE, deflated
 
-BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters full"
+BROKEN, INCOMPLETE = "outbox broken", "outbox incomplete"
+UNWRITABLE, LETTERS = "disk not writable", "letters full"
 MOST_UNWRITTEN = 16_000_000
 """Bytes of windows held in memory while the disk cannot be written."""
 _MOST_LETTERS = 10_000
@@ -63,9 +72,9 @@ class SqliteOutbox:
     kept : AcknowledgedLimits, optional
         Limits of the windows that stay after their acknowledgement, for a twin that asks for them again; none by
         default.
-    waiting : int
-        Windows that waited when the last process ended, as far as is known: those of a corrupt file that cannot be
-        found even by name are counted from it.
+    last : LastStatus, optional
+        When the last process ended, as far as is known: windows of a corrupt file that cannot be found even by name are
+        counted from it, and those that a file lacks which is older than that.
     clock : callable
         Monotonic, s.
 
@@ -73,6 +82,8 @@ class SqliteOutbox:
     ----------
     salvages : list of Salvage
         Corrupt files of this process.
+    missing : int
+        Windows that waited at the last status, and are not in the file: it is an older one, or without its log.
     """
 
     def __init__(
@@ -82,14 +93,15 @@ class SqliteOutbox:
         windows: int = 5000,
         size: int = 256_000_000,
         kept: AcknowledgedLimits | None = None,
-        waiting: int = 0,
+        last: LastStatus | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if windows < 1 or size < 1:
             raise InvalidInput(f"outbox of {windows!r} windows and {size!r} bytes: must be at least 1 of each")
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
         self._kept = AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0), clock)
-        self._waiting = waiting
+        self._last: LastStatus | None = last
+        self._stored = self.missing = 0
         self.salvages: list[Salvage] = []
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
@@ -110,6 +122,13 @@ class SqliteOutbox:
         """Number of windows dropped since the file was made, by reason."""
         counts = dict(self._counts).items()
         return {name.removeprefix(_DROPPED): number for name, number in counts if name.startswith(_DROPPED)}
+
+    @property
+    def stored(self) -> int:
+        """Number of windows that the file has stored so far."""
+        with self._lock:
+            self._stored = max([self._stored, *(number for (number,) in self._read(STORED, ()))])
+            return self._stored
 
     @property
     def flushed(self) -> bool:
@@ -311,6 +330,11 @@ class SqliteOutbox:
         self._letters = {**{each: None for each in letters if ("letter", each) not in self._unwritten}, **self._letters}
         self._counts = Counter(counts) | self._counts
         self._notes = dict(connection.execute("SELECT name, value FROM notes").fetchall()) | self._notes
+        if self._last is not None:
+            lacks = self._last.stored - sum(number for (number,) in connection.execute(STORED))
+            self.missing = max(0, min(lacks, self._last.waiting))
+            self._count(_DROPPED + INCOMPLETE, self.missing)
+            self._last = None
 
     def _failed(self, error: Exception) -> None:
         """Go on without the disk, or with a new file."""
@@ -361,14 +385,15 @@ class SqliteOutbox:
         lost = (self._index.keys() | found.lost) - known
         # The number of the last status is old by up to a second: it counts only where the names are not known.
         unnamed = not (self._index or found.lost_is_complete)
-        number = max(len(lost), self._waiting - len(known - in_memory) if unnamed else 0)
+        waiting = 0 if self._last is None else self._last.waiting
+        number = max(len(lost), waiting - len(known - in_memory) if unnamed else 0)
         self._restore(found, rebuild.in_memory, in_memory)
         self._count(_DROPPED + BROKEN, number)
         self._count(_DROPPED + UNWRITABLE, len(rebuild.dropped))
         self._count(BROKEN)
         self._unwritten |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
         self._unwritten |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
-        self._waiting = 0
+        self._last = None
         rebuild.complete(self._unwritten.values())
         self._rebuild = rebuild, number
 

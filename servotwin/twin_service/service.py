@@ -237,7 +237,9 @@ class TwinService:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
         store, workers, dispatching = self._store_healthy(), self.pool.alive, self.dispatching
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
-        return {"ok": store and workers > 0 and dispatching, "degraded": self._lagging(backlog), **parts}
+        fault = "" if self.tokens is None else self.tokens.fault
+        degraded = [*self._lagging(backlog), *([f"the former tokens stay in force: {fault}"] if fault else [])]
+        return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property
     def dispatching(self) -> bool:

@@ -170,7 +170,7 @@ def test_every_line_of_an_edge_s_log_is_explained() -> None:
 
 def test_every_reason_for_which_a_window_is_dropped_is_explained() -> None:
     reasons = (outlet.FILTERED, outlet.NOT_FINITE, outbox.FULL, sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE,
-               sqlite_outbox.LETTERS, pipe_outlet.BEHIND)  # fmt: skip
+               sqlite_outbox.INCOMPLETE, sqlite_outbox.LETTERS, pipe_outlet.BEHIND)  # fmt: skip
     assert sorted(named("Windows that are dropped")) == sorted(reasons)
 
 

@@ -14,7 +14,7 @@ import pytest
 from outbox_cases import filled, window
 
 from servotwin.link import rebuild, sqlite_outbox
-from servotwin.link.outbox_index import AcknowledgedLimits
+from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.salvage import salvage
 from servotwin.link.sqlite_outbox import BROKEN, UNWRITABLE, SqliteOutbox
 from servotwin.messages import encode
@@ -37,7 +37,7 @@ def leaves(path: Path) -> list[int]:
 
 
 def reopened(path: Path, waiting: int = 0) -> SqliteOutbox:
-    box = SqliteOutbox(path, "axis-1", waiting=waiting)
+    box = SqliteOutbox(path, "axis-1", last=LastStatus(waiting))
     assert box.flushed
     return box
 
