@@ -47,7 +47,7 @@ from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.strangers import StrangerLimit
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.what_if_process import WhatIfProcess
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool, pool_of
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class TwinService:
         self.metrics, self.executor = Metrics(), StoreExecutor()
         # What people read may take long: edges and acknowledgements do not wait behind it.
         self._readers = StoreExecutor(_READERS, "readers")
-        self.pool = pool or WorkerPool(config.workers, twin.start, config.job_timeout_s)
+        self.pool = pool or pool_of(twin)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
         self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)

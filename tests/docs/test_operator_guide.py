@@ -32,7 +32,7 @@ from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import ALARMS
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 ROOT = Path(__file__).parents[2]
 OPERATOR = ROOT / "docs/operator"

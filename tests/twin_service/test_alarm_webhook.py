@@ -30,7 +30,7 @@ from servotwin.twin_service.webhook import (
     alarm_post,
     send_post,
 )
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
 POST = alarm_post("ax-1", "alarm", "the gap grows faster than is assumed", 0.0)

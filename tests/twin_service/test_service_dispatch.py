@@ -17,7 +17,7 @@ from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import VerificationQuota
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
 PATIENCE = 60.0
