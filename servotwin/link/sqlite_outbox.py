@@ -209,6 +209,11 @@ class SqliteOutbox:
         with self._lock:
             return sorted(self._index, key=lambda key: self._index[key].again)
 
+    def newest(self) -> Key | None:
+        """Key of the newest window that the twin has never acknowledged; None: there is none."""
+        with self._lock:
+            return next((key for key, entry in reversed(self._index.items()) if not entry.again), None)
+
     def put_letter(self, body: bytes) -> None:
         """Store a letter (an encoded message); equal letters are stored once."""
         digest = letter_digest(body)
