@@ -22,6 +22,9 @@ _LONGEST_GAP = 0.1
 _RESOLUTION = 0.25
 """Share of the longest gap up to which the time between two messages that were read is taken as even."""
 
+_JITTER_S = 60.0
+"""s by which messages may be committed in another order than they were received, by several processes at once."""
+
 
 class OldMessages(NamedTuple):
     """Messages that are older than an age.
@@ -95,7 +98,8 @@ def _backwards(
 
 def _even(left: _Receipt, middle: _Receipt, right: _Receipt, step: float) -> bool:
     """True where three times rise, and no further than `step`: between them the clock is taken as right."""
-    return left.received <= middle.received <= right.received <= left.received + step
+    times = left.received, middle.received, right.received
+    return min(times[1] - times[0], times[2] - times[1]) >= -_JITTER_S and times[2] - times[0] <= step
 
 
 def _middle(left: _Receipt, right: _Receipt, up_to: Callable[[int], _Receipt | None]) -> _Receipt | None:

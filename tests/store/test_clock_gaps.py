@@ -1,6 +1,7 @@
 """Age of windows on a clock that may be wrong, and retention that goes by it."""
 
 from collections.abc import Callable, Sequence
+from random import Random
 
 import pytest
 import sqlalchemy as sa
@@ -114,6 +115,19 @@ def test_few_messages_are_read(store: Store, monkeypatch: pytest.MonkeyPatch) ->
     assert found.through == 0
     assert found.left_out == pytest.approx((70.0 - 1.999 - 3.0) * DAY)
     assert len(reads) < 60
+
+
+def test_messages_that_came_at_once_in_any_order_are_not_read_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    from servotwin.store import clock_gaps
+
+    store, random = open_store("sqlite://"), Random(1)
+    filled(store, [40.0 + random.uniform(0.0, 20.0) / DAY for _ in range(1000)])
+    reads: list[object] = []
+    receipt: Callable[..., object] = clock_gaps._receipt
+    monkeypatch.setattr(clock_gaps, "_receipt", lambda *query: reads.append(query) or receipt(*query))
+    assert old(store, 50.0) == 0
+    assert len(reads) < 20
+    store.close()
 
 
 def test_one_pass_deletes_only_so_many(store: Store) -> None:
