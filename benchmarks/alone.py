@@ -80,11 +80,12 @@ def run_alone(
     full: bool = False,
     seed: int | None = None,
     minutes: float | None = None,
+    servos: int | None = None,
 ) -> bool:
     """Run the named benchmark if it is one of quality; `others`: options that only speed benchmarks take were given.
 
     `full` applies to those of `FULL`: the full length of the documented figures. `seed` applies to those of `SEEDED`,
-    `minutes` to the endurance.
+    `minutes` and `servos` to the endurance.
 
     Raises
     ------
@@ -98,6 +99,8 @@ def run_alone(
         raise InvalidInput(f"--seed: only bench {', '.join(SEEDED[:-1])} or {SEEDED[-1]} takes it")
     if minutes is not None and list(names) != [endurance.NAME]:
         raise InvalidInput(f"--minutes: only bench {endurance.NAME} takes it")
+    if servos is not None and list(names) != [endurance.NAME]:
+        raise InvalidInput(f"--servos: only bench {endurance.NAME} takes it")
     if name is None:
         return False
     if len(names) > 1 or others:
@@ -105,8 +108,6 @@ def run_alone(
     chosen = ALONE[name]
     scale = FULL[name] if full else chosen.quick if quick else chosen.whole
     scale = scale if minutes is None else minutes
-    if seed is None:
-        chosen.run(date, output, scale)
-    else:
-        chosen.run(date, output, scale, seed=seed)
+    chosen_by_user = {"seed": seed, "servos": servos}
+    chosen.run(date, output, scale, **{name: value for name, value in chosen_by_user.items() if value is not None})
     return True

@@ -31,6 +31,9 @@ def bench(
         typer.Option(min=0, help="Seed of the machines (windows, loops, certificates) or faults (endurance)."),
     ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.1, help="endurance: length; 10 by default.")] = None,
+    servos: Annotated[
+        int | None, typer.Option(min=4, help="endurance: servos; 4 by default, which have edges, the others none.")
+    ] = None,
     slow: Annotated[bool, typer.Option("--slow", help="Add jobs of many seconds: scipy, compilation.")] = False,
     reference: Annotated[Path | None, typer.Option(help="An .npz with W1's true q3, to compare with.")] = None,
 ) -> None:
@@ -41,7 +44,7 @@ def bench(
 
     date = datetime.now(UTC).isoformat(timespec="seconds")
     others = slow or runs is not None or reference is not None
-    if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed, minutes):
+    if run_alone(tuple(workloads or ()), date, json, quick, others, full, seed, minutes, servos):
         return
     from benchmarks.catalogue import Options
     from benchmarks.command import bench as run

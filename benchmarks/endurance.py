@@ -1,7 +1,8 @@
 """`servotwin bench endurance`: twin, machines and edges as processes under random faults; nothing may get lost.
 
 Faults: kills of the twin, of its worker, of an edge and of its link process; a disk that is full for some seconds, for
-the twin or for an edge; a damaged page in an edge's outbox; a twin or an edge that starts on a clock 90 days off.
+the twin or for an edge; a damaged page in an edge's outbox; a twin or an edge that starts on a clock 90 days off. Of
+many servos four have an edge; the others are simulated in one process (`endurance_crowd`), which is killed too.
 """
 
 from __future__ import annotations
@@ -44,6 +45,7 @@ class EnduranceOutcome(NamedTuple):
 
     Attributes
     ----------
+    servos : int
     seconds : float
     faults : dict of str to int
     starts, ended_alone, twin_ended : int
@@ -56,12 +58,17 @@ class EnduranceOutcome(NamedTuple):
         that the edges themselves count as dropped; windows left in the outboxes.
     applied : int
         Updates that edges applied.
+    refused : dict of str to int
+        Messages of the crowd that the twin refused for good since its last start, by status.
+    kept_bytes : dict of str to int
+        Size of the twin's files at the end.
     bytes_per_window, outbox_bytes : float
         The store's size per window; of the largest outbox.
     memory : dict of str to (int, int)
         Largest resident bytes of each kind of process in the first and in the last third of the time.
     """
 
+    servos: int
     seconds: float
     faults: dict[str, int]
     starts: int
@@ -75,6 +82,8 @@ class EnduranceOutcome(NamedTuple):
     counted: int
     waiting: int
     applied: int
+    refused: dict[str, int]
+    kept_bytes: dict[str, int]
     bytes_per_window: float
     outbox_bytes: int
     memory: dict[str, tuple[int, int]]
@@ -98,6 +107,8 @@ class Faults:
                 ("edge's disk full", self._fill_edge), ("page of an outbox damaged", self._damage),
                 ("twin's clock", self._step_twin), ("edge's clock", self._step_edge),
             ]  # fmt: skip
+            if self._site.crowd:
+                self._deck.append(("crowd killed", self._kill_crowd))
             self._random.shuffle(self._deck)
         name, act = self._deck.pop()
         act()
@@ -127,6 +138,10 @@ class Faults:
     def _kill_link(self) -> None:
         for pid in children(self._edge()[1].pid)[:1]:
             os.kill(pid, signal.SIGKILL)
+
+    def _kill_crowd(self) -> None:
+        assert self._site.crowd is not None
+        self._again(self._site.crowd)
 
     def _fill_twin(self) -> None:
         _full_disk([self._site.twin.pid])
@@ -166,9 +181,14 @@ def _full_disk(pids: list[int]) -> None:
 
 
 def endure(
-    date: str = "", output: Path | None = None, minutes: float = MINUTES, seed: int = 1, console: Console | None = None
+    date: str = "",
+    output: Path | None = None,
+    minutes: float = MINUTES,
+    seed: int = 1,
+    console: Console | None = None,
+    servos: int = SERVOS,
 ) -> EnduranceOutcome:
-    """Run a site under faults, print the table, and write JSON on request.
+    """Run a site under faults, print the table, and write JSON on request; `servos`: with and without edges.
 
     Raises
     ------
@@ -181,7 +201,7 @@ def endure(
     folder = Path(mkdtemp(prefix="endure-"))
     try:
         with console.status(f"{minutes:g} minutes of faults"):
-            outcome = _outcome(Site(folder, _free_port(), minutes), minutes, seed)
+            outcome = _outcome(Site(folder, _free_port(), minutes, servos - SERVOS), minutes, seed)
     except KeyboardInterrupt:
         shutil.rmtree(folder)
         raise
@@ -212,6 +232,7 @@ def _outcome(site: Site, minutes: float, seed: int) -> EnduranceOutcome:
             faults.strike()
         for machine in site.machines.values():
             machine.kill()
+        site.stop_crowd()
         _until(site.settled, _END_S)
         witness.look()
         for member in (*site.edges.values(), site.twin):
@@ -231,8 +252,10 @@ def _figures(
     counts = "SELECT number FROM counts WHERE what LIKE 'dropped: %'"
     unseen = {each: cut - len(boots.get(each, ())) - waiting.get(each, 0) for each, cut in witness.cut.items()}
     applied = "SELECT count(*) FROM evidence WHERE kind = 'receipt' AND status = 'applied'"
-    seconds = samples[-1][0]
+    seconds, crowd = samples[-1][0], site.crowd_status()
+    acknowledged = witness.acknowledged | site.acknowledged_by_crowd()
     return EnduranceOutcome(
+        servos=len(site.edges) + site.crowd_size,
         seconds=seconds,
         faults=dict(faults),
         starts=sum(edge.starts for edge in site.edges.values()),
@@ -240,11 +263,13 @@ def _figures(
         twin_ended=site.twin.ended_alone,
         boots=len(boots),
         stored=len(stored),
-        lost_acknowledged=len(witness.acknowledged - stored),
+        lost_acknowledged=len(acknowledged - stored),
         holes=sum(max(numbers) + 1 - len(numbers) for numbers in boots.values()),
         unseen=sum(max(0, number) for number in unseen.values()),
         counted=sum(number for servo in site.edges for (number,) in ask(site.outbox(servo), counts)),
-        waiting=sum(waiting.values()),
+        waiting=sum(waiting.values()) + crowd.waiting,
+        refused=crowd.refused,
+        kept_bytes={file.name: file.stat().st_size for file in sorted(site.folder.glob("twin.db*"))},
         applied=ask(site.folder / "twin.db", applied)[0][0],
         bytes_per_window=(site.folder / "twin.db").stat().st_size / max(1, len(stored)),
         outbox_bytes=max(site.outbox(servo).stat().st_size for servo in site.edges),
@@ -289,8 +314,10 @@ def shown(outcome: EnduranceOutcome) -> Table:
     result.add_column("figure")
     result.add_column("value", justify="right")
     year = outcome.bytes_per_window * _YEAR_WINDOWS
+    refused = ", ".join(f"{number} with {status}" for status, number in sorted(outcome.refused.items())) or "0"
     rows = {
         "time, s; edges": f"{outcome.seconds:.0f}; {SERVOS}",
+        "servos in all": str(outcome.servos),
         "starts of edges; ended without a fault": f"{outcome.starts}; {outcome.ended_alone}",
         "ends of the twin without a fault": str(outcome.twin_ended),
         "boots with stored windows": str(outcome.boots),
@@ -301,14 +328,33 @@ def shown(outcome: EnduranceOutcome) -> Table:
         "cut up to 1 s before a fault, and neither stored nor waiting": str(outcome.unseen),
         "dropped, counted by edges": str(outcome.counted),
         "left waiting": str(outcome.waiting),
+        "refused for good, of the crowd": refused,
         "updates applied": str(outcome.applied),
         "store, kB per window; GB in a year of a servo": f"{outcome.bytes_per_window / 1e3:.1f}; {year / 1e9:.1f}",
+        f"store of {outcome.servos} servos in a year, TB, without retention": f"{year * outcome.servos / 1e12:.1f}",
         "largest outbox, MB": f"{outcome.outbox_bytes / 1e6:.1f}",
         **{
             f"memory of a {kind}, MB: first, last third": f"{first / 1e6:.0f}, {last / 1e6:.0f}"
             for kind, (first, last) in outcome.memory.items()
         },
+        **{
+            f"growth of a {kind}, bytes per window; MB in a year": _growth(outcome, last - first)
+            for kind, (first, last) in outcome.memory.items()
+            if kind in ("twin", "worker")
+        },
     }
     for name, value in rows.items():
         result.add_row(name, value)
     return result
+
+
+def _growth(outcome: EnduranceOutcome, grown: int) -> str:
+    """Growth of a process between the middles of two thirds of the time, by the windows that were stored then.
+
+    In a year it would have grown by that much, if it did not stop growing.
+    """
+    if grown <= 0:
+        return "none"
+    windows = 2.0 / 3.0 * max(1, outcome.stored)
+    year = outcome.servos * _YEAR_WINDOWS
+    return f"{grown / windows:.1f}; {grown / windows * year / 1e6:.0f}"

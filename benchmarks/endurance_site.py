@@ -1,8 +1,9 @@
-"""Twin, machines and edges of `servotwin bench endurance` as processes in a folder, and what they leave there."""
+"""Twin, machines, edges and a crowd of `servotwin bench endurance` as processes, and what they leave in a folder."""
 
 from __future__ import annotations
 
 import os
+import secrets
 import signal
 import sqlite3
 import subprocess
@@ -14,14 +15,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+from benchmarks.endurance_crowd import ACKNOWLEDGED, STATUS, STOP, CrowdPlan, CrowdStatus
+from benchmarks.overload import without_voltage
+from servotwin.cosim import cosimulate
+from servotwin.cosim.scenario import Scenario
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.edge_process.monitoring import read_status
+from servotwin.link.seal import verifier_of
+from servotwin.messages import WindowMessage, encode
 from servotwin.runtime.retry import Retry
+from servotwin.twin_service.auth import read_tokens, write_tokens
 from servotwin.up.enrolment import Enrolment, enroll
 
 SERVOS = 4
 _RATE, _WINDOW_S, _PERIOD_S = 500.0, 0.8, 1.64
 _END_S, _PATIENCE_S = 120.0, 60.0
+_CROWD_PERIOD_S, _CROWD_CONNECTIONS = 20.0, 32
 TWIN_TOML = """
 [service]
 port = {port}
@@ -148,10 +159,20 @@ class Member:
 
 
 class Site:
-    """A twin, machines and their edges in a folder."""
+    """A twin, machines and their edges in a folder, and a crowd of simulated servos beside them.
 
-    def __init__(self, folder: Path, port: int, minutes: float) -> None:
-        self.folder = folder
+    Parameters
+    ----------
+    folder : Path
+    port : int
+        Of the twin.
+    minutes : float
+    crowd : int
+        Simulated servos.
+    """
+
+    def __init__(self, folder: Path, port: int, minutes: float, crowd: int = 0) -> None:
+        self.folder, self.crowd_size = folder, crowd
         (folder / "sitecustomize.py").write_text(_CLOCK, encoding="utf-8")
         twin = TWIN_TOML.format(port=port, service='log_level = "warning"', rate=_RATE, validity=100.0)
         (folder / "twin.toml").write_text(twin, encoding="utf-8")
@@ -160,6 +181,27 @@ class Site:
         self.machines: dict[str, Member] = {}
         for number in range(SERVOS):
             self._add(f"ax-{number}", number, 60.0 * minutes + 600.0)
+        self.crowd = self._crowd(port) if crowd else None
+
+    def _crowd(self, port: int) -> Member:
+        """Give each servo of the crowd a token, and prepare its process."""
+        tokens = {f"ax-c{number:05d}": secrets.token_hex(16) for number in range(self.crowd_size)}
+        file = self.folder / "tokens.toml"
+        known = read_tokens(file)
+        made = {name: verifier_of(token) for name, token in tokens.items()}
+        write_tokens(file, replace(known, servos={**known.servos, **made}))
+        plan = CrowdPlan(port, tokens, _CROWD_PERIOD_S, _CROWD_CONNECTIONS, tuple(map(encode, self._templates())))
+        (self.folder / "crowd.plan").write_bytes(msgspec.msgpack.encode(plan))
+        command = ("-m", "benchmarks.endurance_crowd", str(self.folder / "crowd.plan"))
+        return Member(Path(__file__).parents[1], self.folder / "crowd.log", *command)
+
+    def _templates(self) -> list[WindowMessage]:
+        """Windows of a machine as the real ones are, in a loop on its own."""
+        known = {"servo": "ax-c", "seed": 0, "rate": _RATE, "window": _WINDOW_S, "period": _PERIOD_S}
+        text = MACHINE_TOML.format(role="supervise", listen="", speed=1.0, duration=60.0, **known)
+        file = self.folder / "crowd.toml"
+        file.write_text(text.partition("[scenario]")[2].replace("[scenario.", "["), encoding="utf-8")
+        return [without_voltage(window) for window in cosimulate(Scenario.load(file)).windows[4:]]
 
     def _add(self, servo: str, seed: int, duration: float) -> None:
         folder = self.folder / servo
@@ -181,7 +223,7 @@ class Site:
     @contextmanager
     def running(self) -> Iterator[None]:
         """Start all; kill what is left in the end."""
-        members = [*self.machines.values(), self.twin, *self.edges.values()]
+        members = [*self.machines.values(), self.twin, *self.edges.values(), *([self.crowd] if self.crowd else [])]
         try:
             for each in members:
                 each.start()
@@ -191,14 +233,34 @@ class Site:
                 each.kill()
 
     def revive(self) -> None:
-        """Start the twin and the edges again that have ended without a fault."""
-        for each in (self.twin, *self.edges.values()):
+        """Start what has ended without a fault again, but for machines."""
+        stopped = (self.folder / STOP).exists()
+        for each in (self.twin, *self.edges.values(), *([self.crowd] if self.crowd and not stopped else [])):
             each.revive()
+
+    def stop_crowd(self) -> None:
+        """Have the crowd send what it has cut, and end."""
+        (self.folder / STOP).touch()
+
+    def crowd_status(self) -> CrowdStatus:
+        """Last status of the crowd."""
+        try:
+            return msgspec.json.decode((self.folder / STATUS).read_bytes(), type=CrowdStatus)
+        except OSError:
+            return CrowdStatus(0, 0, {})
+
+    def acknowledged_by_crowd(self) -> set[Window]:
+        """Windows of which the crowd has an acknowledgement."""
+        file = self.folder / ACKNOWLEDGED
+        lines = file.read_text(encoding="ascii").splitlines() if file.exists() else []
+        fields = [line.split() for line in lines]
+        # A kill may have cut the last line of a process; the next one begins behind it.
+        return {(one[0], one[1], int(one[2])) for one in fields if len(one) == 3 and one[2].isdigit()}
 
     def settled(self) -> bool:
         """True where no window waits; what has ended without a fault is started again."""
         self.revive()
-        return not self.waiting()
+        return not (self.crowd and self.crowd.pid) and not self.waiting()
 
     def outbox(self, servo: str) -> Path:
         """File of an edge's outbox."""
@@ -224,7 +286,7 @@ class Site:
                 [(servos,)] = database.execute("SELECT count(DISTINCT servo) FROM messages WHERE kind = 'window'")
         except sqlite3.Error:
             return False
-        return bool(servos == len(self.edges))
+        return bool(servos == len(self.edges) + self.crowd_size)
 
 
 class Witness:

@@ -270,10 +270,11 @@ def recorded(count: int) -> list[WindowMessage]:
     Each shows the gap; with the voltage the twin would see that the loop did not run on the edge's setting.
     """
     scenario = Scenario.preset("fig15-sampled").replace(gap=_GAP, duration=_STEP_S * (count + 1.5), name="axis")
-    return [_without_voltage(window) for window in cosimulate(scenario).windows[1 : count + 1]]
+    return [without_voltage(window) for window in cosimulate(scenario).windows[1 : count + 1]]
 
 
-def _without_voltage(window: WindowMessage) -> WindowMessage:
+def without_voltage(window: WindowMessage) -> WindowMessage:
+    """Copy a window without its voltage, which would show a loop that ran on another setting."""
     channels = tuple(channel for channel in window.channels if channel.name != "voltage")
     return msgspec.structs.replace(window, channels=channels, crc=checksum(channels))
 

@@ -22,6 +22,8 @@ from servotwin.link.seal import Sealed
 from servotwin.messages import Reason, Receipt, Update, WindowMessage, decode, encode
 
 TAKEN, LATER = (200, 201, 202), (429, 503)
+FRESH_S = 10.0
+"""s after the end of an outage after which the newest windows go first, as `servotwin.link.session` has it."""
 PAUSE = 0.2
 """s after which a request that was put off is made again."""
 PATIENCE, ANSWER_S = 600.0, 120.0
@@ -85,7 +87,7 @@ class EdgeLoad:
         plan, count = load.plan, len(self.places)
         self.edges = [LoadEdge(f"ax-{n:05d}", n % count, plan.version, plan.sequence) for n in range(plan.servos)]
         self.counts = LoadCounts()
-        self._issued = 0
+        self._issued, self._refreshed = 0, False
         self._pending: deque[tuple[LoadEdge, float]] = deque()
 
     @property
@@ -108,6 +110,8 @@ class EdgeLoad:
         plan, since = self.plan, now - self.begin
         if self.cut(now):
             return None
+        if not self._refreshed and 0.0 < plan.outage[1] <= since - FRESH_S:
+            self._refresh()
         if self._pending:
             return self._pending.popleft()
         if plan.rate == 0.0:
@@ -120,6 +124,12 @@ class EdgeLoad:
     def cut(self, now: float) -> bool:
         """Test for an outage that has cut every connection."""
         return self.plan.outage[0] <= now - self.begin < self.plan.outage[1]
+
+    def _refresh(self) -> None:
+        """Put the newest window of each servo first, as an edge does whose backlog has taken long."""
+        newest: dict[str, tuple[LoadEdge, float]] = {edge.name: (edge, due) for edge, due in self._pending}
+        rest = [(edge, due) for edge, due in self._pending if newest[edge.name][1] != due]
+        self._pending, self._refreshed = deque([*newest.values(), *rest]), True
 
     def requeue(self, edge: LoadEdge, due: float) -> None:
         """Put a postponed window back."""

@@ -56,6 +56,16 @@ def done(connection: sqlite3.Connection, since: float, until: float) -> Processe
     return ProcessedWork(len(rows), len(rows) - len(ages), shares(ages))
 
 
+def fresh(connection: sqlite3.Connection, start: float, returned: float) -> tuple[int, float]:
+    """Servos of which a window has an outcome that starts at `start` (s of sample time) or later; s until the last one.
+
+    Counted from the return of the link, at `returned` (s since the epoch).
+    """
+    query = "SELECT min(done) FROM messages WHERE kind = 'window' AND start >= ? AND done IS NOT NULL GROUP BY servo"
+    first = [float(at) for (at,) in connection.execute(query, (start,))]
+    return len(first), max(first, default=returned) - returned
+
+
 def made(connection: sqlite3.Connection, since: float) -> dict[str, int]:
     """Number of records of each kind of evidence since a time (s since the epoch)."""
     query = "SELECT kind, count(*) FROM evidence WHERE created >= ? GROUP BY kind"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import subprocess
 import sys
@@ -44,6 +45,9 @@ class FleetRun(NamedTuple):
         Windows that waited when the link came back, at the edges and at the twin.
     drained : float
         s from then until no more than a second's windows waited; NaN: never.
+    fresh : (int, float)
+        Servos of which a window was processed that was cut in the last period before the link came back or later, and s
+        from then until the first such window of the last of them.
     """
 
     report: LoadReport
@@ -52,6 +56,7 @@ class FleetRun(NamedTuple):
     made: dict[str, int]
     behind: float
     drained: float
+    fresh: tuple[int, float] = (0, math.nan)
 
 
 def ingest(
@@ -103,7 +108,11 @@ def _run(
         broken = findings.failures(store)
         if broken or twin.process.poll() is not None:
             raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
-        return FleetRun(report, watch, work, findings.made(store, since), *behind)
+        fresh = (0, math.nan)
+        if plan.outage[1] > 0.0:
+            cut = plan.start + plan.outage[1] - plan.servos / plan.rate
+            fresh = findings.fresh(store, cut, since + plan.outage[1])
+        return FleetRun(report, watch, work, findings.made(store, since), *behind, fresh)
 
 
 def _watched(

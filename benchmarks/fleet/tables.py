@@ -75,6 +75,12 @@ def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
 
 def _of_outage(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
     yield ReportLine(f"after {scale.outage:g} s without a link, windows behind", "", f"{whole.behind:.0f}")
+    servos, seconds = whole.fresh
+    yield ReportLine(
+        "... newest window of each servo processed: servos, within",
+        f"{scale.servos}, 30 s",
+        f"{servos}, {seconds:.0f} s",
+    )
     if math.isnan(whole.drained):
         yield ReportLine("... worked off within", "drains", "not: more comes than can be worked on")
         return

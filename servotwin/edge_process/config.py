@@ -104,7 +104,11 @@ class StoredFiles:
     ] = 128 * MB
     acknowledged_s: Annotated[
         float,
-        key(minimum=0.0, help="Time for which they stay; it should reach back to the twin's last backup.", later=True),
+        key(
+            minimum=0.0,
+            help="Time of running for which they stay; it should reach back to the twin's last backup.",
+            later=True,
+        ),
     ] = 172_800.0
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ from servotwin.edge_process.metrics import write_metrics
 from servotwin.edge_process.monitoring import TroubleLog, log, overwrite_status, read_status, summarise, write_status
 from servotwin.edge_process.transports import exclusive_transport, link_token
 from servotwin.errors import InvalidInput
-from servotwin.link.outbox_index import AcknowledgedLimits
+from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Acknowledge, InvalidMessage, Resend, decode, encode
@@ -77,8 +77,9 @@ class LinkProcess:
         self._control: frames.StatusFrame | None = None
         self._pending = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
+        new_losses = self.outbox.salvages or self.outbox.missing
         # Counts of earlier processes are in their logs; what a corrupt file has just cost is in none.
-        self._troubles, self._dropped = TroubleLog(), {} if self.outbox.salvages else self._dropped_unintended()
+        self._troubles, self._dropped = TroubleLog(), {} if new_losses else self._dropped_unintended()
         self._conflict, self._status_trouble = False, ""
 
     def run(self) -> None:
@@ -178,6 +179,9 @@ class LinkProcess:
         if self._stopping.is_set():
             return
         self._troubles.update("disk", self._disk_trouble)
+        if self.outbox.missing:
+            log("outbox incomplete", lost=self.outbox.missing)
+            self.outbox.missing = 0
         while self.outbox.salvages:
             found = self.outbox.salvages.pop(0)
             log("outbox broken", file=found.file.name, rescued=found.rescued, lost=found.lost)
@@ -294,6 +298,7 @@ class LinkProcess:
             status["tick"] = summarise(control.ticks, longest)
         status["windows"] = {
             "waiting": len(box.pending()),
+            "stored": box.stored,
             "letters_waiting": len(box.letters()),
             "dropped": {**(control.dropped if control is not None else {}), **box.dropped},
         }
@@ -311,13 +316,15 @@ class LinkProcess:
 
 
 def _outbox(config: EdgeConfig) -> SqliteOutbox:
-    """Open the outbox; the last status tells how many windows waited in it."""
+    """Open the outbox; the last status tells how many windows waited in it, and how many it had had."""
     files = config.files
-    last = read_status(config.path(files.status)) or {}
-    waiting = last.get("windows", {}).get("waiting", 0) if isinstance(last.get("windows"), dict) else 0
+    windows = (read_status(config.path(files.status)) or {}).get("windows")
+    known = windows if isinstance(windows, dict) else {}
+    numbers = (known.get(name) for name in LastStatus._fields)
+    last = LastStatus(*(number if isinstance(number, int) else 0 for number in numbers))
     kept = AcknowledgedLimits(files.acknowledged_bytes, files.acknowledged_s)
     path = config.path(files.outbox)
-    return SqliteOutbox(path, config.agent.servo, files.windows, files.bytes, kept, int(waiting))
+    return SqliteOutbox(path, config.agent.servo, files.windows, files.bytes, kept, last)
 
 
 def run_alone(config: EdgeConfig, end: socket.socket, run: str) -> None:

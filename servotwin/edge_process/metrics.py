@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from servotwin.edge.outlet import FILTERED, NOT_FINITE
 from servotwin.edge_process.outlet import BEHIND
 from servotwin.link.outbox import FULL
-from servotwin.link.sqlite_outbox import BROKEN, LETTERS, UNWRITABLE
+from servotwin.link.sqlite_outbox import BROKEN, INCOMPLETE, LETTERS, UNWRITABLE
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.prometheus import Sample, metric_lines
 
@@ -46,7 +46,7 @@ _METRICS = (
         "Windows that were never sent, by reason.",
         ("windows", "dropped"),
         "reason",
-        (BEHIND, BROKEN, FILTERED, FULL, LETTERS, NOT_FINITE, UNWRITABLE),
+        (BEHIND, BROKEN, FILTERED, FULL, INCOMPLETE, LETTERS, NOT_FINITE, UNWRITABLE),
     ),
     _Metric("servotwin_edge_disk_safe", "gauge", "1: all that must be on the disk is there.", ("disk", "safe")),
     _Metric("servotwin_edge_disk_faults_total", "counter", "Faults of the disk.", ("disk", "faults"), "fault"),

@@ -54,6 +54,9 @@ class Outbox(Protocol):
     def pending(self) -> Sequence[Key]:
         """Keys of all windows, oldest first."""
 
+    def newest(self) -> Key | None:
+        """Key of the newest window that the twin has never acknowledged; None: there is none."""
+
     def put_letter(self, body: bytes) -> None:
         """Store a letter (an encoded message); equal letters are stored once."""
 
@@ -133,6 +136,10 @@ class MemoryOutbox:
     def pending(self) -> list[Key]:
         """Keys of all windows, oldest first."""
         return list(self._windows)
+
+    def newest(self) -> Key | None:
+        """Key of the newest window; None: there is none."""
+        return next(reversed(self._windows), None)
 
     def put_letter(self, body: bytes) -> None:
         """Store a letter; equal letters are stored once."""

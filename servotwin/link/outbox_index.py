@@ -5,7 +5,8 @@ A twin restored from a backup asks for acknowledged windows again.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -13,14 +14,29 @@ from servotwin.link.outbox import Key
 
 
 class AcknowledgedLimits(NamedTuple):
-    """Limits of the acknowledged windows: bytes of all, and s since the acknowledgement; 0 bytes: none stay."""
+    """Limits of the acknowledged windows: bytes of all, and s of running time since; 0 bytes: none stay."""
 
     bytes: int
     seconds: float
 
 
+class LastStatus(NamedTuple):
+    """Numbers of an edge's last status, which may be up to a second older than its files.
+
+    Attributes
+    ----------
+    waiting : int
+        Windows that waited.
+    stored : int
+        Windows that the file had stored so far.
+    """
+
+    waiting: int = 0
+    stored: int = 0
+
+
 class _Kept(NamedTuple):
-    """An acknowledged window: its size in bytes, and when it was acknowledged, s since the epoch."""
+    """An acknowledged window: its size in bytes, and when it was acknowledged, s of running time."""
 
     size: int
     at: float
@@ -30,20 +46,32 @@ class _Kept(NamedTuple):
 class AcknowledgedWindows:
     """Index of acknowledged windows, the oldest acknowledgement first.
 
+    Their time is the time for which link processes of the edge have run: each goes on where the newest acknowledgement
+    of the file stands. A clock that is set, or wrong at a start, changes nothing.
+
     Parameters
     ----------
     limits : AcknowledgedLimits
+    clock : callable
+        Monotonic, s.
     """
 
     limits: AcknowledgedLimits
+    clock: Callable[[], float] = time.monotonic
     entries: dict[Key, _Kept] = field(default_factory=dict)
     _bytes: int = 0
+    _zero: float = 0.0
+
+    def now(self) -> float:
+        """Running time, s."""
+        return self._zero + self.clock()
 
     def load(self, stored: Iterable[tuple[Key, int, float]]) -> None:
         """Load the index of a file: keys, sizes and times."""
         rows = sorted(stored, key=lambda row: row[2])
         self.entries = {key: _Kept(size, at) for key, size, at in rows}
         self._bytes = sum(size for _, size, _ in rows)
+        self._zero = (rows[-1][2] if rows else 0.0) - self.clock()
 
     def take(self, key: Key) -> int:
         """Forget a window; return its size."""
@@ -52,10 +80,7 @@ class AcknowledgedWindows:
         return size
 
     def add(self, key: Key, size: int, now: float) -> list[Key]:
-        """Add a window; return those that are over the limits now, which are forgotten.
-
-        A clock that was set back leaves windows for longer, one that was set forward for less; the bytes bound both.
-        """
+        """Add a window; return those that are over the limits now, which are forgotten."""
         self.entries[key] = _Kept(size, now)
         self._bytes += size
         gone = list[Key]()

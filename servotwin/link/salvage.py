@@ -2,8 +2,8 @@
 
 SQLite finds a row by its place through the table's tree: a damaged page hides the rows on it and below it, and no
 others. The keys of all windows are in an index too, on other pages; so what is lost is known where that can be read.
-A copy is opened; where its first page is damaged, that of an empty outbox replaces it. Without room for a copy the file
-itself is read, without its log, and not changed.
+The file is read where it is, with its write-ahead log, and not changed. Where that gives nothing, a copy is read, whose
+first page that of an empty outbox replaces. Windows are handed on one by one: an outbox may be larger than the memory.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import sqlite3
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +31,10 @@ _LETTERS = "SELECT place, digest, body FROM letters"
 # By the order of the index, which holds all that is asked for: the table's pages are not read.
 _KEYS = "SELECT boot, sequence FROM windows ORDER BY boot, sequence"
 _ACKNOWLEDGED = f"SELECT boot, sequence FROM acknowledged WHERE at != {AGAIN}"
+
+
+Row = tuple[int, str, int, str, str, bytes]
+"""A window: place, which is larger for newer ones, boot, sequence, reason, encoding, body."""
 
 
 class Salvage(NamedTuple):
@@ -55,8 +59,8 @@ class Salvaged:
 
     Attributes
     ----------
-    windows : list of (str, int, str, str, bytes)
-        Boot, sequence, reason, encoding and body of windows that decode, oldest first.
+    windows : set of Key
+        Windows that were read, and decode.
     letters : list of (bytes, bytes)
         Digests and bodies.
     counts, notes : dict
@@ -67,7 +71,7 @@ class Salvaged:
         The index and the acknowledgements are not damaged: no more are lost.
     """
 
-    windows: list[tuple[str, int, str, str, bytes]] = field(default_factory=list)
+    windows: set[Key] = field(default_factory=set)
     letters: list[tuple[bytes, bytes]] = field(default_factory=list)
     counts: dict[str, int] = field(default_factory=dict)
     notes: dict[str, bytes] = field(default_factory=dict)
@@ -75,25 +79,37 @@ class Salvaged:
     lost_is_complete: bool = False
 
 
-def salvage(path: Path) -> Salvaged:
-    """Read what can be read of a corrupt outbox."""
+def salvage(path: Path, give: Callable[[Row], None]) -> Salvaged:
+    """Read what can be read of a corrupt outbox; `give` gets each window, once, in any order.
+
+    Raises
+    ------
+    Exception
+        What `give` raises.
+    """
     found = Salvaged()
-    with (
-        suppress(OSError, sqlite3.Error),
-        tempfile.TemporaryDirectory(dir=path.parent, prefix=".salvage-") as folder,
-    ):
-        copy = Path(folder) / "copy.sqlite"
-        _copy(path, copy)
-        _read_into(found, copy.absolute().as_uri())
-        found.lost_is_complete = _is_whole(copy, _KEYS, _ACKNOWLEDGED)
-        if not found.windows and not found.lost and not found.lost_is_complete:
-            _replace_first_page(copy)
-            _read_into(found, copy.absolute().as_uri())
+    # Nobody else has the file open. Without locks and shared memory SQLite writes nothing, and reads the log as well.
+    _read_into(found, f"{path.absolute().as_uri()}?mode=ro&vfs=unix-none", give)
+    if found.windows or found.lost or found.lost_is_complete:
         return found
-    # No room for a copy: immutable, so that SQLite writes no file beside it either.
-    if not found.windows and not found.lost:
-        _read_into(found, f"{path.absolute().as_uri()}?mode=ro&immutable=1")
+    with _with_new_first_page(path) as copy:
+        if copy is not None:
+            _read_into(found, copy.absolute().as_uri(), give)
     return found
+
+
+@contextmanager
+def _with_new_first_page(path: Path) -> Iterator[Path | None]:
+    """Yield a copy with another first page; None: there is no room for it."""
+    with ExitStack() as stack:
+        copy = None
+        with suppress(OSError, sqlite3.Error):
+            folder = stack.enter_context(tempfile.TemporaryDirectory(dir=path.parent, prefix=".salvage-"))
+            made = Path(folder) / "copy.sqlite"
+            _copy(path, made)
+            _replace_first_page(made)
+            copy = made
+        yield copy
 
 
 def _copy(path: Path, copy: Path) -> None:
@@ -105,31 +121,34 @@ def _copy(path: Path, copy: Path) -> None:
             shutil.copyfile(source, copy.with_name(copy.name + end))
 
 
-def _read_into(found: Salvaged, address: str) -> None:
+def _read_into(found: Salvaged, address: str, give: Callable[[Row], None]) -> None:
     with suppress(sqlite3.Error), closing(sqlite3.connect(address, uri=True)) as connection:
+        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         connection.execute("SELECT count(*) FROM sqlite_master").fetchone()  # raises where the first page is damaged
         acknowledged = set(_rows(connection, _ACKNOWLEDGED))
-        for place, *row in _by_place(connection, _WINDOWS, lambda row: row[1:3] not in acknowledged):
-            boot, sequence, _, encoding, body = row
-            if _is_window(place, boot, sequence, encoding, body):
-                found.windows.append((boot, sequence, row[2], encoding, body))
+        for row in _by_place(connection, _WINDOWS):
+            key = boot, sequence = row[1], row[2]
+            if key in acknowledged or key in found.windows:
+                continue
+            if _is_window(*row):
+                found.windows.add(key)
+                give(row)
             elif isinstance(boot, str) and isinstance(sequence, int):
-                found.lost.add((boot, sequence))
-        keys = set(_rows(connection, _KEYS))
-        found.lost |= keys - acknowledged
-        found.lost -= {(boot, sequence) for boot, sequence, *_ in found.windows}
-        letters = [(digest, body) for _, digest, body in _by_place(connection, _LETTERS)]
+                found.lost.add(key)
+        found.lost |= set(_rows(connection, _KEYS)) - acknowledged
+        found.lost -= found.windows
+        letters = [row[1:] for row in sorted(_by_place(connection, _LETTERS), key=lambda row: row[0])]
         found.letters = [each for each in letters if all(isinstance(part, bytes) for part in each)]
         found.counts = {what: n for what, n in _rows(connection, "SELECT what, number FROM counts") if _is(n, int)}
         found.notes = {name: v for name, v in _rows(connection, "SELECT name, value FROM notes") if _is(v, bytes)}
+        found.lost_is_complete = _is_whole(connection, _KEYS, _ACKNOWLEDGED)
 
 
-def _is_whole(copy: Path, *texts: str) -> bool:
+def _is_whole(connection: sqlite3.Connection, *texts: str) -> bool:
     """Test whether queries can be read to their ends."""
     try:
-        with closing(sqlite3.connect(copy)) as connection:
-            for text in texts:
-                connection.execute(text).fetchall()
+        for text in texts:
+            connection.execute(text).fetchall()
     except sqlite3.Error:
         return False
     return True
@@ -145,28 +164,17 @@ def _rows(connection: sqlite3.Connection, text: str) -> Iterator[tuple[Any, ...]
         yield from connection.execute(text)
 
 
-def _by_place(
-    connection: sqlite3.Connection, text: str, wanted: Callable[[tuple[Any, ...]], bool] = lambda _: True
-) -> list[tuple[Any, ...]]:
-    """Read a table from both ends up to a damaged page, and what is between by places one by one.
-
-    Only the wanted rows are held in memory: the acknowledged windows may be most of a file.
-    """
-    rows, first, last = dict[int, tuple[Any, ...]](), 0, _last_place(connection, text)
-
-    def read(condition: str) -> Iterator[int]:
-        for row in _rows(connection, f"{text} {condition}"):
-            if wanted(row):
-                rows[row[0]] = row
-            yield row[0]
-
-    for first in read("ORDER BY place"):  # noqa: B007
-        pass
-    for last in read(f"WHERE place > {first} ORDER BY place DESC"):  # noqa: B007
-        pass
+def _by_place(connection: sqlite3.Connection, text: str) -> Iterator[tuple[Any, ...]]:
+    """Yield a table's rows from both ends up to a damaged page, and what is between by places one by one."""
+    first, last = 0, _last_place(connection, text)
+    for row in _rows(connection, f"{text} ORDER BY place"):
+        first = row[0]
+        yield row
+    for row in _rows(connection, f"{text} WHERE place > {first} ORDER BY place DESC"):
+        last = row[0]
+        yield row
     for place in range(first + 1, min(last, first + 1 + _MOST_PROBED)):
-        list(read(f"WHERE place = {place}"))
-    return [row for _, row in sorted(rows.items())]
+        yield from _rows(connection, f"{text} WHERE place = {place}")
 
 
 def _last_place(connection: sqlite3.Connection, text: str) -> int:
@@ -176,9 +184,11 @@ def _last_place(connection: sqlite3.Connection, text: str) -> int:
     return int(place) + 1
 
 
-def _is_window(place: object, boot: object, sequence: object, encoding: object, body: object) -> bool:
+def _is_window(place: object, boot: object, sequence: object, reason: object, encoding: object, body: object) -> bool:
     """True where a body is the window that its row says; its own checksum covers the samples."""
-    if not (isinstance(place, int) and isinstance(encoding, str) and isinstance(body, bytes)):
+    if not (isinstance(place, int) and isinstance(reason, str) and isinstance(encoding, str)):
+        return False
+    if not isinstance(body, bytes):
         return False
     try:
         window = decode(decompress(body, encoding, MAX_BYTES) if encoding == DEFLATE else body)

@@ -29,6 +29,8 @@ from servotwin.runtime.retry import Backoff, Retry
 
 _OLDER_TWIN_S = 600.0
 """s between two tries of a message that the twin's version does not know."""
+_FRESH_S = 10.0
+"""s for which windows may hold up the newest one while the twin takes them."""
 _TO_EDGES = Update | Request | Acknowledge | LearntResponse | Resend
 """Messages that a twin sends to an edge."""
 Item = Key | bytes
@@ -85,6 +87,10 @@ class Session:
         """Yield the messages to be sent now, in order."""
         if now >= self._not_before:
             yield from (item for item in self._items() if self._due_time(item) <= now)
+
+    def is_due(self, item: Item, now: float) -> bool:
+        """True where a message of the outbox may be sent now."""
+        return now >= self._not_before and self._due_time(item) <= now
 
     def retry_later(self, item: Item, now: float, after_s: float = 0.0) -> None:
         """Schedule a message that was sent, or could not be read, after its next pause, at least `after_s`."""
@@ -163,6 +169,10 @@ class Sent(NamedTuple):
 class Sender:
     """Delivers the messages that are due in a session.
 
+    The oldest window goes first, since the twin learns from windows in their order. Where that takes long, because all
+    edges send at once what an outage has held up, the newest one goes first from time to time: a setting follows from
+    that one only.
+
     Parameters
     ----------
     session : Session
@@ -171,11 +181,12 @@ class Sender:
 
     session: Session
     transport: Transport
+    _behind_since: float | None = None
 
     def step(self, now: float) -> Sent:
         """Deliver the message that is due, if one is."""
         session = self.session
-        item = next(session.due(now), None)
+        item = self._next(now)
         if item is None:
             due = session.next_time
             return Sent(inf if due is None else due - now)
@@ -186,12 +197,27 @@ class Sender:
             session.retry_later(item, now)
         except Unreachable as error:
             session.unreachable(now, str(error))
+            self._behind_since = None
         except Refused as error:
             session.refused(item, now, error.reason, str(error), error.after_s)
         else:
             reconnected = session.delivered(item)
             return Sent(window=None if isinstance(item, bytes) else item, reconnected=reconnected)
         return Sent(session.pause_left(now))
+
+    def _next(self, now: float) -> Item | None:
+        """The message to be sent now: the first one that is due, or the newest window where others hold it up."""
+        item, newest = next(self.session.due(now), None), self.session.outbox.newest()
+        if item is None or isinstance(item, bytes) or item == newest:
+            if not isinstance(item, bytes):
+                self._behind_since = None
+            return item
+        if self._behind_since is None:
+            self._behind_since = now
+        if newest is None or now - self._behind_since < _FRESH_S or not self.session.is_due(newest, now):
+            return item
+        self._behind_since = now
+        return newest
 
 
 class Received(NamedTuple):

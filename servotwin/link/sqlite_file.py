@@ -26,6 +26,7 @@ CREATE TABLE IF NOT EXISTS acknowledged (
     boot TEXT NOT NULL, sequence INTEGER NOT NULL, at REAL NOT NULL, PRIMARY KEY (boot, sequence)) WITHOUT ROWID;
 """
 INSERT = "INSERT OR IGNORE INTO windows (boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?)"
+INSERT_AT = "INSERT OR IGNORE INTO windows (place, boot, sequence, reason, encoding, body) VALUES (?, ?, ?, ?, ?, ?)"
 DELETE = "DELETE FROM windows WHERE boot = ? AND sequence = ?"
 ACKNOWLEDGE = "INSERT OR REPLACE INTO acknowledged (boot, sequence, at) VALUES (?, ?, ?)"
 AGAIN = -1.0
@@ -35,6 +36,7 @@ POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
 TAKE = "DELETE FROM letters WHERE digest = ?"
 COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
 NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
+STORED = "SELECT seq FROM sqlite_sequence WHERE name = 'windows'"
 _BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 BESIDE = ("-wal", "-shm")
 

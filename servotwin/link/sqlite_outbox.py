@@ -11,7 +11,7 @@ import sqlite3
 import time
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import RLock
@@ -19,8 +19,16 @@ from typing import Any
 
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import FULL, Dropped, Key, letter_digest
-from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows, Entry, excess, is_uninformative
-from servotwin.link.salvage import Salvage, Salvaged, salvage
+from servotwin.link.outbox_index import (
+    AcknowledgedLimits,
+    AcknowledgedWindows,
+    Entry,
+    LastStatus,
+    excess,
+    is_uninformative,
+)
+from servotwin.link.rebuild import Rebuild, adopt
+from servotwin.link.salvage import Row, Salvage, Salvaged
 from servotwin.link.sqlite_file import (
     ACKNOWLEDGE,
     AGAIN,
@@ -30,18 +38,19 @@ from servotwin.link.sqlite_file import (
     INSERT,
     NOTE,
     POST,
+    STORED,
     TAKE,
     Statement,
     connect,
     is_broken,
-    put_aside,
     was_read_only,
 )
 from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, decode, encode
 from servotwin.messages.codec import DEFLATE, deflated
 
-BROKEN, UNWRITABLE, LETTERS = "outbox broken", "disk not writable", "letters full"
+BROKEN, INCOMPLETE = "outbox broken", "outbox incomplete"
+UNWRITABLE, LETTERS = "disk not writable", "letters full"
 MOST_UNWRITTEN = 16_000_000
 """Bytes of windows held in memory while the disk cannot be written."""
 _MOST_LETTERS = 10_000
@@ -63,14 +72,18 @@ class SqliteOutbox:
     kept : AcknowledgedLimits, optional
         Limits of the windows that stay after their acknowledgement, for a twin that asks for them again; none by
         default.
-    waiting : int
-        Windows that waited when the last process ended, as far as is known: those of a corrupt file that cannot be
-        found even by name are counted from it.
+    last : LastStatus, optional
+        When the last process ended, as far as is known: windows of a corrupt file that cannot be found even by name are
+        counted from it, and those that a file lacks which is older than that.
+    clock : callable
+        Monotonic, s.
 
     Attributes
     ----------
     salvages : list of Salvage
         Corrupt files of this process.
+    missing : int
+        Windows that waited at the last status, and are not in the file: it is an older one, or without its log.
     """
 
     def __init__(
@@ -80,13 +93,15 @@ class SqliteOutbox:
         windows: int = 5000,
         size: int = 256_000_000,
         kept: AcknowledgedLimits | None = None,
-        waiting: int = 0,
+        last: LastStatus | None = None,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if windows < 1 or size < 1:
             raise InvalidInput(f"outbox of {windows!r} windows and {size!r} bytes: must be at least 1 of each")
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
-        self._kept = AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0))
-        self._waiting = waiting
+        self._kept = AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0), clock)
+        self._last: LastStatus | None = last
+        self._stored = self.missing = 0
         self.salvages: list[Salvage] = []
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
@@ -97,6 +112,7 @@ class SqliteOutbox:
         self._notes: dict[str, bytes] = {}
         self._in_transaction = False
         self._unwritten: dict[tuple[Any, ...], Statement] = {}
+        self._rebuild: tuple[Rebuild, int] | None = None
         self.faults: Counter[str] = Counter()
         self.trouble = ""
         self.flush()
@@ -106,6 +122,13 @@ class SqliteOutbox:
         """Number of windows dropped since the file was made, by reason."""
         counts = dict(self._counts).items()
         return {name.removeprefix(_DROPPED): number for name, number in counts if name.startswith(_DROPPED)}
+
+    @property
+    def stored(self) -> int:
+        """Number of windows that the file has stored so far."""
+        with self._lock:
+            self._stored = max([self._stored, *(number for (number,) in self._read(STORED, ()))])
+            return self._stored
 
     @property
     def flushed(self) -> bool:
@@ -185,6 +208,11 @@ class SqliteOutbox:
         """Keys of all windows, oldest first; those that are sent once more come last."""
         with self._lock:
             return sorted(self._index, key=lambda key: self._index[key].again)
+
+    def newest(self) -> Key | None:
+        """Key of the newest window that the twin has never acknowledged; None: there is none."""
+        with self._lock:
+            return next((key for key, entry in reversed(self._index.items()) if not entry.again), None)
 
     def put_letter(self, body: bytes) -> None:
         """Store a letter (an encoded message); equal letters are stored once."""
@@ -274,6 +302,7 @@ class SqliteOutbox:
 
     def _write(self) -> None:
         if self._connection is None:
+            adopt(self._path)  # of a process that was killed between two renames
             self._connection = connect(self._path)
             self._load(self._connection)
         if self._read_only:
@@ -306,6 +335,11 @@ class SqliteOutbox:
         self._letters = {**{each: None for each in letters if ("letter", each) not in self._unwritten}, **self._letters}
         self._counts = Counter(counts) | self._counts
         self._notes = dict(connection.execute("SELECT name, value FROM notes").fetchall()) | self._notes
+        if self._last is not None:
+            lacks = self._last.stored - sum(number for (number,) in connection.execute(STORED))
+            self.missing = max(0, min(lacks, self._last.waiting))
+            self._count(_DROPPED + INCOMPLETE, self.missing)
+            self._last = None
 
     def _failed(self, error: Exception) -> None:
         """Go on without the disk, or with a new file."""
@@ -333,38 +367,50 @@ class SqliteOutbox:
     def _begin_anew(self) -> None:
         """Put the corrupt file aside and begin another, with all that can be read of it; count the rest as lost."""
         self.close()
-        self.faults[BROKEN] += 1
-        found = salvage(self._path)
+        if self._rebuild is None:
+            self.faults[BROKEN] += 1
+            self._salvage()
+        assert self._rebuild is not None
+        rebuild, lost = self._rebuild
+        try:
+            aside = rebuild.rename()
+        except OSError as error:  # a read-only disk: the next try renames it only
+            self.trouble = str(error)
+            return
+        self._rebuild = None
+        self.salvages.append(Salvage(aside, len(rebuild.found.windows), lost))
+        self.flush()
+
+    def _salvage(self) -> None:
+        """Read the corrupt file, and take over its letters, counts and values; what is in memory is newer."""
         in_memory = {key for kind, key in self._unwritten if kind == "window"}
-        rescued = {(row[0], row[1]): row for row in found.windows if (row[0], row[1]) not in in_memory}
+        rebuild = Rebuild(self._path, in_memory, MOST_UNWRITTEN)
+        found, known = rebuild.found, rebuild.found.windows | rebuild.dropped | in_memory
         # Known by name: from memory where the file was open before, and from what is left of the file.
-        lost = (self._index.keys() | found.lost) - in_memory - rescued.keys()
+        lost = (self._index.keys() | found.lost) - known
         # The number of the last status is old by up to a second: it counts only where the names are not known.
         unnamed = not (self._index or found.lost_is_complete)
-        number = max(len(lost), self._waiting - len(rescued) if unnamed else 0)
-        self._restore(found, rescued, in_memory)
+        waiting = 0 if self._last is None else self._last.waiting
+        number = max(len(lost), waiting - len(known - in_memory) if unnamed else 0)
+        self._restore(found, rebuild.in_memory, in_memory)
         self._count(_DROPPED + BROKEN, number)
+        self._count(_DROPPED + UNWRITABLE, len(rebuild.dropped))
         self._count(BROKEN)
         self._unwritten |= {("count", what): Statement(COUNT, (what, n)) for what, n in self._counts.items()}
         self._unwritten |= {("note", name): Statement(NOTE, (name, value)) for name, value in self._notes.items()}
-        self._waiting = 0
-        try:
-            aside = put_aside(self._path)
-        except OSError as error:
-            self.trouble = str(error)
-            return
-        self.salvages.append(Salvage(aside, len(rescued), number))
-        self.flush()
+        self._last = None
+        rebuild.complete(self._unwritten.values())
+        self._rebuild = rebuild, number
 
-    def _restore(self, found: Salvaged, rescued: Mapping[Key, tuple[Any, ...]], in_memory: set[Key]) -> None:
-        """Take over what was read of a corrupt file; what is in memory is newer."""
+    def _restore(self, found: Salvaged, rows: Sequence[Row], in_memory: set[Key]) -> None:
+        """Take over letters, counts and values of a corrupt file, and windows that are in no new one."""
         unwritten: dict[tuple[Any, ...], Statement] = {
-            ("window", key): Statement(INSERT, row) for key, row in rescued.items()
+            ("window", (row[1], row[2])): Statement(INSERT, row[1:]) for row in rows
         }
         letters = {digest: body for digest, body in found.letters if ("letter", digest) not in self._unwritten}
         unwritten |= {("letter", digest): Statement(POST, (digest, body)) for digest, body in letters.items()}
         self._index = {
-            **{key: Entry(len(row[4]), is_uninformative(row[2])) for key, row in rescued.items()},
+            **{(row[1], row[2]): Entry(len(row[5]), is_uninformative(row[3])) for row in rows},
             **{key: entry for key, entry in self._index.items() if key in in_memory},
         }
         known = {digest for digest in self._letters if ("letter", digest) in self._unwritten}
@@ -406,7 +452,7 @@ class SqliteOutbox:
             self._forget(key)
             return
         del self._index[key]
-        now = time.time()
+        now = self._kept.now()
         self._unwritten["acknowledged", key] = Statement(ACKNOWLEDGE, (*key, now))
         for old in self._kept.add(key, entry.size, now):
             self._unwritten["window", old] = Statement(DELETE, old)

@@ -1,7 +1,9 @@
-"""Gaps in the times at which messages were received: silence, or a clock that was set forward.
+"""Age of messages on a clock that may be wrong, or may have been wrong when they were received.
 
-Which of the two a gap was cannot be told. So the age of a message does not count it: nothing becomes old because a
-clock was wrong, and after a long silence messages only stay for longer.
+The age of a message is the sum of the times between it, all messages after it, and now. A longer gap is silence, or a
+clock that was set forward. Which of the two cannot be told, so that only a part of it counts: little becomes old
+because a clock was wrong, and after a long silence messages only stay for longer. A clock that was set back gives no
+time. So messages are old by their numbers, which rise for ever, and not by their own times.
 """
 
 from __future__ import annotations
@@ -17,6 +19,26 @@ from servotwin.store.store import Store
 
 _LONGEST_GAP = 0.1
 """Share of an age; a longer gap is not counted beyond it."""
+_RESOLUTION = 0.25
+"""Share of the longest gap up to which the time between two messages that were read is taken as even."""
+
+_JITTER_S = 60.0
+"""s by which messages may be committed in another order than they were received, by several processes at once."""
+
+
+class OldMessages(NamedTuple):
+    """Messages that are older than an age.
+
+    Attributes
+    ----------
+    through : int
+        Number (id) of the newest of them: all up to it are old; 0: none is.
+    left_out : float
+        s of gaps that did not count.
+    """
+
+    through: int
+    left_out: float
 
 
 class _Receipt(NamedTuple):
@@ -26,8 +48,8 @@ class _Receipt(NamedTuple):
     received: float
 
 
-def received_before(store: Store, now: float, age: float) -> float:
-    """Time before which messages are older than `age`, without the gaps in between.
+def old_messages(store: Store, now: float, age: float) -> OldMessages:
+    """Find the messages that are older than `age`; few are read.
 
     Parameters
     ----------
@@ -36,54 +58,64 @@ def received_before(store: Store, now: float, age: float) -> float:
         s since the epoch, on a clock that may be wrong.
     age : float
         s. Of a gap in the times of receipt, a tenth of that counts.
-
-    Returns
-    -------
-    float
-        s since the epoch; -inf where the store has no messages.
     """
+    longest = _LONGEST_GAP * age
     with transaction(store.engines.reader) as connection:
+
+        def up_to(id_: int) -> _Receipt | None:
+            return _receipt(connection, _UP_TO, id_)
+
         first, last = (_receipt(connection, query) for query in (_FIRST, _LAST))
-        if first is None or last is None:
-            return -float("inf")
-
-        def between(one: _Receipt, other: _Receipt) -> _Receipt | None:
-            lower = _receipt(connection, _UP_TO, (one.id + other.id) // 2) or one
-            inner = lower if lower.id > one.id else _receipt(connection, _FROM, one.id + 1) or other
-            return inner if inner.id < other.id else None
-
-        longest = _LONGEST_GAP * age
-        gaps = [(last.received, now), *_gaps(first, last, longest, between)]
-    before = now - age
-    for begin, end in gaps:
-        if end > before and end - begin > longest:
-            before -= end - begin - longest
-    return before
+        elapsed, left_out, later = 0.0, 0.0, _Receipt(0, now)
+        for receipt in () if first is None or last is None else _backwards(first, last, _RESOLUTION * longest, up_to):
+            gap = max(0.0, later.received - receipt.received)
+            counted = min(gap, longest)
+            if elapsed + counted > age:
+                return OldMessages(_last_before(receipt, later, later.received - (age - elapsed), up_to), left_out)
+            elapsed, left_out, later = elapsed + counted, left_out + gap - counted, receipt
+    return OldMessages(0, left_out)
 
 
-def _gaps(
-    first: _Receipt, last: _Receipt, longest: float, between: Callable[[_Receipt, _Receipt], _Receipt | None]
-) -> Iterator[tuple[float, float]]:
-    """Yield the longer gaps between two messages, the latest one first; few messages are read, by halving."""
-    if last.received - first.received <= longest:
-        return
-    middle = between(first, last)
-    if middle is None:
-        yield first.received, last.received
-        return
-    if middle.received > last.received:
-        # It came on a clock that was ahead, and was set back since: it is as old as the first one after that.
-        middle = middle._replace(received=_set_back(middle, last, between).received)
-    yield from _gaps(middle, last, longest, between)
-    yield from _gaps(first, middle, longest, between)
+def _backwards(
+    first: _Receipt, last: _Receipt, step: float, up_to: Callable[[int], _Receipt | None]
+) -> Iterator[_Receipt]:
+    """Yield messages from the last to the first, so close that at most `step` s are between two, or none.
+
+    Where the clock was set back, the messages before and after that are found as well.
+    """
+    yield last
+    waiting, right = [first], last
+    while waiting:
+        left = waiting[-1]
+        middle = _middle(left, right, up_to)
+        if middle is not None and not _even(left, middle, right, step):
+            waiting.append(middle)
+            continue
+        right = waiting.pop()
+        if right.id < last.id:
+            yield right
 
 
-def _set_back(ahead: _Receipt, last: _Receipt, between: Callable[[_Receipt, _Receipt], _Receipt | None]) -> _Receipt:
-    """The first message, as far as halving tells, that was received no later than `last`, after one that was."""
-    first, until = ahead, last
-    while (middle := between(first, until)) is not None:
-        first, until = (middle, until) if middle.received > last.received else (first, middle)
-    return until
+def _even(left: _Receipt, middle: _Receipt, right: _Receipt, step: float) -> bool:
+    """True where three times rise, and no further than `step`: between them the clock is taken as right."""
+    times = left.received, middle.received, right.received
+    return min(times[1] - times[0], times[2] - times[1]) >= -_JITTER_S and times[2] - times[0] <= step
+
+
+def _middle(left: _Receipt, right: _Receipt, up_to: Callable[[int], _Receipt | None]) -> _Receipt | None:
+    """A message between two; None: there is none."""
+    middle = up_to((left.id + right.id) // 2)
+    if middle is not None and middle.id > left.id:
+        return middle
+    middle = up_to(right.id - 1)  # numbers are missing
+    return middle if middle is not None and middle.id > left.id else None
+
+
+def _last_before(old: _Receipt, later: _Receipt, time: float, up_to: Callable[[int], _Receipt | None]) -> int:
+    """Id of the last message before a time, from `old` on, which is before it, to `later`, which is not."""
+    while (middle := _middle(old, later, up_to)) is not None:
+        old, later = (middle, later) if middle.received < time else (old, middle)
+    return old.id
 
 
 def _receipt(connection: sa.Connection, query: sa.Select[tuple[int, float]], id_: int = 0) -> _Receipt | None:
@@ -94,5 +126,4 @@ def _receipt(connection: sa.Connection, query: sa.Select[tuple[int, float]], id_
 _RECEIVED = sa.select(messages.c.id, messages.c.received).limit(1)
 _ALL = _RECEIVED.where(messages.c.id > 0)  # so that a plan names the key, by which the first row ends the search
 _FIRST, _LAST = _ALL.order_by(messages.c.id), _ALL.order_by(messages.c.id.desc())
-_FROM = _RECEIVED.where(messages.c.id >= sa.bindparam("_id")).order_by(messages.c.id)
 _UP_TO = _RECEIVED.where(messages.c.id <= sa.bindparam("_id")).order_by(messages.c.id.desc())

@@ -35,12 +35,12 @@ class RetentionResult(NamedTuple):
 
 def delete_old_bodies(
     store: Store,
-    before: float,
+    through: int,
     batch: int = 256,
     pause: Callable[[], None] | None = None,
     most: float = math.inf,
 ) -> RetentionResult:
-    """Delete the bodies of windows received before a time.
+    """Delete the bodies of windows up to a message.
 
     Windows that led to an update and unprocessed ones stay. The work is done in short transactions, with `pause` called
     between them, so that incoming messages do not wait. Interrupted, it continues at the next call.
@@ -48,8 +48,8 @@ def delete_old_bodies(
     Parameters
     ----------
     store : Store
-    before : float
-        s since the epoch.
+    through : int
+        Number (id) of the last message that is old.
     batch : int
         Windows in one transaction.
     most : float
@@ -63,22 +63,18 @@ def delete_old_bodies(
     if batch < 1:
         raise InvalidInput(f"retention batch = {batch!r} windows: must be at least 1")
     total, after = RetentionResult(0, 0, 0), 0
-    while total.emptied < most and (rows := _next(store, after, batch)):
-        old = [row for row in rows if row.received < before]
-        # Ids rise with time, except after a clock was set back: a whole batch of newer windows ends the scan.
-        if not old:
-            break
+    while total.emptied < most and (rows := _next(store, after, through, batch)):
         # Read and delete are separate transactions, so that reading does not hold the write lock.
-        total = _add(total, _empty(store, old))
+        total = _add(total, _empty(store, rows))
         after = rows[-1].id
         if pause is not None:
             pause()
     return total
 
 
-def _next(store: Store, after: int, batch: int) -> Sequence[Any]:
+def _next(store: Store, after: int, through: int, batch: int) -> Sequence[Any]:
     with transaction(store.engines.reader) as connection:
-        return connection.execute(_OLD_WINDOWS, {"_after": after, "_batch": batch}).all()
+        return connection.execute(_OLD_WINDOWS, {"_after": after, "_through": through, "_batch": batch}).all()
 
 
 def _empty(store: Store, old: Sequence[Any]) -> RetentionResult:
@@ -107,12 +103,11 @@ _LED_TO_UPDATE = sa.exists().where(evidence.c.message == messages.c.id, evidence
 _OLD_WINDOWS = (
     sa.select(
         messages.c.id,
-        messages.c.received,
         sa.func.length(bodies.c.body).label("size"),
         sa.or_(messages.c.done.is_(None), _LED_TO_UPDATE).label("stays"),
     )
     .select_from(bodies.join(messages, messages.c.id == bodies.c.message))
-    .where(bodies.c.message > sa.bindparam("_after"), WINDOWS)
+    .where(bodies.c.message > sa.bindparam("_after"), bodies.c.message <= sa.bindparam("_through"), WINDOWS)
     .order_by(bodies.c.message)
     .limit(sa.bindparam("_batch"))
 )

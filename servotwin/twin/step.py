@@ -259,7 +259,9 @@ def _learn(
         records.append(MachineRecord(message, after.machine))
     if after.motor is not None and after.motor != before.motor:
         records.append(MotorRecord(message, after.motor))
-    records += [AlarmRecord(message, sentence) for sentence in after.alarms(before, estimate, trends, learning)]
+    records += [
+        AlarmRecord(message, sentence) for sentence in after.alarms(before, estimate, trends, learning, model.motor)
+    ]
     if not stale:
         state, differs = _compare(model, state, decoded)
         records += [AlarmRecord(message, sentence) for sentence in differs]

@@ -207,10 +207,15 @@ class TokenFile:
     """Reloads the file of tokens when it is replaced, so that `servotwin enroll` needs no restart.
 
     An invalid file changes nothing: the tokens that were read last stay valid.
+
+    Attributes
+    ----------
+    fault : str
+        Sentence on what is wrong with the file that is there now; empty: nothing.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.fault = path, ""
         # Taken before the file is read: a file that is replaced meanwhile is then read again.
         self._stamp = self._stat()
         self.access = AccessControl(read_tokens(path))
@@ -224,8 +229,10 @@ class TokenFile:
         try:
             self.access.replace(read_tokens(self.path))
         except (InvalidInput, OSError) as error:
-            log.error("tokens not reloaded: the former ones stay", extra={"why": str(error)})
+            self.fault = str(error)
+            log.error("tokens not reloaded: the former ones stay", extra={"why": self.fault})
             return False
+        self.fault = ""
         log.info("tokens reloaded")
         return True
 

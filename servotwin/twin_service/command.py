@@ -21,7 +21,7 @@ from servotwin.twin_service.http_server import HttpServer, check_tls, listening_
 from servotwin.twin_service.monitoring import configure_logging
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import TwinFile, read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool, pool_of
 
 log = logging.getLogger(__name__)
 
@@ -37,7 +37,7 @@ def run(path: Path, port: int | None = None) -> None:
     twin = read_twin(path, models=False)
     check_tls(twin.service)
     configure_logging(twin.service.log_level)
-    pool = WorkerPool(twin.service.workers, twin.start, twin.service.job_timeout_s)
+    pool = pool_of(twin)
     with (
         # First: a worker checks the models before a store is made.
         pool.launched(),

@@ -218,6 +218,14 @@ class ServiceConfig:
         float, key(minimum=0.0, help="Largest lead of a window's sample time over that ratio.")
     ] = 60.0
     job_timeout_s: Annotated[float, key(above=0.0, help="Time for one servo after which a worker is replaced.")] = 300.0
+    worker_megabytes: Annotated[
+        float,
+        key(
+            minimum=500.0,
+            infinite=True,
+            help="Memory of its own that a worker may have, in MB; a message that needs more fails, and is counted.",
+        ),
+    ] = 2000.0
     worker_share: Annotated[
         float,
         key(

@@ -19,7 +19,8 @@ from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.store_executor import StoreExecutor
-from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerPool, WorkerProcess
+from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerProcess
+from servotwin.twin_service.worker_pool import WorkerPool
 
 log = logging.getLogger(__name__)
 

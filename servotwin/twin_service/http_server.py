@@ -23,6 +23,7 @@ from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import ABORT, HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 from servotwin.twin_service.strangers import Stranger, StrangerLimit
+from servotwin.twin_service.tls_handshakes import TlsHandshakes, address_of
 
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
@@ -61,7 +62,7 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
         super().connection_made(transport)
         self._start_timer()
         if self._strangers is not None:
-            self._stranger = self._strangers.enter(_address_of(transport), transport.abort)
+            self._stranger = self._strangers.enter(address_of(transport), transport.abort)
             if self._stranger is None:
                 transport.abort()
 
@@ -242,6 +243,8 @@ class HttpServer(uvicorn.Server):
         works: Callable[[], bool],
     ) -> None:
         super().__init__(_server_config(config, app, strangers))
+        self._handshakes: TlsHandshakes | None = None
+        self._most_handshakes = config.strangers
         self._close_polls, self._works, self._manager = close_polls, works, ServiceManager()
 
     @contextmanager
@@ -254,7 +257,20 @@ class HttpServer(uvicorn.Server):
             for number, handler in former.items():
                 signal.signal(number, handler)
 
+    @property
+    def handshakes(self) -> int:
+        """TLS handshakes in progress."""
+        return 0 if self._handshakes is None else self._handshakes.open
+
+    def _limit_handshakes(self) -> None:
+        """Do TLS here: uvicorn leaves it to asyncio, without a limit that suits strangers."""
+        context, make = self.config.ssl, self.config.http_protocol_class
+        if context is not None:
+            self._handshakes = TlsHandshakes(context, make, self._most_handshakes)
+            self.config.ssl, self.config.http_protocol_class = None, self._handshakes  # type: ignore[assignment]
+
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        self._limit_handshakes()
         await super().startup(sockets)
         for each in sockets or ():
             print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
@@ -269,12 +285,9 @@ class HttpServer(uvicorn.Server):
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         self._manager.stopping()
         self._close_polls()
+        if self._handshakes is not None:
+            self._handshakes.abort()
         await super().shutdown(sockets)
-
-
-def _address_of(transport: asyncio.Transport) -> str:
-    peer = transport.get_extra_info("peername")
-    return str(peer[0]) if isinstance(peer, tuple) and peer else ""
 
 
 def _server_config(config: ServiceConfig, app: HttpApp, strangers: StrangerLimit | None) -> uvicorn.Config:

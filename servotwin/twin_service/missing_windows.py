@@ -67,6 +67,8 @@ class SequenceWatch:
                 self._boots.popitem(last=False)
         if window.sequence > known.newest + 1 and known.look_at is None:
             known.look_at = self._now() + _PATIENCE_S
+        if window.sequence < known.newest and known.look_at is not None:
+            known.look_at = self._now() + _PATIENCE_S  # what an outage has held up still comes
         known.newest = max(known.newest, window.sequence)
         self._boots.move_to_end(boot)
 

@@ -14,7 +14,7 @@ from uuid import uuid4
 
 from servotwin import __version__
 from servotwin.messages import NAME_PATTERN
-from servotwin.store.clock_gaps import received_before
+from servotwin.store.clock_gaps import old_messages
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import Backlog, OutgoingMessage, PutResult
@@ -47,7 +47,7 @@ from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.strangers import StrangerLimit
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.what_if_process import WhatIfProcess
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool, pool_of
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +84,7 @@ class TwinService:
         self.metrics, self.executor = Metrics(), StoreExecutor()
         # What people read may take long: edges and acknowledgements do not wait behind it.
         self._readers = StoreExecutor(_READERS, "readers")
-        self.pool = pool or WorkerPool(config.workers, twin.start, config.job_timeout_s)
+        self.pool = pool or pool_of(twin)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
         self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
@@ -237,7 +237,9 @@ class TwinService:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
         store, workers, dispatching = self._store_healthy(), self.pool.alive, self.dispatching
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
-        return {"ok": store and workers > 0 and dispatching, "degraded": self._lagging(backlog), **parts}
+        fault = "" if self.tokens is None else self.tokens.fault
+        degraded = [*self._lagging(backlog), *([f"the former tokens stay in force: {fault}"] if fault else [])]
+        return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property
     def dispatching(self) -> bool:
@@ -320,11 +322,10 @@ class TwinService:
                     log.info("old window bodies deleted", extra=done._asdict())
 
     def _delete_old(self, age: float, most: int) -> RetentionResult:
-        now = self.clocks.wall()
-        before = received_before(self.store, now, age)
-        if (left_out := now - age - before) > 0.0 and not math.isinf(left_out):
-            log.warning("retention leaves out a gap", extra={"days": round(left_out / _DAY, 3)})
-        return delete_old_bodies(self.store, before, most=most)
+        old = old_messages(self.store, self.clocks.wall(), age)
+        if old.left_out > 0.0:
+            log.warning("retention leaves out a gap", extra={"days": round(old.left_out / _DAY, 3)})
+        return delete_old_bodies(self.store, old.through, most=most)
 
     def _add_gauges(self) -> None:
         add = self.metrics.add_gauge

@@ -1,4 +1,4 @@
-"""Worker processes: their pool in the service, which replaces those that die or hang, and the process itself.
+"""Worker processes: the end in the service, and the process itself.
 
 Both ends exchange frames (`runtime.frames`) of MessagePack over a socket; no pickles. A worker is started as
 `python -m servotwin.twin_service.worker DESCRIPTOR`. It works on what it receives over that one socket and ends when
@@ -8,15 +8,15 @@ the socket closes. It has no access to the store and keeps nothing but caches.
 from __future__ import annotations
 
 import asyncio
-import logging
+import math
 import os
+import resource
 import signal
 import socket
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,18 +25,13 @@ import msgspec
 from servotwin.errors import InvalidInput
 from servotwin.runtime.child_process import ChildProcess
 from servotwin.runtime.frames import frame, read_frame, receive_frame
-from servotwin.runtime.retry import Backoff, Retry
 from servotwin.store.records import Lease, WorkResult
 from servotwin.twin_service import config
 
-log = logging.getLogger(__name__)
-
 _START_S = 120.0
 """s that a worker may take until it is ready: it imports and compiles."""
-_START_TRIES = 3
-"""Times that a worker is started before the service gives up its own start."""
 _STOP_S = 5.0
-_COMMAND = (sys.executable, "-m", "servotwin.twin_service.worker")
+COMMAND = (sys.executable, "-m", "servotwin.twin_service.worker")
 
 
 class WorkerStart(NamedTuple):
@@ -119,10 +114,14 @@ class WorkerProcess:
         s that it may take for one lease.
     command : sequence of str
         Command line; the number of the socket's descriptor is appended.
+    memory : float
+        Bytes of memory of its own that it may have. A message for which that is not enough fails.
     """
 
-    def __init__(self, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
-        self._start, self._timeout, self._command = start, timeout, tuple(command)
+    def __init__(
+        self, start: WorkerStart, timeout: float, command: Sequence[str] = COMMAND, memory: float = math.inf
+    ) -> None:
+        self._start, self._timeout, self._command, self._memory = start, timeout, tuple(command), memory
         self._process: ChildProcess | None = None
         self._socket: socket.socket | None = None
         self._ready = False
@@ -141,6 +140,7 @@ class WorkerProcess:
         with theirs:
             number = theirs.fileno()
             self._process = ChildProcess((*self._command, str(number)), pass_fds=(number,), env=_environment())
+        _limit_memory(self._process.pid, self._memory)
 
     def check(self) -> None:
         """Wait until the launched process is ready, without an event loop; `start` reports one that is not.
@@ -230,125 +230,11 @@ class WorkerProcess:
             raise WorkerLost("the worker ended") from None
 
 
-class WorkerPool:
-    """Workers, each used by one task at a time.
-
-    Parameters
-    ----------
-    size : int
-    start : WorkerStart
-    timeout : float
-        s for one lease.
-    command : sequence of str
-
-    Attributes
-    ----------
-    lost : int
-        Number of workers that were replaced.
-    """
-
-    def __init__(self, size: int, start: WorkerStart, timeout: float, command: Sequence[str] = _COMMAND) -> None:
-        self.size, self.lost = size, 0
-        self._make = partial(WorkerProcess, start, timeout, command)
-        self._launched: list[WorkerProcess] = []
-        self._workers: set[WorkerProcess] = set()
-        self._idle: asyncio.Queue[WorkerProcess] = asyncio.Queue()
-
-    @property
-    def alive(self) -> int:
-        """Number of workers whose process runs."""
-        return sum(worker.pid is not None for worker in self._workers)
-
-    @contextmanager
-    def launched(self) -> Iterator[None]:
-        """Launch all workers, have the first one check the twin's file, and kill in the end those that still run.
-
-        Raises
-        ------
-        InvalidInput
-            A worker refuses the file.
-        """
-        self._launched = [self._make() for _ in range(self.size)]
-        try:
-            for worker in self._launched:
-                worker.launch()
-            self._launched[0].check()
-            yield
-        finally:
-            for worker in self._launched:
-                worker.discard()
-
-    async def start(self) -> None:
-        """Start all workers; one that ends meanwhile is replaced, as it would be later.
-
-        Raises
-        ------
-        WorkerLost
-            A worker and those in its place did not start; the others were stopped.
-        """
-        self._workers = set(self._launched) or {self._make() for _ in range(self.size)}
-        starts = [asyncio.ensure_future(self._start(worker)) for worker in list(self._workers)]
-        try:
-            await asyncio.gather(*starts)
-        except WorkerLost:
-            # Their workers end now, which they must not take for a death.
-            for start in starts:
-                start.cancel()
-            await asyncio.gather(*starts, return_exceptions=True)
-            await self.stop()
-            raise
-        for worker in self._workers:
-            self._idle.put_nowait(worker)
-
-    async def _start(self, worker: WorkerProcess) -> None:
-        for tries_left in reversed(range(_START_TRIES)):
-            try:
-                await worker.start()
-                return
-            except WorkerLost as error:
-                if not tries_left:
-                    raise
-                log.warning("worker replaced", extra={"pid": worker.pid, "why": str(error)})
-            self.lost += 1
-            self._workers.discard(worker)
-            await worker.kill()
-            worker = self._make()
-            self._workers.add(worker)
-
-    async def acquire(self) -> WorkerProcess:
-        """Wait for an idle worker."""
-        return await self._idle.get()
-
-    def release(self, worker: WorkerProcess) -> None:
-        """Return a worker to the pool."""
-        self._idle.put_nowait(worker)
-
-    async def replace(self, worker: WorkerProcess, why: str) -> None:
-        """Kill a worker and start another one in its place."""
-        log.warning("worker replaced", extra={"pid": worker.pid, "why": why})
-        self.lost += 1
-        self._workers.discard(worker)
-        await worker.kill()
-        # A worker that cannot start (no memory, a broken installation) must not keep the processor busy.
-        backoff = Backoff(Retry(0.1, 2.0, 30.0))
-        while True:
-            fresh = self._make()
-            self._workers.add(fresh)
-            try:
-                await fresh.start()
-            except (WorkerLost, OSError) as error:
-                self._workers.discard(fresh)
-                await fresh.kill()
-                log.error("worker does not start", extra={"why": str(error)})
-                await asyncio.sleep(backoff.failed())
-                continue
-            self._idle.put_nowait(fresh)
-            return
-
-    async def stop(self) -> None:
-        """Stop all workers."""
-        await asyncio.gather(*(worker.stop() for worker in self._workers))
-        self._workers.clear()
+def _limit_memory(pid: int, size: float) -> None:
+    """Limit a process's own writable memory, where the system can."""
+    if math.isfinite(size) and hasattr(resource, "prlimit"):
+        with suppress(OSError):  # it has ended already
+            resource.prlimit(pid, resource.RLIMIT_DATA, (int(size), int(size)))
 
 
 def _environment() -> Mapping[str, str]:

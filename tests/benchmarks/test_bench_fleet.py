@@ -29,7 +29,7 @@ from servotwin.cli.app import app
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
 from servotwin.messages import Receipt, Setting, Update, decode, encode
 from servotwin.redesign.certified.lookup import Grid
-from servotwin.store.records import Incoming, MessageKind
+from servotwin.store.records import Incoming, MessageKind, WorkResult
 from servotwin.store.store import open_store
 
 PLAN = LoadPlan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, version=3, sequence=100, start=200.0)
@@ -78,6 +78,15 @@ def test_in_an_outage_windows_wait() -> None:
     assert edges.take(1.5) is not None
     assert edges.undisturbed(0.4)
     assert not edges.undisturbed(1.0)
+
+
+def test_ten_seconds_after_an_outage_the_newest_window_of_each_servo_goes_first() -> None:
+    edges = fleet(msgspec.structs.replace(PLAN, outage=(0.5, 1.5), duration=20.0))
+    edges.add_due(1.5)
+    assert [round(edges.take(1.6)[1], 3) for _ in range(2)] == [0.0, 0.1]
+    edges.add_due(2.0)
+    dues = [round(edges.take(11.5)[1], 3) for _ in range(8)]
+    assert (sorted(dues[:4]), dues[4:]) == ([1.7, 1.8, 1.9, 2.0], [0.2, 0.3, 0.4, 0.5])
 
 
 def test_without_a_rate_a_window_is_due_whenever_one_may_be_sent() -> None:
@@ -235,6 +244,11 @@ def test_the_store_shows_the_waiting_times_of_windows(tmp_path: Path) -> None:
             assert findings.stored(reading) == 4
             found = findings.done(reading, 101.0, 103.0)
             assert (found.windows, found.undone) == (2, 2)
+            assert findings.fresh(reading, 2.0, 100.0) == (0, 0.0)
+            lease = store.lease("me", 1, 60.0, 110.0)[0]
+            store.commit([WorkResult("a", lease.serial, b"", None, tuple(m.id for m in lease.messages))], 125.0)
+            assert findings.fresh(reading, 2.0, 100.0) == (1, 25.0)
+            assert findings.fresh(reading, 4.0, 100.0) == (0, 0.0)
             assert findings.made(reading, 0.0) == {}
             assert findings.failures(reading) == []
     finally:

@@ -50,20 +50,28 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
         twin=SimpleNamespace(ended_alone=2),
         outbox=lambda servo: tmp_path / servo / "outbox.sqlite",
     )
+    site.crowd_size = 996
+    site.crowd_status = lambda: Site.crowd_status(site)
+    site.acknowledged_by_crowd = lambda: Site.acknowledged_by_crowd(site)
     site.stored, site.waiting = lambda: Site.stored(site), lambda: Site.waiting(site)
+    # Of the crowd one acknowledged window is stored, and one is not; a line was cut by a kill.
+    (tmp_path / "crowd-acknowledged").write_text("ax-0 b1 0\nax-c00001 c-1 7\nax-c00002 c-")
+    (tmp_path / "crowd-status.json").write_text('{"waiting": 3, "applied": 5, "refused": {"400": 2}}')
     witness = Witness(site)
     witness.look()
     samples = [(float(second), {"twin": 100 + second}) for second in range(10)]
     found = endurance._figures(site, witness, {"edge killed": 3}, samples)
     assert (found.stored, found.boots, found.applied) == (3, 2, 1)
-    assert (found.lost_acknowledged, found.holes, found.counted, found.waiting) == (1, 1, 2, 1)
+    assert (found.lost_acknowledged, found.holes, found.counted, found.waiting) == (2, 1, 2, 4)
+    assert (found.servos, found.refused) == (997, {"400": 2})
     # Seven were cut in b2 up to its last status: one is stored, one waits.
     assert (found.starts, found.ended_alone, found.twin_ended, found.unseen) == (4, 1, 2, 5)
     assert found.memory == {"twin": (103, 109)}
     with (console := Console(width=120)).capture() as printed:
         console.print(endurance.shown(found))
     lines = [line.split() for line in printed.get().splitlines()]
-    assert ["acknowledged,", "and", "not", "stored", "1"] in lines
+    assert ["acknowledged,", "and", "not", "stored", "2"] in lines
+    assert ["growth", "of", "a", "twin,", "bytes", "per", "window;", "MB", "in", "a", "year", "3.0;", "4719"] in lines
     assert ["faults:", "edge", "killed", "3"] in lines
 
 

@@ -16,7 +16,7 @@ from servotwin.edge_process.metrics import metrics_text
 from servotwin.store.store import open_store
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 FOLDER = Path(__file__).parents[2] / "docs/operator/prometheus"
 DASHBOARD: Any = json.loads((FOLDER / "dashboard.json").read_text())

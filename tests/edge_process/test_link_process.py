@@ -75,7 +75,7 @@ def test_an_edge_that_was_superseded_keeps_its_windows_and_tells_the_control_pro
         pipe.close()
         running.join(PATIENCE)
     status = read_status(tmp_path / "status.json") or {}
-    assert status["windows"] == {"waiting": 1, "letters_waiting": 0, "dropped": {}}
+    assert status["windows"] == {"waiting": 1, "stored": 2, "letters_waiting": 0, "dropped": {}}
     assert list(twin.windows) == [("b1-aa", 0)]
     assert "another edge of this servo" in capfd.readouterr().err
 
@@ -125,7 +125,7 @@ def test_a_twin_gets_windows_again_a_full_disk_is_said_and_a_corrupt_outbox_is_l
             send(pipe, k)
         # The twin has a window before the edge has its acknowledgement, and a status may be of before all of them.
         until(lambda: len(twin.windows) == 3 and not process.outbox.pending())
-        acknowledged = {"waiting": 0, "letters_waiting": 0, "dropped": {"outbox broken": 80}}
+        acknowledged = {"waiting": 0, "stored": 3, "letters_waiting": 0, "dropped": {"outbox broken": 80}}
         until(lambda: (read_status(tmp_path / "status.json") or {}).get("windows") == acknowledged)
         twin.windows.clear()
         twin.say(Resend("ax-1", "b1-aa", 1, reason="restored"))

@@ -8,8 +8,11 @@ from scaling import scaled
 from scipy.linalg import expm
 
 from servotwin import Axis, DcMotor, Load, Servo, SquareWave, Transmission, Window, simulate
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.motor import BACK_EMF, BIAS, FRICTION, LearntMotor, MotorLearning, motor_rows
+from servotwin.estimation.learning.trend_settings import TrendSettings
+from servotwin.estimation.learning.wear import Wear
 from servotwin.plant.signals import Array
 from servotwin.twin.estimating import motor_learning_of
 from servotwin.twin.settings import TwinSettings
@@ -188,3 +191,24 @@ def test_a_load_that_acts_back_is_no_motor_of_this_kind() -> None:
     assert window.voltage is not None
     other = window.replace(voltage=window.voltage + wiggle(6))
     assert learning().updated(None, other, 0.0) is None
+
+
+def test_a_motor_that_is_always_at_its_drives_limit_teaches_nothing_and_that_is_said() -> None:
+    """Windows of a drive that cuts nearly every command; a window that tells of the motor ends the count."""
+    motor = DcMotor(PAPER.J, PAPER.R, PAPER.k_T, PAPER.k_B, PAPER.L, limit=2.0)
+    load = Load(tuple(PAPER.masses), tuple(PAPER.stiffnesses), tuple(PAPER.dampings))
+    of = motor_learning_of(Axis(motor, Transmission(PAPER.p), load, PAPER.controller), TwinSettings())
+    square = 3.0 * np.sign(np.sin(12.0 * np.arange(5000) / RATE))
+    cut = turned(PAPER, np.clip(square, -2.0, 2.0))
+    always = Window(cut.position, theta_m=cut.theta_m, voltage=square, sample_rate=RATE)
+    settings, trends = LearningSettings(), TrendSettings()
+    nothing = math.inf, math.inf, (0.0, math.inf)
+    estimate = GapEstimate(math.nan, *nothing, GapStatus.UNIDENTIFIABLE, 0.5)
+    wear, told = Wear(0.1), list[str]()
+    for window in [*[always] * 5, turned(PAPER, wiggle(1)), *[always] * 3]:
+        before = wear
+        wear, _ = before.update(trends, "b", estimate, 1.0, settings, None, window, of)
+        told.append("".join(wear.alarms(before, estimate, trends, settings, of)))
+    assert [bool(sentence) for sentence in told] == [False, False, True, *[False] * 5, True]
+    assert "the drive's limit of 2 V in 100 % of the samples" in told[2]
+    assert "tell nothing of the motor" in told[2]

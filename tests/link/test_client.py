@@ -9,6 +9,7 @@ from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.link.outbox_index import AcknowledgedLimits
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
 from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
@@ -88,6 +89,36 @@ def test_letters_go_first_then_windows_in_order(sender: Sender, outbox: SqliteOu
     assert sender.step(0.0).wait_s == inf
     assert (outbox.pending(), outbox.letters()) == ([], [])
     assert sender.session.counts == {"letters": 1, "windows": 2}
+
+
+def test_where_a_backlog_takes_long_the_newest_window_goes_first_from_time_to_time(
+    sender: Sender, outbox: SqliteOutbox, script: Script
+) -> None:
+    """Fresh settings of all follow soon after an outage of many; a backlog that goes quickly stays in order."""
+    for k in range(8):
+        outbox.put(window(k))
+    script.faults = [Unreachable("gone")]
+    assert sender.step(0.0).window is None
+    sent = [sender.step(60.0 + 4.0 * n).window for n in range(4)]
+    assert sent == [("b0", 0), ("b0", 1), ("b0", 2), ("b0", 7)]
+    outbox.put(window(8))
+    assert [sender.step(75.0 + 4.0 * n).window for n in range(3)] == [("b0", 3), ("b0", 4), ("b0", 8)]
+    assert [sender.step(84.0 + 0.1 * n).window for n in range(2)] == [("b0", 5), ("b0", 6)]
+    assert sender.step(85.0).wait_s == inf
+    outbox.put(window(9))
+    outbox.put(window(10))
+    assert [sender.step(100.0 + n).window for n in range(2)] == [("b0", 9), ("b0", 10)]
+
+
+def test_windows_that_the_twin_asked_for_again_are_not_the_newest(tmp_path: Path, script: Script) -> None:
+    box = SqliteOutbox(tmp_path / "again.sqlite", "axis-1", kept=AcknowledgedLimits(10**7, 3600.0))
+    for k in range(4):
+        box.put(window(k))
+    box.remove(("b0", 3))
+    box.resend(lambda *_: True)
+    sender = Sender(Session(box, RETRY), script)
+    assert [sender.step(11.0 * n).window for n in range(4)] == [("b0", k) for k in (0, 2, 1, 3)]
+    box.close()
 
 
 def test_pauses_grow_while_the_twin_is_out_of_reach(sender: Sender, outbox: SqliteOutbox, script: Script) -> None:

@@ -78,7 +78,10 @@ def test_two_twins_share_what_edges_send(server: Mosquitto, store: Store) -> Non
 
 
 @pytest.mark.slow
-def test_a_broker_killed_again_and_again_loses_nothing(server: Mosquitto, store: Store) -> None:
+def test_a_broker_killed_again_and_again_loses_nothing(
+    server: Mosquitto, store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     at = Broker(server.url)
     with twin(at, store), edge(at, timeout_s=3.0) as here:
         tries = 0
@@ -88,6 +91,7 @@ def test_a_broker_killed_again_and_again_loses_nothing(server: Mosquitto, store:
                 server.start()
             tries += insist(lambda k=k: here.deliver(parcel(k)))
         assert kept(store) == list(range(60))
+    assert {"broker connected", "broker lost"} <= set(caplog.messages)
 
 
 def test_a_twin_that_begins_late_gets_all(server: Mosquitto, store: Store) -> None:

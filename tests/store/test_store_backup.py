@@ -168,7 +168,7 @@ def test_retention_deletes_old_bodies_except_those_of_windows_that_led_to_an_upd
     every = [EvidenceRecord("estimate", message.id, b"e") for message in claim.messages]
     store.commit([outcome(claim, led, *every)], 201.0)
     pauses: list[None] = []
-    assert delete_old_bodies(store, 109.0, 3, lambda: pauses.append(None)) == RetentionResult(
+    assert delete_old_bodies(store, 9, 3, lambda: pauses.append(None)) == RetentionResult(
         emptied=7, bytes=7000, retained=2
     )
     assert pauses
@@ -178,7 +178,7 @@ def test_retention_deletes_old_bodies_except_those_of_windows_that_led_to_an_upd
     assert store.put([window(body=bytes(1000))]) == [PutResult.KNOWN]
     (rest,) = store.lease("me", 1, 30.0, 300.0)
     assert len(rest.messages) == 3
-    assert delete_old_bodies(store, 109.0) == RetentionResult(0, 0, 2)
+    assert delete_old_bodies(store, 9) == RetentionResult(0, 0, 2)
     store.close()
 
 
@@ -193,7 +193,7 @@ def test_retention_returns_space_to_the_file_system(url: str, tmp_path: Path) ->
             return connection.exec_driver_sql("PRAGMA page_count").scalar_one()
 
     before = pages()
-    assert delete_old_bodies(store, 1000.0, 10).emptied == 100
+    assert delete_old_bodies(store, 1000, 10).emptied == 100
     assert pages() < before / 5
     store.close()
 
@@ -207,10 +207,10 @@ def test_interrupted_retention_continues_at_the_next_call(url: str) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        delete_old_bodies(store, 1000.0, 4, stop)
-    assert delete_old_bodies(store, 1000.0, 4).emptied == 6
+        delete_old_bodies(store, 1000, 4, stop)
+    assert delete_old_bodies(store, 1000, 4).emptied == 6
     with transaction(store.engines.reader) as connection:
         assert connection.execute(sa.select(sa.func.count()).select_from(bodies)).scalar_one() == 0
     with pytest.raises(InvalidInput, match="must be at least 1"):
-        delete_old_bodies(store, 1000.0, 0)
+        delete_old_bodies(store, 1000, 0)
     store.close()

@@ -1,4 +1,4 @@
-"""A worker that does what the body of a window's channel says: "die", "hang", "raise", or its work."""
+"""A worker that does what the body of a window's channel says: "die", "hang", "raise", "fill", or its work."""
 
 import os
 import sys
@@ -26,6 +26,8 @@ def work(claim: Lease, now: float, _urgency: object) -> WorkResult:
             time.sleep(600.0)
         if behaviour == "raise":
             raise ValueError("this one cannot be worked on")
+        if behaviour == "fill":
+            bytearray(2_000_000_000)
         evidence.append(EvidenceRecord("estimate", message.id, b"\xc0", status=f"at {now:.0f}"))
     done = tuple(message.id for message in messages)
     sent = tuple(b"news" for _ in messages)

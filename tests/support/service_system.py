@@ -20,7 +20,7 @@ from servotwin.store.store import open_store
 from servotwin.twin_service.auth import Verifiers, write_tokens
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 TOKEN, OTHER, OPERATOR, ENGINEER = "token-of-ax-1", "token-of-ax-2", "token-of-the-operator", "token-of-the-engineer"
 SERVO = '[models.axis]\nservo = "paper"\n[models.axis.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "axis"\n'

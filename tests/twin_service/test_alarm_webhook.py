@@ -30,7 +30,7 @@ from servotwin.twin_service.webhook import (
     alarm_post,
     send_post,
 )
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
 POST = alarm_post("ax-1", "alarm", "the gap grows faster than is assumed", 0.0)
@@ -201,18 +201,21 @@ def test_only_alarms_are_posted_each_once_an_hour(monkeypatch):
     assert counts == {"taken": 4, "refused": 0, "dropped": 0}
 
 
-def test_an_alarm_waits_for_a_webhook_that_is_away_and_the_others_behind_it(monkeypatch):
+def test_an_alarm_waits_for_a_webhook_that_is_away_and_the_others_behind_it(monkeypatch, caplog):
+    caplog.set_level("INFO")
     away = [WebhookAway("a"), WebhookAway("a"), WebhookAway("a")]
     posted, counts, now = run_webhook(monkeypatch, away, [result(alarm("one"), alarm("two"))])
     assert posted == ["one", "one", "one", "one", "two"]
     assert counts["taken"] == 2
     assert now == 2.0 + 4.0 + 8.0
+    assert {"webhook away", "webhook answers again"} <= set(caplog.messages)
 
 
-def test_a_refused_alarm_is_not_posted_again(monkeypatch):
+def test_a_refused_alarm_is_not_posted_again(monkeypatch, caplog):
     posted, counts, _ = run_webhook(monkeypatch, [WebhookRefused("no")], [result(alarm("one"), alarm("two"))])
     assert posted == ["one", "two"]
     assert counts == {"taken": 1, "refused": 1, "dropped": 0}
+    assert "webhook refused an alarm" in caplog.messages
 
 
 def test_after_a_day_an_alarm_is_dropped(monkeypatch):
@@ -246,7 +249,8 @@ def test_a_result_that_is_void_announces_nothing(monkeypatch):
     asyncio.run(body())
 
 
-def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch):
+def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
     posted = []
 
     async def body():
@@ -273,6 +277,7 @@ def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch):
         ("twin", "twin: lag: new messages of a servo wait for longer than lag_limit_s = 30 s"),
         ("twin", "twin: store damaged: it is not written any more: page 7 is damaged"),
     ]
+    assert {"updates lag", "updates lag no longer"} <= set(caplog.messages)
 
 
 def test_what_a_twin_could_not_process_is_posted(tmp_path):

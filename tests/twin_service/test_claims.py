@@ -58,9 +58,10 @@ def test_a_copied_folder_is_refused_and_an_alarm_is_stored(tmp_path: Path, caplo
             assert alarm.kind == "alarm"
             assert alarm.status == "conflict: two edges of this servo run, one and two; the newer one counts"
             assert system.metrics.rejected.values[("superseded",)] >= 2
+            assert "edge began" in caplog.messages
             assert (await client.get("/v1/servos/ax-2", headers=bearer(OTHER))).status_code == 403
 
-    with caplog.at_level(logging.WARNING, "servotwin"):
+    with caplog.at_level(logging.INFO, "servotwin"):
         asyncio.run(run())
     assert [record.message for record in caplog.records].count("conflict") == 2
 

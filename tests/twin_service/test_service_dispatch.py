@@ -16,7 +16,7 @@ from servotwin.store.store import open_store
 from servotwin.twin_service.dispatcher import VerificationQuota
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 pytest_plugins = ("store_fixtures",)
 WORKER = (sys.executable, str(Path(__file__).parents[1] / "support" / "scripted_worker.py"))
@@ -90,12 +90,14 @@ def test_a_message_that_kills_its_workers_is_isolated_and_all_others_are_process
             assert 'servotwin_evidence_total{kind="estimate"} 11\n' in counted
             [alarm] = [record for record in caplog.records if record.message == "failed"]
             assert (alarm.levelname, alarm.servo, alarm.window) == ("WARNING", "ax-1", "b/3")
+            assert "work failed" in caplog.messages
+            assert ("worker replaced" in caplog.messages) == (fault != "raise")
 
     asyncio.run(body())
 
 
 @pytest.mark.slow
-def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path):
+def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path, caplog):
     async def body():
         async with working(twin_file(tmp_path)) as (system, client):
             write, failures = system.store.write, []
@@ -112,6 +114,7 @@ def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path
                 await put(client, sequence, tries=3)
             await until(lambda: done(system))
             assert len(failures) == 2
+            assert "result not committed" in caplog.messages
             assert {len(each) for each in statuses(system).values()} == {1}
             assert system.store.servo("ax-1").posted == 5
 

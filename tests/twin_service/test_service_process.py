@@ -37,7 +37,7 @@ from servotwin.messages import encode
 from servotwin.store.store import open_store
 from servotwin.twin_service import command as service
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerPool
+from servotwin.twin_service.worker_pool import WorkerPool
 
 PATIENCE = 60.0
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups")

@@ -193,6 +193,19 @@ def test_windows_that_were_only_overtaken_are_not_asked_for(tmp_path):
     serve(twin_file(tmp_path), body)
 
 
+def test_a_backlog_behind_the_newest_window_is_not_missing_while_it_comes():
+    now = [0.0]
+    watch = missing_windows.SequenceWatch(lambda: now[0])
+    watch.note(window(0))
+    watch.looked_at(("ax-1", "b"), 0)
+    for number in (20, *range(1, 9)):
+        watch.note(window(number))
+        now[0] += 20.0
+        assert watch.due() == []
+    now[0] += 15.0
+    assert watch.due() == [("ax-1", "b")]
+
+
 @pytest.mark.parametrize("selected", [None, 0])
 def test_an_edge_that_selects_its_windows_leaves_no_holes(selected):
 

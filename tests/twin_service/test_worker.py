@@ -3,16 +3,22 @@
 import asyncio
 import sys
 from contextlib import closing
+from pathlib import Path
 
+import msgspec
 import pytest
-from service_system import twin_file
+from service_system import twin_file, window
 
+from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
+from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.store.store import open_store
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
-from servotwin.twin_service.worker import WorkerLost, WorkerPool
+from servotwin.twin_service.worker import WorkerLost
+from servotwin.twin_service.worker_pool import WorkerPool
 
+SCRIPTED = Path(__file__).parents[1] / "support" / "scripted_worker.py"
 WORKER = """
 import os, sys, pathlib
 starts = pathlib.Path({starts!r})
@@ -68,3 +74,28 @@ def test_a_service_starts_while_its_disk_is_full(tmp_path):
         service = TwinService(twin, store, pool=WorkerPool(0, twin.start, 1.0))
         assert asyncio.run(run(service))
     assert tried
+
+
+def test_a_message_that_needs_more_memory_than_a_worker_may_have_fails_alone(tmp_path):
+    """Its worker lives on: one window cannot take the memory of the machine."""
+    twin = read_twin(twin_file(tmp_path))
+
+    async def body():
+        pool = WorkerPool(1, twin.start, 30.0, (sys.executable, str(SCRIPTED)), memory=400e6)
+        with pool.launched():
+            await pool.start()
+            worker = await pool.acquire()
+            asked = [lease(n, reason) for n, reason in enumerate(("work", "fill", "work"))]
+            found = [done async for done in worker.work(asked, 1.0)]
+            assert [each.error for each in found] == ["", "MemoryError: ", ""]
+            assert pool.alive == 1
+            pool.release(worker)
+            await pool.stop()
+
+    asyncio.run(body())
+
+
+def lease(number, reason):
+    body = encode(msgspec.structs.replace(window(number), reason=reason))
+    stored = StoredMessage(number, MessageKind.WINDOW, body, "", 0.0, f"b/{number}")
+    return Lease(f"ax-{number}", b"", 0, (stored,), 1)

@@ -205,6 +205,17 @@ class MotorLearning:
             return replace(fresh, windows=before.windows + 1, alarm=self._outside(before, fresh, window))
         return self._contradicted(before, fresh, window, now)
 
+    def lost_at_limit(self, window: Window) -> float:
+        """Share of a window's commands at the drive's limit where they leave too little to learn from; 0: they do not.
+
+        A window that would tell nothing without the limit either, such as a short one, is none of these.
+        """
+        if self.limit is None or window.voltage is None:
+            return 0.0
+        share = float(np.mean(np.abs(window.voltage) > (1.0 - _NEAR_LIMIT) * self.limit))
+        cut = share > 0.0 and motor_rows(window, self.servo, self.limit) is None
+        return share if cut and motor_rows(window, self.servo) is not None else 0.0
+
     def current(self, motor: LearntMotor | None, now: float) -> LearntMotor | None:
         """Return what is known of the motor at a time (s); None where the last windows contradict it."""
         if motor is None or motor.surprises > 0:

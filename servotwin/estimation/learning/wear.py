@@ -133,6 +133,9 @@ class Wear(Struct, frozen=True):
         None before a window told of the motor's numbers.
     mismatches : int
         Windows in a row that no model within what is known explains; windows that show too little do not count.
+    at_limit, limited : int, float
+        Windows in a row that tell nothing of the motor because its commands were at the drive's limit, and the share of
+        the last one's commands that were.
     """
 
     previous: float
@@ -142,6 +145,8 @@ class Wear(Struct, frozen=True):
     machine: LearntMachine | None = None
     motor: LearntMotor | None = None
     mismatches: int = 0
+    at_limit: int = 0
+    limited: float = 0.0
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
@@ -200,14 +205,25 @@ class Wear(Struct, frozen=True):
         if wear.mismatches != (mismatches := self._mismatches(estimate)):
             wear = replace(wear, mismatches=mismatches)
         if motor is not None and window is not None:
-            wear = replace(wear, motor=motor.updated(self.motor, window, now))
+            wear = self._with_motor(wear, motor, window, now)
         if not learning.learn:
             return wear, rejection
         machine = updated(self.machine, learning, estimate, counts=not rejection, now=now, stated=stated)
         return replace(wear, machine=machine), rejection
 
+    def _with_motor(self, wear: Wear, motor: MotorLearning, window: Window, now: float) -> Wear:
+        """`wear` with what the window tells of the motor, or that it was at its drive's limit."""
+        learnt, share = motor.updated(self.motor, window, now), motor.lost_at_limit(window)
+        count = self.at_limit + 1 if share else self.at_limit if learnt == self.motor else 0
+        return replace(wear, motor=learnt, at_limit=count, limited=share)
+
     def alarms(
-        self, before: Wear, estimate: GapEstimate, settings: TrendSettings, learning: LearningSettings
+        self,
+        before: Wear,
+        estimate: GapEstimate,
+        settings: TrendSettings,
+        learning: LearningSettings,
+        motor: MotorLearning | None = None,
     ) -> list[str]:
         """List what an operator should know of the machine after a window, besides what was learnt.
 
@@ -219,6 +235,12 @@ class Wear(Struct, frozen=True):
             sentences.append(
                 f"{count} windows in a row fit no machine within what is known of this one ({because}): check the "
                 "nameplate (stiffness, damping, pitch, masses), the channels' units, and what may be loose"
+            )
+        if motor is not None and self.at_limit == count > before.at_limit:
+            sentences.append(
+                f"{count} windows in a row tell nothing of the motor (back EMF, lag, friction, input bias): the "
+                f"command is at the drive's limit of {motor.limit:g} V in {100.0 * self.limited:.3g} % of the samples; "
+                "check the limit, the load and the steps of the reference"
             )
         trend, earlier = self.trend(settings), before.trend(settings)
         if trend is not None and earlier is not None and trend.afresh and not earlier.afresh:

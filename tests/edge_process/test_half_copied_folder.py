@@ -1,0 +1,103 @@
+"""A folder of an edge that was copied in part: what is missing is said and counted, and nothing is sent wrongly."""
+
+import shutil
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from edge_process_parts import EDGE
+from outbox_cases import window
+
+from servotwin.edge_process.config_file import load
+from servotwin.edge_process.link_process import LinkProcess
+from servotwin.edge_process.monitoring import read_status
+from servotwin.edge_process.startup import check
+from servotwin.errors import InvalidInput
+
+WINDOWS, OF_LOG = 24, 8
+
+
+@contextmanager
+def link(folder: Path) -> Iterator[LinkProcess]:
+    """A link process that does not run; it writes its status at the beginning and at the end."""
+    ours, theirs = socket.socketpair()
+    process = LinkProcess(load(folder / "edge.toml"), theirs, "b1-aa")
+    try:
+        process._check()
+        yield process
+        process._check()
+    finally:
+        process._end_all([])
+        ours.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The folder of an edge whose newest windows are in the log of its outbox only."""
+    here, copy = tmp_path / "edge", tmp_path / "copy"
+    here.mkdir()
+    (here / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9"))
+    (here / "token").touch(0o600)
+    (here / "token").write_text("first")
+    with link(here) as process:
+        for k in range(WINDOWS - OF_LOG):
+            process.outbox.put(window(k))
+    with link(here) as process:
+        for k in range(WINDOWS - OF_LOG, WINDOWS):
+            process.outbox.put(window(k))
+        process._check()
+        shutil.copytree(here, copy)
+    return copy
+
+
+@pytest.mark.parametrize(
+    ("lacks", "left"),
+    [("", WINDOWS), ("outbox.sqlite-wal", WINDOWS - OF_LOG), ("outbox.sqlite*", 0), ("outbox.sqlite-shm", WINDOWS)],
+    ids=["nothing", "log", "outbox", "shared memory"],
+)
+def test_windows_of_a_file_that_was_not_copied_are_counted_once(
+    folder: Path, lacks: str, left: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for path in folder.glob(lacks) if lacks else ():
+        path.unlink()
+    for _ in range(2):
+        with link(folder) as process:
+            status = read_status(folder / "status.json") or {}
+            assert status["windows"]["waiting"] == left
+            assert status["windows"]["dropped"] == ({} if left == WINDOWS else {"outbox incomplete": WINDOWS - left})
+            process.outbox.put(window(100))
+            process.outbox.remove(("b0", 100))
+    log = capfd.readouterr().err
+    assert log.count('"event":"outbox incomplete"') == (left < WINDOWS)
+    assert log.count('"event":"windows dropped"') == (left < WINDOWS)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.95])
+def test_every_window_of_an_outbox_that_was_cut_is_read_or_counted(folder: Path, share: float) -> None:
+    path = folder / "outbox.sqlite"
+    path.with_name("outbox.sqlite-shm").unlink()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(share * len(whole))])
+    with link(folder) as process:
+        status = read_status(folder / "status.json") or {}
+        assert status["windows"]["waiting"] + sum(status["windows"]["dropped"].values()) == WINDOWS
+        assert set(status["windows"]["dropped"]) <= {"outbox broken", "outbox incomplete"}
+        for key in process.outbox.pending():
+            assert process.outbox.get(key) == window(key[1])
+
+
+def test_a_folder_without_its_token_is_refused_in_one_sentence(folder: Path) -> None:
+    (folder / "token").unlink()
+    with pytest.raises(InvalidInput, match="token"):
+        check(load(folder / "edge.toml"))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.9])
+def test_a_status_that_was_cut_tells_nothing_and_stops_nothing(folder: Path, share: float) -> None:
+    status = folder / "status.json"
+    status.write_bytes(status.read_bytes()[: int(share * status.stat().st_size)])
+    with link(folder) as process:
+        assert len(process.outbox.pending()) == WINDOWS
+        assert process.outbox.dropped == {}
