@@ -6,6 +6,7 @@ import { ActsPanel } from "./acts.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
+import { LiveViewPanel } from "./live_view.js";
 import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
@@ -26,6 +27,7 @@ export class MachinePage {
     this.closed = true;
     clearInterval(this.ages);
     clearTimeout(this.timer);
+    this.liveView.close();
     for (const plot of this.plots) plot.close();
   }
 
@@ -68,6 +70,7 @@ export class MachinePage {
       return this.plots.at(-1);
     };
     this.whatIf = new WhatIfPanel(name, () => this.start());
+    this.liveView = new LiveViewPanel(name, () => this.gaps?.machine);
     this.acts = new ActsPanel(name, () => this.later());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
@@ -75,6 +78,7 @@ export class MachinePage {
       panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV")],
         legend(["blue", "estimate"], ["blue band", "95 % interval"], ["green", "wear (trend)"], ["red dash", "limit"], ["orange", "version applied"], ["red dots", "version refused, or fallback"]),
         places.gap),
+      panel("Live", [], ...this.liveView.content),
       panel("Window", [this.choice, this.rate, this.windowFile], this.windowNote,
         element("div", { class: "pair" },
           element("div", {},
@@ -97,7 +101,7 @@ export class MachinePage {
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
     this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
     this.makePlots(plot, places);
-    this.plots.push(...this.whatIf.plots);
+    this.plots.push(...this.whatIf.plots, ...this.liveView.plots);
   }
 
   // Where a trial on the model begins: at what is known of the machine.
