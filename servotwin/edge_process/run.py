@@ -29,8 +29,8 @@ from servotwin.runtime.service_manager import ServiceManager
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _RECONNECT_S, _PAUSE_S, _FINISH_S = 1.0, 0.02, 3.0
-_SHARED_S = 3.0
-"""s of samples that a link process may come late by in the live view."""
+_SHARED_S = 20.0
+"""s of samples that the live view can look back, also at a simulated machine that runs faster than time."""
 
 
 class _Role(Protocol):

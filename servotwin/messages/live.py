@@ -14,7 +14,7 @@ from servotwin.messages.checks import Count, InvalidMessage, Name, require
 
 COLUMN_S = 0.1
 """s of one column."""
-MAX_LIVE_COLUMNS, MAX_LIVE_BYTES = 64, 8192
+MAX_LIVE_COLUMNS, MAX_LIVE_BYTES = 256, 16_384
 """Columns of one message, and bytes of it."""
 LIVE_CHANNELS = "position", "error", "voltage"
 """Channels of a column: m or rad, the same (reference less position), and the command to the motor."""

@@ -20,6 +20,8 @@ _SHOWN_S = 60.0
 _STALE_S, _ALLOWED_S = 3.0, 40.0
 """s without a column after which the view is stale; s since the edge was last heard here for which its file counts as
 one that allows the view: longer than its longest wait."""
+_NOTHING: LiveColumn = (None, None, None, None, None, None)
+"""Stands for a column that the edge could not send."""
 _POLLS = 2
 """Edges of one servo that may wait at once: one that was superseded may not have noticed yet."""
 
@@ -116,9 +118,11 @@ class LiveViews:
             return False
         if not sent.columns:
             return True
-        if (sent.boot, sent.width) != (view.boot, view.width) or sent.first != view.next:
-            # After a gap the columns would not follow each other.
+        missing = sent.first - view.next
+        if (sent.boot, sent.width) != (view.boot, view.width) or not 0 <= missing < (view.columns.maxlen or 0):
             view.columns.clear()
+        elif view.columns:
+            view.columns.extend([_NOTHING] * missing)
         view.columns.extend(sent.columns)
         view.boot, view.width, view.next = sent.boot, sent.width, sent.first + len(sent.columns)
         view.came = self._now()
