@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from servotwin.dashboard.assets import INDEX, REPORT_SECURITY, SECURITY, Asset, assets
 from servotwin.dashboard.machine_metrics import machine_metrics
+from servotwin.dashboard.rest import at_rest
 from servotwin.dashboard.series import machine_series, table_csv
 from servotwin.dashboard.window_view import MAX_POINTS, channel_series, sample_range, window_columns
 from servotwin.errors import InvalidInput
@@ -164,7 +165,7 @@ class DashboardApi:
         window = (SERVO, BOOT, SEQUENCE)
         channels = operation(
             "Channels of a window for a screen: least and greatest sample of each column",
-            {200: ("Every sample, where there are at most four a column.", JSON)},
+            {200: ("Every sample, where there are at most four a column; rest: a word on the window's end.", JSON)},
             (
                 *window,
                 parameter("from", SECONDS, "Only samples from then on, s after the first."),
@@ -302,6 +303,7 @@ def _channels(stored: StoredMessage, part: tuple[float | None, float | None], po
         "reason": window.reason,
         "version": window.parameter_version,
         "channels": channel_series(window, selected, points),
+        "rest": at_rest(window) if part == (None, None) else None,
     }
 
 

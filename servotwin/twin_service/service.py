@@ -174,7 +174,7 @@ class TwinService:
         dashboard = DashboardApi(
             self.operators, self.store, self._readers, self._reader, self.feed, self.config.machine_metrics
         )
-        what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
+        what_if = WhatIfApi(self.operators, self.store, self._readers, self.what_if, self.clocks.monotonic)
         acts = ActsApi(
             self.operators, self.store, self._readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
             self.clocks.monotonic,

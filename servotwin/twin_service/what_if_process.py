@@ -25,7 +25,7 @@ from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.worker import WorkerLost, WorkerProcess, WorkerStart
 
 _COMMAND = (sys.executable, "-m", "servotwin.twin_service.what_if_process")
-_ANSWER_S, _IDLE_S, _LOOK_S = 5.0, 300.0, 15.0
+_ANSWER_S, _IDLE_S, _LOOK_S = 10.0, 300.0, 15.0
 """s for one answer; s without a question after which the process ends; s between two looks."""
 _WAITING = 8
 """Questions that may wait, beside the one that is answered."""
@@ -33,10 +33,20 @@ _NICENESS = 5
 
 
 class WhatIfQuestion(NamedTuple):
-    """A question about a servo: the body of the request, JSON."""
+    """A question about a servo.
+
+    Attributes
+    ----------
+    servo : str
+    body : bytes
+        Of a simulated step: the body of the request, JSON. Of a residual: a `StoredFit`, MessagePack.
+    residual : bool
+        True: the residual of a stored window is asked for, not a simulated step.
+    """
 
     servo: str
     body: bytes
+    residual: bool = False
 
 
 class WhatIfReply(NamedTuple):
@@ -72,8 +82,8 @@ class WhatIfProcess:
         """Process id, while the process runs."""
         return None if self._process is None else self._process.pid
 
-    async def answer(self, servo: str, body: bytes) -> bytes:
-        """Answer a question, JSON for JSON.
+    async def answer(self, servo: str, body: bytes, residual: bool = False) -> bytes:
+        """Answer a question, as `WhatIfQuestion` describes it, in JSON.
 
         Raises
         ------
@@ -85,7 +95,7 @@ class WhatIfProcess:
         self._asked += 1
         try:
             async with self._turn:
-                reply = await self._replied(_encode(WhatIfQuestion(servo, body)))
+                reply = await self._replied(_encode(WhatIfQuestion(servo, body, residual)))
         finally:
             self._asked -= 1
             self._used = self._monotonic()
@@ -156,14 +166,19 @@ def _replied(answer: Callable[[WhatIfQuestion], bytes], question: WhatIfQuestion
 
 
 def _load(start: bytes) -> Callable[[WhatIfQuestion], bytes]:
+    from servotwin.dashboard.map_position import CoarseMaps
+    from servotwin.dashboard.residual_view import StoredFit, residual_view
     from servotwin.dashboard.what_if import read_what_if, simulated_step
     from servotwin.twin.model_registry import ModelRegistry
 
     file = msgspec.msgpack.decode(start, type=WorkerStart)
-    registry = ModelRegistry.loads(file.text, file.source, Path(file.folder))
+    registry, maps = ModelRegistry.loads(file.text, file.source, Path(file.folder)), CoarseMaps()
 
     def answer(question: WhatIfQuestion) -> bytes:
-        return msgspec.json.encode(simulated_step(registry.model_of(question.servo), read_what_if(question.body)))
+        if question.residual:
+            return msgspec.json.encode(residual_view(msgspec.msgpack.decode(question.body, type=StoredFit)))
+        asked = read_what_if(question.body)
+        return msgspec.json.encode(simulated_step(registry.model_of(question.servo), asked, maps))
 
     return answer
 

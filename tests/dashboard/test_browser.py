@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -152,6 +153,11 @@ def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
     has_text(page, ".fact", "limit 20.0 deg")
     page.wait_for_selector(".hysteresis svg")
     assert page.locator(".uplot").count() == 6
+    page.locator("[aria-label=Window] p.mark", has_text=re.compile("imit cycle|still swings")).wait_for()
+    page.click("[aria-label=Residual] button")
+    has_text(page, "[aria-label=Residual] p", "autocorrelations lie outside the 95 % band")
+    assert page.locator("[aria-label=Residual] .uplot").count() == 2
+    has_text(page, "[aria-label=Live] p", "The edge is not connected")
     has_text(page, "[aria-label=Updates] tbody tr", "applied it")
     assert page.locator("[aria-label=Updates] tbody tr").count() == 4
     has_text(page, "[aria-label='Behind the last update']", "not simulated")
@@ -173,9 +179,13 @@ def test_a_step_is_tried_on_the_model(open_page):
     panel.locator("text=Try on the model").click()
     panel.locator("text=exactly simulated on the model").wait_for()
     assert panel.locator(".uplot").count() == 2
-    before = panel.locator(".soft").first.inner_text()
+    panel.locator(".map-words", has_text="The nearest cell").wait_for()
+    assert panel.locator(".map rect").count() == 121
+    panel.locator(".map-words", has_text=re.compile(r"settles from \d of 4 starts\.$")).wait_for()
+    before, place = panel.locator(".soft").first.inner_text(), panel.locator(".map-words").inner_text()
     panel.locator("label", has_text="k_DZ").locator("input").fill("300")
     panel.locator(".soft", has_text=before).first.wait_for(state="detached")
+    panel.locator(".map-words", has_text=place).wait_for(state="detached")
     assert serious_faults(page) == []
     page.set_viewport_size({"width": 360, "height": 740})
     assert page.evaluate("document.documentElement.scrollWidth") <= 360

@@ -7,6 +7,7 @@ import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
 import { LiveViewPanel } from "./live_view.js";
+import { ResidualPanel } from "./residual.js";
 import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
@@ -28,6 +29,7 @@ export class MachinePage {
     clearInterval(this.ages);
     clearTimeout(this.timer);
     this.liveView.close();
+    this.whatIf.close();
     for (const plot of this.plots) plot.close();
   }
 
@@ -60,6 +62,7 @@ export class MachinePage {
     this.rate = element("button", { type: "button", on: { click: () => this.loadWindow(EVERY) } }, "Every sample");
     this.windowFile = element("a", { download: true }, "CSV");
     this.windowNote = element("p", { class: "soft" });
+    this.rest = element("p", { role: "status" });
     this.loop = element("div", { class: "hysteresis" });
     this.chain = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Updates" });
     this.proof = element("div");
@@ -71,6 +74,8 @@ export class MachinePage {
     };
     this.whatIf = new WhatIfPanel(name, () => this.start());
     this.liveView = new LiveViewPanel(name, () => this.gaps?.machine);
+    const chosen = () => (this.shown ? this.shown.split("/") : null);
+    this.residualPanel = new ResidualPanel(name, chosen, () => positionUnit(this.gaps.machine).name === "deg");
     this.acts = new ActsPanel(name, () => this.later());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
@@ -79,7 +84,7 @@ export class MachinePage {
         legend(["blue", "estimate"], ["blue band", "95 % interval"], ["green", "wear (trend)"], ["red dash", "limit"], ["orange", "version applied"], ["red dots", "version refused, or fallback"]),
         places.gap),
       panel("Live", [], ...this.liveView.content),
-      panel("Window", [this.choice, this.rate, this.windowFile], this.windowNote,
+      panel("Window", [this.choice, this.rate, this.windowFile], this.windowNote, this.rest,
         element("div", { class: "pair" },
           element("div", {},
             legend(["orange", "reference"], ["blue", "position"]), places.position,
@@ -88,6 +93,7 @@ export class MachinePage {
           element("div", {}, element("h3", {}, "Hysteresis"),
             element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
             this.loop))),
+      panel("Residual", this.residualPanel.tools, ...this.residualPanel.content),
       panel("What if", this.whatIf.tools, ...this.whatIf.content),
       panel("Did it help?", [],
         legend(["blue", "of each window"], ["orange", "version applied"]),
@@ -101,7 +107,7 @@ export class MachinePage {
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
     this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
     this.makePlots(plot, places);
-    this.plots.push(...this.whatIf.plots, ...this.liveView.plots);
+    this.plots.push(...this.whatIf.plots, ...this.liveView.plots, ...this.residualPanel.plots);
   }
 
   // Where a trial on the model begins: at what is known of the machine.
@@ -256,6 +262,7 @@ export class MachinePage {
       this.showWindow(window);
     } catch (error) {
       if (this.closed) return;
+      setText(this.rest, "");
       setText(this.windowNote, error.status === 404 ? "The samples of this window are no longer stored." : error.message);
       this.loop.replaceChildren();
       for (const plot of [this.positionPlot, this.motorPlot, this.voltagePlot]) if (plot.data) plot.show([[], ...plot.data.slice(1).map(() => [])], "no samples");
@@ -291,6 +298,7 @@ export class MachinePage {
     const every = kept >= window.samples;
     this.rate.disabled = every;
     setText(this.windowNote, `${duration(window.samples / window.rate)} at ${brief(window.rate)} Hz, sent for: ${window.reason}; version ${window.version} in force. ${every ? "Every sample is shown." : "The least and greatest sample of each column are shown."} Drag to look closer, double click for all.`);
+    if (window.rest) this.showRest(window.rest, unit);
     this.positionPlot.options.yLabel = `Position (${unit.name})`;
     const joined = (first, second) => uPlot.join([first, second].map((each) => (each ? [each.time, each.values] : [[], []])));
     const stretch = (data, factors) => [data[0], ...data.slice(1).map((values, i) => filled(values).map((value) => (value === null ? null : value * factors[i])))];
@@ -300,6 +308,19 @@ export class MachinePage {
     this.voltagePlot.options.yLabel = `Command (${machine.command_unit})`;
     this.voltagePlot.show(command ? [command.time, command.values] : [[], []], `Command in ${machine.command_unit}`);
     this.showLoop(motor, position, machine);
+  }
+
+  // The limit-cycle indicator.
+  showRest({ word, swing, frequency, seconds }, unit) {
+    const over = `in the ${brief(seconds)} s after the last step`, size = swing === null ? "" : `± ${brief(swing * unit.factor)} ${unit.name}`;
+    const [mark, words] = {
+      rest: ["good", `No limit cycle: the load comes to rest ${over}, within ${size}.`],
+      "limit cycle": ["bad", `Limit cycle: ${over} the load goes on swinging by ${size}${frequency === null ? "" : ` at ${brief(frequency)} Hz`}.`],
+      "swings down": ["none", `The load still swings, but less and less: ${size} at the end, ${brief(frequency)} Hz.`],
+      "not seen": ["none", "The window does not tell whether there is a limit cycle: the reference moves, or the time after its last step is too short."],
+    }[word];
+    this.rest.className = `mark ${mark}`;
+    setText(this.rest, words);
   }
 
   showLoop(motor, position, machine) {
