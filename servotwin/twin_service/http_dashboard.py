@@ -283,13 +283,13 @@ class DashboardApi:
 
     async def _get_channels_csv(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)
-        text = await self._executor.run(lambda: table_csv(window_columns(_decoded(stored))))
+        text = await self._executor.run(lambda: table_csv(window_columns(decoded_window(stored))))
         servo, boot, sequence = (request.path[key] for key in ("servo", "boot", "sequence"))
         return _csv(text, f"{servo}-{boot}-{sequence}.csv")
 
 
 def _channels(stored: StoredMessage, part: tuple[float | None, float | None], points: int) -> dict[str, Any]:
-    window = _decoded(stored)
+    window = decoded_window(stored)
     try:
         selected = sample_range(window, *part)
     except InvalidInput as error:
@@ -307,7 +307,7 @@ def _channels(stored: StoredMessage, part: tuple[float | None, float | None], po
     }
 
 
-def _decoded(stored: StoredMessage) -> WindowMessage:
+def decoded_window(stored: StoredMessage) -> WindowMessage:
     """Decode a stored window; raises RequestRejected where it cannot be read."""
     try:
         window = decode(decompress(stored.body, stored.encoding, MAX_BYTES))

@@ -19,7 +19,7 @@ from servotwin.twin_service.limits import RateLimiter, RequestRejected
 from servotwin.twin_service.openapi import BOOT, JSON, QUERY_ERRORS, SEQUENCE, SERVO, operation
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
-from servotwin.twin_service.what_if_process import WhatIfProcess
+from servotwin.twin_service.what_if_process import QuestionKind, WhatIfProcess
 
 _BODY_BYTES, _BODY_S = 4096, 10.0
 _NOT_ESTIMATED = "this window was not estimated: screening was enough, or it waits for its turn"
@@ -84,7 +84,7 @@ class WhatIfApi:
         stored = await stored_window(self._operators, self._store, self._executor, request)
         key = request.path["boot"], int(request.path["sequence"])
         fit = await store_query(self._executor, partial(_stored_fit, self._store, servo, key, stored))
-        return _fresh(await self._process.answer(servo, msgspec.msgpack.encode(fit), residual=True))
+        return _fresh(await self._process.answer(servo, msgspec.msgpack.encode(fit), QuestionKind.RESIDUAL))
 
 
 def _stored_fit(store: Store, servo: str, key: tuple[str, int], stored: StoredMessage) -> dict[str, object]:

@@ -35,6 +35,7 @@ from servotwin.twin_service.http_edge import EdgeApi, LongPolls
 from servotwin.twin_service.http_live import LiveApi
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
+from servotwin.twin_service.http_parquet import ParquetApi
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
@@ -180,7 +181,8 @@ class TwinService:
             self.clocks.monotonic,
         )  # fmt: skip
         live = LiveApi(self.gate, self.operators, self.claims, self.live_views, self.clocks.monotonic)
-        parts = edge, operator, dashboard, what_if, acts, live
+        parquet = ParquetApi(self.operators, self.store, self._readers, self.what_if)
+        parts = edge, operator, dashboard, what_if, acts, live, parquet
         routes = [route for part in parts for route in part.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)

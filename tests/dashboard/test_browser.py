@@ -147,7 +147,7 @@ def test_a_thousand_machines_are_sorted_filtered_searched_and_opened_with_the_ke
 
 
 def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
-    page = open_page()
+    page = open_page(expected=("status of 400",))
     open_machine(page, WEARING)
     has_text(page, ".fact", "± 0.039")  # of the estimate that the co-simulation gives
     has_text(page, ".fact", "limit 20.0 deg")
@@ -170,6 +170,14 @@ def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
     with page.expect_download() as download:
         page.click("[aria-label='Gap over time'] a")
     assert download.value.path().read_text().startswith("received,sample_time,boot")
+    for panel, name in (("Gap over time", f"{WEARING}-gaps.parquet"), ("Window", f"{WEARING}-boot-1-2.parquet")):
+        with page.expect_download() as download:
+            page.click(f"[aria-label='{panel}'] button.plain")
+        assert download.value.suggested_filename == name
+        assert download.value.path().read_bytes()[:4] == b"PAR1"
+    page.route("**/gaps.parquet*", lambda route: route.fulfill(status=400, json={"detail": "it needs pyarrow"}))
+    page.click("[aria-label='Gap over time'] button.plain")
+    has_text(page, ".error", "No Parquet file: it needs pyarrow")
 
 
 def test_a_step_is_tried_on_the_model(open_page):

@@ -58,6 +58,7 @@ export class MachinePage {
     };
     this.alarms = element("ul", { class: "alarms", hidden: true, "aria-label": "Alarms of the last day" });
     this.trouble = element("p", { class: "error", role: "status" });
+    this.fileWords = element("p", { class: "error", role: "alert" });
     this.choice = element("select", { "aria-label": "Window", on: { change: () => this.pick(this.choice.value) } });
     this.rate = element("button", { type: "button", on: { click: () => this.loadWindow(EVERY) } }, "Every sample");
     this.windowFile = element("a", { download: true }, "CSV");
@@ -80,11 +81,11 @@ export class MachinePage {
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", {},
-      panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV")],
+      panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV"), this.saver(() => api.gapsFile(name, "parquet"))],
         legend(["blue", "estimate"], ["blue band", "95 % interval"], ["green", "wear (trend)"], ["red dash", "limit"], ["orange", "version applied"], ["red dots", "version refused, or fallback"]),
         places.gap),
       panel("Live", [], ...this.liveView.content),
-      panel("Window", [this.choice, this.rate, this.windowFile], this.windowNote, this.rest,
+      panel("Window", [this.choice, this.rate, this.windowFile, this.saver(() => this.windowFile.href.replace(/csv$/, "parquet"))], this.windowNote, this.rest,
         element("div", { class: "pair" },
           element("div", {},
             legend(["orange", "reference"], ["blue", "position"]), places.position,
@@ -105,7 +106,7 @@ export class MachinePage {
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
     this.tilesList = element("dl", { class: "facts" },
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
-    this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
+    this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.fileWords, this.blank, this.content);
     this.makePlots(plot, places);
     this.plots.push(...this.whatIf.plots, ...this.liveView.plots, ...this.residualPanel.plots);
   }
@@ -176,6 +177,22 @@ export class MachinePage {
       this.alarms.dataset.lines = lines.join("\n");
       this.alarms.replaceChildren(...lines.map((line) => element("li", {}, line)));
     }
+  }
+
+  // A button that saves a Parquet file, or says why there is none.
+  saver(path) {
+    const button = element("button", { type: "button", class: "plain", on: { click: () => saved() } }, "Parquet");
+    const saved = async () => {
+      button.disabled = true;
+      setText(this.fileWords, "");
+      try {
+        await api.save(path());
+      } catch (error) {
+        setText(this.fileWords, `No Parquet file: ${error.message}`);
+      }
+      button.disabled = false;
+    };
+    return button;
   }
 
   tile(key, value, notes) {
