@@ -67,6 +67,7 @@ export class TimePlot {
     const width = this.place.clientWidth;
     if (!width || !this.data) return;
     this.width = width;
+    this.rem = rem();
     this.plot = new uPlot({
       width, height: this.place.clientHeight || 240,
       legend: { show: false },
@@ -90,6 +91,7 @@ export class TimePlot {
   resize() {
     if (!this.plot) return this.make();
     const width = this.place.clientWidth;
+    if (this.rem !== rem()) return this.redraw(); // on another screen: fonts are fixed when a plot is made
     if (width && width !== this.width) {
       this.width = width;
       this.plot.setSize({ width, height: this.place.clientHeight || 240 });

@@ -5,7 +5,7 @@ import { legend, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { positionUnit } from "./format.js";
 
-const ASK_MS = 500, IDLE_MS = 4000, SHOWN_S = 30;
+const ASK_MS = 500, IDLE_MS = 3000, SHOWN_S = 30;
 const WORDS = {
   off: ["Off at the edge", "The edge's file does not allow it: live = true in its table [twin] would. Over MQTT, and with edges of earlier versions, there is no live view."],
   away: ["The edge is not connected", "The live view begins when it is."],

@@ -58,7 +58,7 @@ export class MachinePage {
     };
     this.alarms = element("ul", { class: "alarms", hidden: true, "aria-label": "Alarms of the last day" });
     this.trouble = element("p", { class: "error", role: "status" });
-    this.fileWords = element("p", { class: "error", role: "alert" });
+    this.fileWords = element("p", { class: "error brief", role: "alert" });
     this.choice = element("select", { "aria-label": "Window", on: { change: () => this.pick(this.choice.value) } });
     this.rate = element("button", { type: "button", on: { click: () => this.loadWindow(EVERY) } }, "Every sample");
     this.windowFile = element("a", { download: true }, "CSV");

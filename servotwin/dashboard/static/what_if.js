@@ -116,7 +116,7 @@ export class WhatIfPanel {
       ? "is being computed"
       : `settles from ${Math.round(share * map.starts)} of ${map.starts} starts`;
     const left = map.left ? ` ${map.left} cells are still being computed.` : "";
-    setText(this.place, `Dead zone ${brief(map.tolerance)} and step ${brief(map.step)}, each over half the travel in the gap. The nearest cell, ${near}, ${here}.${left}`);
+    setText(this.place, `Dead zone ${brief(map.tolerance)} and step ${brief(map.step)}, each over half the travel in the gap. The nearest cell, ${near}, ${here}. Darker cells settle from more starts.${left}`);
     const mark = { row: placeOf(map.tolerances, map.tolerance), column: placeOf(map.steps.map(Math.log), Math.log(map.step)) };
     this.map.replaceChildren(mapPlot(map.tolerances, map.steps, map.settled, mark, {
       xLabel: "Step over half the travel in the gap", yLabel: "Dead zone over the same",
