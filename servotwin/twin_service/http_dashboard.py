@@ -257,7 +257,8 @@ class DashboardApi:
     async def _get_gaps_csv(self, request: HttpRequest) -> HttpResponse:
         servo, limit, before = self._page_of(request)
         found = await store_query(self._executor, partial(self._gaps, servo, limit, before))
-        return _csv(table_csv(found["windows"]), f"{servo}-gaps.csv")
+        text = await self._executor.run(partial(table_csv, found["windows"]))
+        return _csv(text, f"{servo}-gaps.csv")
 
     def _page_of(self, request: HttpRequest) -> tuple[str, int, int | None]:
         servo = admitted_servo(self._operators, request)

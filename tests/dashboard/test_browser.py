@@ -1,5 +1,6 @@
 """The dashboard in Debian's Chromium: each page and state, accessibility, and pictures in build/screenshots."""
 
+import itertools
 import json
 import math
 import os
@@ -133,7 +134,7 @@ def test_a_thousand_machines_are_sorted_filtered_searched_and_opened_with_the_ke
     has_text(page, ".chips button", f"{OTHERS + 2} all")
     assert page.locator(".rows .row").count() < 60
     page.click(".heads [data-column=gap] button")
-    assert page.get_attribute(".heads [data-column=gap]", "aria-sort") == "descending"
+    page.wait_for_selector(".heads [data-column=gap][aria-sort=descending]")
     has_text(page, ".rows .row[aria-rowindex='2']", "m-0016")
     page.evaluate("scrollTo(0, document.body.scrollHeight)")
     has_text(page, ".rows .row", SILENT)  # what is unknown comes last
@@ -367,8 +368,30 @@ def test_text_from_outside_is_never_executed(open_page, twin):
     has_text(page, ".alarms li", "onerror")
 
 
+def test_seven_tabs_of_a_browser_share_one_stream(open_page, twin):
+    reaches(lambda: watchers(twin), 0)
+    page = open_page()
+    tabs = [page.context.new_page() for _ in range(6)]
+    for tab in tabs:
+        tab.goto(twin.url)
+        tab.wait_for_selector(".rows .row")
+        tab.wait_for_selector("[data-live=live]", state="attached")
+    assert watchers(twin) == 1
+    sent = window(7, SILENT)
+    assert httpx.put(twin.url + place(sent), content=encode(sent), headers=bearer(OTHER)).status_code == 201
+    for tab in (page, *tabs):
+        tab.fill(".search", SILENT)
+        tab.locator(".rows .row", has_text=SILENT).locator("[data-column=window]", has_text="s ago").wait_for()
+    for tab in tabs:
+        tab.close()
+    assert watchers(twin) == 1
+    page.close()
+    reaches(lambda: watchers(twin), 0)
+
+
 def test_a_malformed_event_keeps_the_last_good_data(open_page):
     page = open_page()
+    page.add_init_script("delete globalThis.SharedWorker")  # where there is none, each page has a stream of its own
     broken = "id: 1-1\nevent: rows\ndata: {broken\n\n"
     page.route("**/v1/fleet/events*", lambda route: route.fulfill(body=broken, content_type="text/event-stream"))
     page.reload()
@@ -390,6 +413,42 @@ def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):
     page.wait_for_selector("[data-live=live]", state="attached")
     assert page.evaluate("window.kept") == 1
     page.locator(".table:not(.stale)").wait_for()
+
+
+def test_an_answer_of_the_live_view_that_cannot_be_read_is_said_and_forgotten(open_page):
+    page = open_page()
+    answers = itertools.cycle(("{broken", "[1]", '{"state": "live"}'))
+    page.route("**/live?*", lambda route: route.fulfill(body=next(answers), content_type="application/json"))
+    open_machine(page, WEARING)
+    has_text(page, "[aria-label=Live] p", "The twin's answer cannot be read")
+    page.unroute("**/live?*")
+    has_text(page, "[aria-label=Live] p", "The edge is not connected")
+
+
+def test_a_browser_whose_clock_is_two_hours_slow_shows_the_twin_s_ages(open_page):
+    page = open_page()
+    page.add_init_script("const now = Date.now; Date.now = () => now() - 7.2e6;")
+    page.reload()
+    page.fill(".search", WEARING)
+    row = page.locator(".rows .row", has_text=WEARING)
+    row.locator("[data-column=window]", has_text=re.compile(r"^\d+ (s|min) ago")).wait_for()
+
+
+def test_a_session_that_has_ended_asks_for_the_token_and_keeps_what_is_shown(open_page):
+    page = open_page(expected=("status of 401",))
+    open_machine(page, WEARING)
+    page.wait_for_selector(".hysteresis svg")
+    page.context.clear_cookies()
+    page.select_option("[aria-label=Window] select", index=1)
+    page.wait_for_selector("#token")
+    has_text(page, "#state", "session has ended")
+    assert page.locator("[aria-label=Window] .uplot").count() == 3
+    has_text(page, "[aria-label=Window] p", "What is shown is the window before")
+    assert page.is_visible(".hysteresis svg")
+    page.fill("#token", OPERATOR)
+    page.press("#token", "Enter")
+    page.wait_for_selector("[data-live=live]", state="attached")
+    page.locator("#login").wait_for(state="hidden")
 
 
 def test_a_revoked_token_ends_the_session(open_page, twin):

@@ -74,8 +74,8 @@ export class TimePlot {
       cursor: { sync: options.sync ? { key: options.sync } : undefined, drag: { x: true, y: false } },
       scales: { x: { time: Boolean(options.time) }, y: { range: options.range && ((_, low, high) => options.range(low, high)) } },
       axes: [
-        axis(options.xLabel, options.time ? 46 : 34, { values: options.time ? [...TIME_FORMATS] : undefined }),
-        axis(options.yLabel, 58, { values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
+        axis(options.xLabel, options.time ? 46 : 34, { space: (options.time ? 75 : 52) * rem(), values: options.time ? [...TIME_FORMATS] : undefined }),
+        axis(options.yLabel, 58, { space: 30 * rem(), values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
       ],
       series: [{}, ...options.series.map((each) => ({
         label: each.label, stroke: colour(each.color), width: each.width ?? 1.6, dash: each.dash, spanGaps: Boolean(each.spanGaps),

@@ -50,6 +50,7 @@ export class LiveViewPanel {
     let wait = IDLE_MS;
     try {
       const found = await api.live(this.name, this.boot, Math.max(0, this.newest));
+      if (!WORDS[found?.state] || !Array.isArray(found.columns)) throw new Error("The twin's answer cannot be read.");
       this.say(found.state, found.state === "stale" ? `The newest sample is ${Math.round(found.age)} s old.` : null);
       if (found.state === "live" || found.state === "waiting" || found.state === "stale") wait = ASK_MS;
       if (found.columns.length) this.take(found);

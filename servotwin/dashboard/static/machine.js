@@ -271,6 +271,7 @@ export class MachinePage {
   async loadWindow(points) {
     const key = this.choice.value, [boot, sequence] = key.split("/");
     this.windowFile.href = `${api.windowPath(this.name, boot, sequence)}/channels.csv`;
+    const before = this.shown;
     this.shown = key;
     try {
       let window = await api.channels(this.name, boot, sequence, points);
@@ -279,11 +280,18 @@ export class MachinePage {
       this.showWindow(window);
     } catch (error) {
       if (this.closed) return;
+      if (error.status !== 404) {
+        // What was shown stays; the next refresh tries again.
+        this.shown = before;
+        setText(this.windowNote, before ? `${error.message} What is shown is the window before.` : error.message);
+        if (error.status === 401) this.live.end(error.message);
+        else this.later();
+        return;
+      }
       setText(this.rest, "");
-      setText(this.windowNote, error.status === 404 ? "The samples of this window are no longer stored." : error.message);
+      setText(this.windowNote, "The samples of this window are no longer stored.");
       this.loop.replaceChildren();
       for (const plot of [this.positionPlot, this.motorPlot, this.voltagePlot]) if (plot.data) plot.show([[], ...plot.data.slice(1).map(() => [])], "no samples");
-      if (error.status === 401) this.live.end(error.message);
     }
   }
 
