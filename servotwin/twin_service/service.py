@@ -37,6 +37,7 @@ from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.http_parquet import ParquetApi
 from servotwin.twin_service.http_server import BodyReader
+from servotwin.twin_service.http_webhook import WebhookApi
 from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
@@ -182,7 +183,8 @@ class TwinService:
         )  # fmt: skip
         live = LiveApi(self.gate, self.operators, self.claims, self.live_views, self.clocks.monotonic)
         parquet = ParquetApi(self.operators, self.store, self._readers, self.what_if)
-        parts = edge, operator, dashboard, what_if, acts, live, parquet
+        webhook = WebhookApi(self.operators, self.config.webhook, self.clocks.monotonic)
+        parts = edge, operator, dashboard, what_if, acts, live, parquet, webhook
         routes = [route for part in parts for route in part.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)

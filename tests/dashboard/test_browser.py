@@ -234,6 +234,19 @@ def test_an_engineer_holds_a_machine_with_a_reason_and_an_operator_sees_who(open
     assert reader.locator("[aria-label='Oversight'] tbody tr").count() == 2
 
 
+def test_an_engineer_tests_the_webhook_and_an_operator_is_not_offered_it(open_page):
+    page = open_page(login=ENGINEER, expected=("status of 404",))
+    assert not page.is_visible("text=Test the alarm webhook")  # this twin posts no alarms
+    page.route("**/v1/webhook", lambda route: route.fulfill(json={"host": "hook.example", "may_test": True}))
+    page.reload()
+    page.click("text=Test the alarm webhook")
+    has_text(page, ".head [role=status]", "has no [service.webhook]")
+    taken = {"host": "hook.example", "status": 204}
+    page.route("**/v1/webhook/test", lambda route: route.fulfill(json=taken))
+    page.click("text=Test the alarm webhook")
+    has_text(page, ".head [role=status]", "hook.example took the test (status 204)")
+
+
 def test_states_without_data_are_said_in_words(open_page):
     page = open_page(expected=("status of 404",))
     open_machine(page, SILENT)
