@@ -1,5 +1,6 @@
 """`servotwin up` with real processes: it runs, ends, resumes, and leaves nothing behind, however it ends."""
 
+import json
 import os
 import signal
 import subprocess
@@ -8,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import pytest
 from typer.testing import CliRunner
@@ -93,6 +95,14 @@ def times(path: Path) -> list[float]:
     return [0.0 if state is None else state.time_s for state in states]
 
 
+def live_state(url: str, token: str, servo: str) -> str:
+    """State of a machine's live view, for a page that asks."""
+    headers = {"authorization": f"Bearer {token}"}
+    with urlopen(Request(f"{url}/v1/servos/{servo}/live", headers=headers), timeout=20.0) as answer:
+        state: str = json.load(answer)["state"]
+    return state
+
+
 def stored(path: Path) -> dict[str, set[str]]:
     """The numbers of the boots of which the twin has windows, by servo: b1 is the first."""
     store = open_store(f"sqlite:///{path / 'twin.db'}")
@@ -134,7 +144,11 @@ def test_it_continues_after_a_signal_and_after_a_kill(tmp_path: Path, monkeypatc
         second.kill()
         second.wait()
         with started(path, "--speed", "10") as third:
-            lines_until(third, RUNNING)
+            begun = lines_until(third, RUNNING)
+            # Both roles show their samples live, as their files allow it.
+            url = next(line.split()[-1] for line in begun if line.startswith("twin: listening on "))
+            token = (path / "operator.token").read_text().strip()
+            assert eventually(lambda: all(live_state(url, token, servo.name) == "live" for servo in STARTED))
             # However slow this machine: each servo's windows come from a boot after the first.
             assert eventually(lambda: all(boots - {"b1"} for boots in stored(path).values()))
             third.send_signal(signal.SIGINT)
