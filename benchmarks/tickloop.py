@@ -1,14 +1,18 @@
 """The edge's real control loop against a drive that keeps to the clock, in a process of its own; prints JSON.
 
-`python -m benchmarks.tickloop RATE SECONDS MOVING PRIORITY FOLDER`: numpy is not imported, as on a real edge.
+`python -m benchmarks.tickloop RATE SECONDS MOVING PRIORITY FOLDER [LIVE]`: numpy is not imported, as on a real edge.
+LIVE is "allowed" where the samples lie in shared memory, and "watched" where a process reads them for a live view.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from math import sin
 from pathlib import Path
@@ -18,7 +22,7 @@ from servotwin.control.controller import Controller
 from servotwin.edge.drive import DriveSample
 from servotwin.edge.outlet import CHANNELS, pack
 from servotwin.edge.parameters import FallbackSet
-from servotwin.edge.recorder import Cut, as_floats
+from servotwin.edge.recorder import Cut, Recorder, as_floats
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.watch import WatchSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig
@@ -29,8 +33,10 @@ from servotwin.edge_process.link_child import LinkChild, link_command
 from servotwin.edge_process.monitoring import TickHistogram, summarise
 from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.edge_process.run import set_realtime_priority, tame_garbage_collector
+from servotwin.edge_process.shared_samples import MakeRecorder, SampleMemory
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Band, Setting
+from servotwin.runtime.service_manager import ServiceManager
 
 STEP_S = 2.0
 _REPEATS = 20
@@ -103,14 +109,36 @@ def config(rate: float, folder: Path) -> EdgeConfig:
     return EdgeConfig(agent, "control", law, {"kind": "simulated"}, folder=folder)
 
 
-def measured(rate: float, seconds: float, moving: bool, priority: int, folder: Path) -> dict[str, Any]:
+@contextmanager
+def live_recorder(rate: float, live: str) -> Iterator[MakeRecorder]:
+    """Ring buffers as an edge's file allows them; watched: read as a link process does, by a process of its own."""
+    if not live:
+        yield Recorder
+        return
+    memory = SampleMemory(round(3.0 * rate))
+    command = [sys.executable, "-m", "benchmarks.live_reader", str(memory.descriptor), str(rate)]
+    reader = subprocess.Popen(command, pass_fds=(memory.descriptor,)) if live == "watched" else None
+    try:
+        yield memory.recorder
+    finally:
+        if reader is not None:
+            reader.kill()
+            reader.wait()
+        memory.close()
+
+
+def measured(
+    rate: float, seconds: float, moving: bool, priority: int, folder: Path, recorder: MakeRecorder = Recorder
+) -> dict[str, Any]:
     """Measure one run."""
     settings = config(rate, folder)
     file = folder / "edge.toml"
     file.write_text(edge_toml(settings), encoding="utf-8")
     drive, outlet = PacedDrive(rate, seconds, moving), PipeOutlet(False)
     child = LinkChild(link_command(file, "bench"), outlet)
-    edge = EdgeRuntime(settings, "bench", outlet, child, None, time.perf_counter, time.sleep)
+    edge = EdgeRuntime(
+        settings, "bench", outlet, child, None, time.perf_counter, time.sleep, ServiceManager({}), recorder
+    )
     role = ControlRole(edge, drive)
     child.check(edge.clock())
     time.sleep(1.0)  # until it listens: its start is not what is measured
@@ -156,7 +184,9 @@ def main(arguments: list[str]) -> None:
     """Measure, print."""
     rate, seconds, moving, priority = float(arguments[0]), float(arguments[1]), arguments[2] == "1", int(arguments[3])
     folder = Path(arguments[4])
-    print(json.dumps({**measured(rate, seconds, moving, priority, folder), **handling(rate, folder)}))
+    with live_recorder(rate, arguments[5] if len(arguments) > 5 else "") as recorder:
+        run = measured(rate, seconds, moving, priority, folder, recorder)
+    print(json.dumps({**run, **handling(rate, folder)}))
 
 
 if __name__ == "__main__":

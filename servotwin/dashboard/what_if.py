@@ -10,6 +10,7 @@ import numpy as np
 
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.control.laws import AnyController
+from servotwin.dashboard.map_position import CoarseMaps
 from servotwin.dashboard.window_view import envelope_indices
 from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains
@@ -75,8 +76,15 @@ def read_what_if(body: bytes) -> WhatIf:
     return asked
 
 
-def simulated_step(model: ServoModel, asked: WhatIf) -> dict[str, Any]:
+def simulated_step(model: ServoModel, asked: WhatIf, maps: CoarseMaps | None = None) -> dict[str, Any]:
     """Simulate a step from rest, the load in the middle of its gap.
+
+    Parameters
+    ----------
+    model : ServoModel
+    asked : WhatIf
+    maps : CoarseMaps, optional
+        The answer then has the place in the stability map, as `CoarseMaps.position` gives it, under `map`.
 
     Returns
     -------
@@ -119,6 +127,7 @@ def simulated_step(model: ServoModel, asked: WhatIf) -> dict[str, Any]:
         "sensitivity_peak": _sensitivity_peak(servo, law),
         **_series(run),
         **_figures(run, step, tolerance),
+        **({} if maps is None else {"map": maps.position(servo, law, asked.gap, tolerance, step)}),
     }
 
 

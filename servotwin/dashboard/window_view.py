@@ -83,6 +83,12 @@ def channel_series(window: WindowMessage, part: SampleRange, points: int) -> lis
     return shown
 
 
+def whole_channel(window: WindowMessage, name: str) -> array[float] | None:
+    """Every sample of a channel; None: the window has none of that name."""
+    channel = window.channel(name)
+    return None if channel is None else _samples(window, channel, SampleRange(0, window.samples))
+
+
 def _samples(window: WindowMessage, channel: Channel, part: SampleRange) -> array[float]:
     values = unpack_channel(_cut(channel, part))
     fine = window.channel(channel.name + FINE)

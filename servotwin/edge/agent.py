@@ -11,6 +11,7 @@ Such a move begins while the reference rests, and ends by itself, or at once whe
 
 from array import array
 from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from math import inf
 from typing import NamedTuple
@@ -73,6 +74,8 @@ class Agent:
         Stores the last parameters under which the loop kept its band; without one each boot begins as configured.
     outlet : Outlet, optional
         Takes the cut windows; by default they are put into `outbox`.
+    recorder : callable, optional
+        Makes the ring buffer from names and capacity.
     """
 
     def __init__(
@@ -81,12 +84,13 @@ class Agent:
         outbox: Outbox | None = None,
         store: ParameterStore | None = None,
         outlet: Outlet | None = None,
+        recorder: Callable[[Sequence[str], int], Recorder] = Recorder,
     ) -> None:
         self.settings = settings
         self.windows_cut = 0
         self.outlet = LocalOutlet(settings, outbox) if outlet is None else outlet
         capacity = max(settings.longest_samples + 1, settings.period_samples, settings.rest_samples)
-        self._recorder = Recorder(tuple(CHANNELS), capacity)
+        self._recorder = recorder(tuple(CHANNELS), capacity)
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outlet.unacknowledged:
             self._supervisor.window_sent(0.0)

@@ -100,8 +100,7 @@ class Recorder:
         InvalidInput
             Some of them are not recorded yet, or overwritten.
         """
-        if not self.oldest <= first < last <= self.samples:
-            raise InvalidInput(f"samples {first} to {last}: {self.oldest} to {self.samples} are in the recorder")
+        self._check(first, last)
         return {name: self._read(ring, first, last) for name, ring in zip(self.names, self._rings, strict=True)}
 
     def constant(self, name: str, count: int) -> float | None:
@@ -110,6 +109,10 @@ class Recorder:
             return None
         values = set(self.cut(self.samples - count, self.samples)[name])
         return values.pop() if len(values) == 1 else None
+
+    def _check(self, first: int, last: int) -> None:
+        if not self.oldest <= first < last <= self.samples:
+            raise InvalidInput(f"samples {first} to {last}: {self.oldest} to {self.samples} are in the recorder")
 
     def _write(self, ring: "array[float]", block: "array[float]", end: int) -> None:
         """Write a block of at most `capacity` samples, the last of which has index `end` - 1."""

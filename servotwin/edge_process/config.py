@@ -52,6 +52,14 @@ class TwinLink:
         str | None, key(help="File of mode 0600 with the user's password; either this or password_env.")
     ] = None
     password_env: Annotated[str | None, key(help="Environment variable with the user's password.")] = None
+    live: Annotated[
+        bool,
+        key(
+            help="While somebody watches the machine on the twin's dashboard, send the least and greatest position, "
+            "error and voltage of each 100 ms; over HTTP only.",
+            later=True,
+        ),
+    ] = False
 
     def __post_init__(self) -> None:
         if not (self.over_mqtt or _is_http(self.url)):
@@ -63,6 +71,8 @@ class TwinLink:
             raise InvalidInput(f"user = {self.user!r} is for a broker, mqtt(s)://host[:port]; url is {self.url!r}")
         if (self.password_file, self.password_env).count(None) != (2 if self.user is None else 1):
             raise InvalidInput("user and one of password_file and password_env belong together")
+        if self.live and self.over_mqtt:
+            raise InvalidInput(f"live = true works over http(s):// only; url is {self.url!r}")
         if (self.token_file is None) == (self.token_env is None):
             raise InvalidInput("token_file or token_env is needed, and only one of them")
         check(self)

@@ -16,11 +16,13 @@ from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.parameters import Parameters
+from servotwin.edge.recorder import Recorder
 from servotwin.edge.store import StoredParameters
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.frames import StatusFrame, Value
 from servotwin.edge_process.monitoring import TickHistogram, log
 from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.edge_process.shared_samples import MakeRecorder
 from servotwin.runtime.service_manager import ServiceManager
 
 Clock = Callable[[], float]
@@ -68,6 +70,8 @@ class EdgeRuntime:
         Returns monotonic seconds; waits for a number of seconds.
     manager : ServiceManager, optional
         Gets a sign of life while samples, or tries to reach the drive, follow each other.
+    recorder : callable, optional
+        Makes the ring buffer of each boot.
 
     Attributes
     ----------
@@ -85,13 +89,14 @@ class EdgeRuntime:
         clock: Clock,
         pause: Callable[[float], None],
         manager: ServiceManager | None = None,
+        recorder: MakeRecorder = Recorder,
     ) -> None:
         self.config, self.clock, self.pause = config, clock, pause
         self.counts: Counter[str] = Counter()
         self.due: int | None = None
         self.ticks = TickHistogram()
         self._boot, self._boots = boot, 0
-        self._outlet, self._child = outlet, child
+        self._outlet, self._child, self._recorder = outlet, child, recorder
         self._manager = manager or ServiceManager({})
         self._check_due = self._status_due = clock()
         self.agent = self._new_agent(first)
@@ -186,7 +191,8 @@ class EdgeRuntime:
         boot = f"{self._boot}.{self._boots}" if self._boots else self._boot
         self._outlet.boot = boot
         settings = replace(self.config.agent, boot=boot)
-        agent = Agent(settings, store=_LinkParameterStore(first, self._outlet), outlet=self._outlet)
+        store = _LinkParameterStore(first, self._outlet)
+        agent = Agent(settings, store=store, outlet=self._outlet, recorder=self._recorder)
         self._outlet.send_letter(agent.hello())
         log("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.setting.tolerance)
         return agent

@@ -17,12 +17,23 @@ Start = Callable[[socket.socket], ChildProcess]
 _END_S = 10.0
 
 
-def link_command(file: Path, run: str) -> Start:
-    """Return a function that starts a link process for an `edge.toml`, in a run of the edge; no argument is secret."""
+def link_command(file: Path, run: str, samples: int | None = None) -> Start:
+    """Return a function that starts a link process; no argument is secret.
+
+    Parameters
+    ----------
+    file : Path
+        The `edge.toml`.
+    run : str
+        Run of the edge.
+    samples : int, optional
+        Descriptor of the memory with the samples, for the live view.
+    """
+    shared = () if samples is None else (samples,)
 
     def start(end: socket.socket) -> ChildProcess:
         command = [sys.executable, "-m", "servotwin.edge_process.link_process", str(file), str(end.fileno()), run]
-        return ChildProcess(command, pass_fds=(end.fileno(),))
+        return ChildProcess([*command, *map(str, shared)], pass_fds=(end.fileno(), *shared))
 
     return start
 

@@ -1,6 +1,7 @@
 """The link process: it filters, packs, stores, sends and receives, so that the control process never waits.
 
-`python -m servotwin.edge_process.link_process edge.toml FD RUN`; it ends when the other end of the socket FD is closed.
+`python -m servotwin.edge_process.link_process edge.toml FD RUN [SAMPLES]`; it ends when the other end of the socket FD
+is closed. SAMPLES is the descriptor of the memory with the samples, for the live view.
 
 `frame_handler` takes the control process's frames.
 """
@@ -26,10 +27,13 @@ from servotwin.edge_process import frames
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
+from servotwin.edge_process.live_view import LiveView
 from servotwin.edge_process.metrics import write_metrics
 from servotwin.edge_process.monitoring import TroubleLog, log, overwrite_status, read_status, summarise, write_status
-from servotwin.edge_process.transports import exclusive_transport, link_token
+from servotwin.edge_process.shared_samples import SampleReader
+from servotwin.edge_process.transports import exclusive_transport, link_token, live_link
 from servotwin.errors import InvalidInput
+from servotwin.link.claim import ExclusiveTransport
 from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
@@ -54,9 +58,11 @@ class LinkProcess:
         To the control process.
     run : str
         Name of the control process's run, which claims the servo.
+    samples : SampleReader, optional
+        Samples for the live view.
     """
 
-    def __init__(self, config: EdgeConfig, end: socket.socket, run: str) -> None:
+    def __init__(self, config: EdgeConfig, end: socket.socket, run: str, samples: SampleReader | None = None) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
         self.outbox = _outbox(config)
         self.outbox.flush()
@@ -70,6 +76,7 @@ class LinkProcess:
             self._sender = Sender(self._session, self._transport)
             self._receiver = Receiver(self._transport, config.agent.servo, self._token, cursor, retry, random.random)
         self._outbox_changed, self._stopping = Event(), Event()
+        self._live = _live_view(config, samples, self._transport, self._stopping)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._outgoing: list[bytes] = []
@@ -85,6 +92,7 @@ class LinkProcess:
     def run(self) -> None:
         """Run until the control process is gone."""
         loops = [] if self._transport is None else [self._send, self._receive]
+        loops += [] if self._live is None else [self._live.run]
         threads = [Thread(target=self._guarded, args=(loop,)) for loop in loops]
         for thread in threads:
             thread.start()
@@ -256,6 +264,8 @@ class LinkProcess:
         if self._transport is not None:
             # First the blocking calls, so that the threads end; then the file, which they use.
             self._transport.close()
+        if self._live is not None:
+            self._live.close()
         for thread in threads:
             thread.join()
         self._check()
@@ -311,6 +321,8 @@ class LinkProcess:
             status["up"] = {"trouble": self._session.trouble, **self._session.counts}
             status["conflict"] = self._conflict
             status["limits"] = self._limits()
+            if self._live is not None:
+                status["live"] = dict(self._live.counts)
             status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
 
@@ -327,7 +339,18 @@ def _outbox(config: EdgeConfig) -> SqliteOutbox:
     return SqliteOutbox(path, config.agent.servo, files.windows, files.bytes, kept, last)
 
 
-def run_alone(config: EdgeConfig, end: socket.socket, run: str) -> None:
+def _live_view(
+    config: EdgeConfig, samples: SampleReader | None, transport: ExclusiveTransport | None, stopping: Event
+) -> LiveView | None:
+    """Make the live view where the edge's file allows it."""
+    link = live_link(config)
+    if link is None or samples is None or transport is None:
+        return None
+    agent = config.agent
+    return LiveView(link, samples, agent.servo, agent.sample_rate, lambda: transport.claim, stopping)
+
+
+def run_alone(config: EdgeConfig, end: socket.socket, run: str, samples: SampleReader | None = None) -> None:
     """Run a link process once the one before it has ended.
 
     Where the control process was killed alone, its link process still stores what it has received: a window that comes
@@ -339,7 +362,7 @@ def run_alone(config: EdgeConfig, end: socket.socket, run: str) -> None:
             _enter(lock, config.path(f"{config.files.outbox}-link-lock"))
         except OSError as error:
             log("not locked", error=str(error))
-        LinkProcess(config, end, run).run()
+        LinkProcess(config, end, run, samples).run()
 
 
 def _enter(lock: ExitStack, path: Path) -> None:
@@ -363,10 +386,10 @@ def main(arguments: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     os.nice(_NICE)
-    path, descriptor, run = arguments
+    path, descriptor, run, *shared = arguments
     end = socket.socket(fileno=int(descriptor))
     try:
-        run_alone(load(path), end, run)
+        run_alone(load(path), end, run, SampleReader(int(shared[0])) if shared else None)
     except Exception as error:
         log("link process failed", error=f"{type(error).__name__}: {error}")
         return 1

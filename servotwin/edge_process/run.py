@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from servotwin.drives import table
 from servotwin.edge.drive import Drive, DriveLost
+from servotwin.edge.recorder import Recorder
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.control import ControlRole
@@ -20,6 +21,7 @@ from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.link_child import LinkChild, link_command
 from servotwin.edge_process.monitoring import TroubleLog, log
 from servotwin.edge_process.outlet import PipeOutlet
+from servotwin.edge_process.shared_samples import SampleMemory
 from servotwin.edge_process.startup import check, exclusive, next_boot, permitted, stored_parameters
 from servotwin.edge_process.supervise import SupervisingRole
 from servotwin.errors import InvalidInput
@@ -27,6 +29,8 @@ from servotwin.runtime.service_manager import ServiceManager
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _RECONNECT_S, _PAUSE_S, _FINISH_S = 1.0, 0.02, 3.0
+_SHARED_S = 20.0
+"""s of samples that the live view can look back, also at a simulated machine that runs faster than time."""
 
 
 class _Role(Protocol):
@@ -76,21 +80,32 @@ def _run(config: EdgeConfig, path: Path) -> None:
     # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
     boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)
-    child = LinkChild(link_command(path, boot), outlet)
+    memory = _shared_samples(config)
+    child = LinkChild(link_command(path, boot, None if memory is None else memory.descriptor), outlet)
     stop, manager = StopSignal(), ServiceManager()
     before = {each: signal.signal(each, stop) for each in SIGNALS if not _is_ignored(each)}
     try:
-        edge = EdgeRuntime(config, boot, outlet, child, first, time.monotonic, time.sleep, manager)
+        recorder = Recorder if memory is None else memory.recorder
+        edge = EdgeRuntime(config, boot, outlet, child, first, time.monotonic, time.sleep, manager, recorder)
         manager.ready()
         until(stop, edge, drive, lambda: _role(edge, drive))
         manager.stopping()
         edge.finish(_FINISH_S)
     finally:
         child.close()
+        if memory is not None:
+            memory.close()
         drive.close()
         for each, handler in before.items():
             signal.signal(each, handler)
         log("end", windows_left_behind=outlet.untaken)
+
+
+def _shared_samples(config: EdgeConfig) -> SampleMemory | None:
+    """Memory with the samples, where the edge's file allows the live view."""
+    if config.twin is None or not config.twin.live:
+        return None
+    return SampleMemory(round(_SHARED_S * config.agent.sample_rate))
 
 
 def until(stop: StopSignal, edge: EdgeRuntime, drive: Drive, role_of: Callable[[], _Role]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 from servotwin import __version__
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
+from servotwin.edge_process.live_view import LiveLink
 from servotwin.link.claim import ClaimingTransport, ExclusiveTransport, Held, held_of
 from servotwin.link.sqlite_outbox import SqliteOutbox
 
@@ -28,6 +29,18 @@ def exclusive_transport(config: EdgeConfig, outbox: SqliteOutbox, run: str) -> E
         held,
         lambda new: outbox.set_value(_CLAIM, new.text.encode()),
         __version__,
+    )
+
+
+def live_link(config: EdgeConfig) -> LiveLink | None:
+    """Make the connection of the live view; None: the edge's file does not allow it."""
+    twin = config.twin
+    if twin is None or not twin.live:
+        return None
+    from servotwin.link.http import LiveHttp
+
+    return LiveHttp(
+        twin.url, config.agent.servo, link_token(config), _ca_file(config, twin), twin.timeout_s, twin.wait_s
     )
 
 

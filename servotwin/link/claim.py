@@ -126,6 +126,11 @@ class ExclusiveTransport:
             self._failed(error)
             raise
 
+    @property
+    def claim(self) -> Held:
+        """The claim that requests name; without number: the servo is not claimed, or the twin knows no claims."""
+        return self._transport.claim
+
     def close(self) -> None:
         """Close the connections at once."""
         self._transport.close()

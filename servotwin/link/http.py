@@ -16,6 +16,7 @@ from servotwin.link.claim import Held
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
 from servotwin.messages import MAX_BYTES, Acknowledge, EdgeClaim, InvalidMessage, Refusal, Standing, decode, encode
+from servotwin.messages.live import LiveColumns, decode_watched, encode_live
 
 if TYPE_CHECKING:
     import ssl
@@ -146,6 +147,45 @@ class _PersistentConnection:
         return b"".join(pieces)
 
 
+class LiveHttp:
+    """Live view of one servo: columns to the twin, and its word whether somebody watches; over a connection of its own.
+
+    Parameters
+    ----------
+    url, servo, token, ca_file, timeout_s, wait_s
+        As of `HttpTransport`.
+    """
+
+    def __init__(
+        self, url: str, servo: str, token: str, ca_file: str | None, timeout_s: float = 10.0, wait_s: float = 25.0
+    ) -> None:
+        context = tls_context(ca_file) if is_encrypted(url) else None
+        self._path, self._wait = f"/v1/servos/{quote(servo, safe='')}/live", wait_s
+        self._connection = _PersistentConnection(url, token, timeout_s + wait_s, context)
+
+    def send(self, columns: LiveColumns, claim: Held) -> bool:
+        """Send columns; without any, wait until somebody watches. Return True while somebody does.
+
+        Raises
+        ------
+        Refused, Unreachable
+            Refused with UNKNOWN_SCHEMA: the twin is of a version without the live view.
+        """
+        headers = {"Content-Type": BODY, **_claimed(claim)}
+        path = self._path if columns.columns else f"{self._path}?wait={self._wait:g}"
+        response = self._connection.request("POST", path, encode_live(columns), headers, _LONGEST_RESPONSE)
+        if response.status == 404 and _refusal_of(response) is Refusal.NOT_UNDERSTOOD:
+            raise Refused(Refusal.UNKNOWN_SCHEMA, "the twin is of a version without the live view")
+        try:
+            return decode_watched(_checked(response, (200,)).body).watched
+        except InvalidMessage:
+            raise Unreachable("the answer to a live view is none: whoever answers is not the twin") from None
+
+    def close(self) -> None:
+        """Close the connection; the request under way fails at once."""
+        self._connection.close()
+
+
 class HttpTransport:
     """One servo's link to a twin.
 
@@ -179,7 +219,7 @@ class HttpTransport:
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when the twin has the message safe; see `Transport`."""
-        headers = {"Content-Type": BODY, **self._claimed()}
+        headers = {"Content-Type": BODY, **_claimed(self.claim)}
         if parcel.encoding:
             headers["Content-Encoding"] = parcel.encoding
         if not parcel.is_window:
@@ -197,7 +237,7 @@ class HttpTransport:
         """Return the twin's messages with serials above `after`; see `Transport`."""
         path = f"{self._base}/outgoing?after={after}&wait={self._wait:g}"
         return _decode_list(
-            _checked(self._down.request("GET", path, None, self._claimed(), 4 * MAX_BYTES), (200,)).body
+            _checked(self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES), (200,)).body
         )
 
     def ask(self, claim: EdgeClaim) -> Standing | None:
@@ -214,13 +254,14 @@ class HttpTransport:
             raise Unreachable("the answer to a claim is none: whoever answers is not the twin")
         return standing
 
-    def _claimed(self) -> dict[str, str]:
-        return {CLAIM: self.claim.text} if self.claim.number else {}
-
     def close(self) -> None:
         """Close both connections."""
         self._up.close()
         self._down.close()
+
+
+def _claimed(claim: Held) -> dict[str, str]:
+    return {CLAIM: claim.text} if claim.number else {}
 
 
 def _shut(connection: HTTPConnection) -> None:

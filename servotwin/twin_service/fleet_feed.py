@@ -27,6 +27,8 @@ _ROWS, _MOST = 1000, 8000
 """Rows of one event, and of one look; where more changed, watchers are told to read the fleet anew."""
 _WAITING = 16
 """Events that wait for a slow watcher; then its stream ends, and it resumes."""
+_AT_ONCE, _BREATH_S = 4, 0.002
+"""Watchers that get an event at once; s until the next ones do."""
 _TICKS_BACK = 3
 """On a shared database a row with a lower id may be committed later: its servo is sent again for so many ticks."""
 _POSITION = re.compile(r"(\d{1,18})-(\d{1,18})")
@@ -114,7 +116,7 @@ class FleetFeed:
         while True:
             if self._queues:
                 for event in await self._look():
-                    self._send(event)
+                    await self._send(event)
             else:
                 self._positions.clear()
                 self._presence.refresh()  # for whoever reads the fleet without watching it
@@ -174,14 +176,17 @@ class FleetFeed:
         last = len(parts) - 1
         return [_event("rows", position if i == last else None, part) for i, part in enumerate(rows)]
 
-    def _send(self, event: bytes) -> None:
-        for queue in tuple(self._queues):
+    async def _send(self, event: bytes) -> None:
+        """Give an event to a few watchers at a time: an acknowledgement must not wait until all of them have it."""
+        for number, queue in enumerate(tuple(self._queues), 1):
             if queue.qsize() < _WAITING:
                 queue.put_nowait(event)
             else:
                 # It gets what waits, but not this: so it resumes from the last event that it got.
                 queue.put_nowait(None)
                 self._queues.discard(queue)
+            if number % _AT_ONCE == 0:
+                await asyncio.sleep(_BREATH_S)
 
 
 def position_of(text: str | None) -> StorePosition | None:

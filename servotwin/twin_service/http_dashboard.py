@@ -11,6 +11,7 @@ import sqlalchemy as sa
 
 from servotwin.dashboard.assets import INDEX, REPORT_SECURITY, SECURITY, Asset, assets
 from servotwin.dashboard.machine_metrics import machine_metrics
+from servotwin.dashboard.rest import at_rest
 from servotwin.dashboard.series import machine_series, table_csv
 from servotwin.dashboard.window_view import MAX_POINTS, channel_series, sample_range, window_columns
 from servotwin.errors import InvalidInput
@@ -164,7 +165,7 @@ class DashboardApi:
         window = (SERVO, BOOT, SEQUENCE)
         channels = operation(
             "Channels of a window for a screen: least and greatest sample of each column",
-            {200: ("Every sample, where there are at most four a column.", JSON)},
+            {200: ("Every sample, where there are at most four a column; rest: a word on the window's end.", JSON)},
             (
                 *window,
                 parameter("from", SECONDS, "Only samples from then on, s after the first."),
@@ -256,7 +257,8 @@ class DashboardApi:
     async def _get_gaps_csv(self, request: HttpRequest) -> HttpResponse:
         servo, limit, before = self._page_of(request)
         found = await store_query(self._executor, partial(self._gaps, servo, limit, before))
-        return _csv(table_csv(found["windows"]), f"{servo}-gaps.csv")
+        text = await self._executor.run(partial(table_csv, found["windows"]))
+        return _csv(text, f"{servo}-gaps.csv")
 
     def _page_of(self, request: HttpRequest) -> tuple[str, int, int | None]:
         servo = admitted_servo(self._operators, request)
@@ -282,13 +284,13 @@ class DashboardApi:
 
     async def _get_channels_csv(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)
-        text = await self._executor.run(lambda: table_csv(window_columns(_decoded(stored))))
+        text = await self._executor.run(lambda: table_csv(window_columns(decoded_window(stored))))
         servo, boot, sequence = (request.path[key] for key in ("servo", "boot", "sequence"))
         return _csv(text, f"{servo}-{boot}-{sequence}.csv")
 
 
 def _channels(stored: StoredMessage, part: tuple[float | None, float | None], points: int) -> dict[str, Any]:
-    window = _decoded(stored)
+    window = decoded_window(stored)
     try:
         selected = sample_range(window, *part)
     except InvalidInput as error:
@@ -302,10 +304,11 @@ def _channels(stored: StoredMessage, part: tuple[float | None, float | None], po
         "reason": window.reason,
         "version": window.parameter_version,
         "channels": channel_series(window, selected, points),
+        "rest": at_rest(window) if part == (None, None) else None,
     }
 
 
-def _decoded(stored: StoredMessage) -> WindowMessage:
+def decoded_window(stored: StoredMessage) -> WindowMessage:
     """Decode a stored window; raises RequestRejected where it cannot be read."""
     try:
         window = decode(decompress(stored.body, stored.encoding, MAX_BYTES))

@@ -12,6 +12,7 @@ from servotwin.twin_service.limits import STATUS
 Operation = dict[str, Any]
 MSGPACK, JSON, TEXT = "application/msgpack", "application/json", "text/plain"
 HTML, CSV, EVENTS = "text/html; charset=utf-8", "text/csv; charset=utf-8", "text/event-stream"
+PARQUET = "application/vnd.apache.parquet"
 MAX_INTEGER = 2**53
 """Largest integer in a request: the largest that JSON readers with float64 numbers represent exactly."""
 _TITLE, _VERSION = "servotwin twin", "1"
@@ -26,6 +27,7 @@ _CONTENT: dict[str, Operation] = {
     MSGPACK: _BYTES,
     JSON: {},
     **{key: {"type": "string"} for key in (TEXT, HTML, CSV, EVENTS)},
+    PARQUET: _BYTES,
 }
 _ERROR: Operation = {
     "type": "object",

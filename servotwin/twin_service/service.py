@@ -32,12 +32,16 @@ from servotwin.twin_service.http_acts import ActsApi
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.http_dashboard import DashboardApi
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
+from servotwin.twin_service.http_live import LiveApi
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
+from servotwin.twin_service.http_parquet import ParquetApi
 from servotwin.twin_service.http_server import BodyReader
+from servotwin.twin_service.http_webhook import WebhookApi
 from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.live_views import LiveViews
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
@@ -150,6 +154,7 @@ class TwinService:
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)
         self.feed = FleetFeed(self._reader, self._readers, presence, config.watchers, self._shared)
+        self.live_views = LiveViews(self.clocks.monotonic, presence, config.watchers, config.long_polls)
         self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
@@ -171,12 +176,16 @@ class TwinService:
         dashboard = DashboardApi(
             self.operators, self.store, self._readers, self._reader, self.feed, self.config.machine_metrics
         )
-        what_if = WhatIfApi(self.operators, self.what_if, self.clocks.monotonic)
+        what_if = WhatIfApi(self.operators, self.store, self._readers, self.what_if, self.clocks.monotonic)
         acts = ActsApi(
             self.operators, self.store, self._readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
             self.clocks.monotonic,
         )  # fmt: skip
-        routes = [*edge.routes(), *operator.routes(), *dashboard.routes(), *what_if.routes(), *acts.routes()]
+        live = LiveApi(self.gate, self.operators, self.claims, self.live_views, self.clocks.monotonic)
+        parquet = ParquetApi(self.operators, self.store, self._readers, self.what_if)
+        webhook = WebhookApi(self.operators, self.config.webhook, self.clocks.monotonic)
+        parts = edge, operator, dashboard, what_if, acts, live, parquet, webhook
+        routes = [route for part in parts for route in part.routes()]
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
@@ -210,9 +219,10 @@ class TwinService:
             await self._mqtt.start()
 
     def end_streams(self) -> None:
-        """End all long polls and event streams, which would otherwise keep the server from stopping."""
+        """End all long polls, live views and event streams, which would otherwise keep the server from stopping."""
         self.polls.close()
         self.feed.close()
+        self.live_views.close()
 
     async def stop(self) -> None:
         """Commit the received messages, finish the running work, stop the workers."""

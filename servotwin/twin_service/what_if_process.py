@@ -1,4 +1,4 @@
-"""Process that simulates what clients of the dashboard ask for, so that neither requests nor estimates wait for it.
+"""Process that computes what clients of the dashboard ask for, so that neither requests nor estimates wait for it.
 
 It starts with the first question and ends some minutes after the last. It speaks frames of MessagePack as a worker
 does, at a lower priority than the workers, and has no access to the store.
@@ -13,6 +13,7 @@ import socket
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from enum import StrEnum
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,22 +26,42 @@ from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.worker import WorkerLost, WorkerProcess, WorkerStart
 
 _COMMAND = (sys.executable, "-m", "servotwin.twin_service.what_if_process")
-_ANSWER_S, _IDLE_S, _LOOK_S = 5.0, 300.0, 15.0
+_ANSWER_S, _IDLE_S, _LOOK_S = 10.0, 300.0, 15.0
 """s for one answer; s without a question after which the process ends; s between two looks."""
 _WAITING = 8
 """Questions that may wait, beside the one that is answered."""
 _NICENESS = 5
 
 
+class QuestionKind(StrEnum):
+    """Kind of a question, and what its body holds.
+
+    step: the body of the request, JSON; residual: a `StoredFit`, MessagePack; parquet: columns by name, MessagePack,
+    which become a file.
+    """
+
+    STEP = "step"
+    RESIDUAL = "residual"
+    PARQUET = "parquet"
+
+
 class WhatIfQuestion(NamedTuple):
-    """A question about a servo: the body of the request, JSON."""
+    """A question about a servo.
+
+    Attributes
+    ----------
+    servo : str
+    body : bytes
+    kind : QuestionKind
+    """
 
     servo: str
     body: bytes
+    kind: QuestionKind = QuestionKind.STEP
 
 
 class WhatIfReply(NamedTuple):
-    """Answer in JSON, or in `error` why there is none."""
+    """Answer, JSON or a file, or in `error` why there is none."""
 
     answer: bytes
     error: str
@@ -72,8 +93,8 @@ class WhatIfProcess:
         """Process id, while the process runs."""
         return None if self._process is None else self._process.pid
 
-    async def answer(self, servo: str, body: bytes) -> bytes:
-        """Answer a question, JSON for JSON.
+    async def answer(self, servo: str, body: bytes, kind: QuestionKind = QuestionKind.STEP) -> bytes:
+        """Answer a question.
 
         Raises
         ------
@@ -85,7 +106,7 @@ class WhatIfProcess:
         self._asked += 1
         try:
             async with self._turn:
-                reply = await self._replied(_encode(WhatIfQuestion(servo, body)))
+                reply = await self._replied(_encode(WhatIfQuestion(servo, body, kind)))
         finally:
             self._asked -= 1
             self._used = self._monotonic()
@@ -156,14 +177,22 @@ def _replied(answer: Callable[[WhatIfQuestion], bytes], question: WhatIfQuestion
 
 
 def _load(start: bytes) -> Callable[[WhatIfQuestion], bytes]:
+    from servotwin.dashboard.map_position import CoarseMaps
+    from servotwin.dashboard.parquet_file import table_parquet
+    from servotwin.dashboard.residual_view import StoredFit, residual_view
     from servotwin.dashboard.what_if import read_what_if, simulated_step
     from servotwin.twin.model_registry import ModelRegistry
 
     file = msgspec.msgpack.decode(start, type=WorkerStart)
-    registry = ModelRegistry.loads(file.text, file.source, Path(file.folder))
+    registry, maps = ModelRegistry.loads(file.text, file.source, Path(file.folder)), CoarseMaps()
 
     def answer(question: WhatIfQuestion) -> bytes:
-        return msgspec.json.encode(simulated_step(registry.model_of(question.servo), read_what_if(question.body)))
+        if question.kind is QuestionKind.PARQUET:
+            return table_parquet(msgspec.msgpack.decode(question.body))
+        if question.kind is QuestionKind.RESIDUAL:
+            return msgspec.json.encode(residual_view(msgspec.msgpack.decode(question.body, type=StoredFit)))
+        asked = read_what_if(question.body)
+        return msgspec.json.encode(simulated_step(registry.model_of(question.servo), asked, maps))
 
     return answer
 

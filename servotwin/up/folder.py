@@ -156,7 +156,8 @@ def _fill(path: Path) -> None:
         enrolment.enroll(path / TWIN, request)
         config = load(folder / EDGE)
         agent = replace(config.agent, retry=_RETRY, window_s=WINDOW_S, pre_trigger_s=PRE_TRIGGER_S)
-        write_text(folder / EDGE, edge_toml(replace(config, agent=agent)))
+        link = None if config.twin is None else replace(config.twin, live=True)
+        write_text(folder / EDGE, edge_toml(replace(config, agent=agent, twin=link)))
         write_text(folder / MACHINE, machine_toml(servo))
     write_text(path / MARKER, msgspec.json.encode(_Marker([servo.name for servo in SERVOS])).decode() + "\n")
 

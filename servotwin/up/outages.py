@@ -14,7 +14,7 @@ _CHUNK = 65536
 
 
 class Outages(NamedTuple):
-    """Schedule of the outages, s since the start.
+    """Schedule of the outages, s since the start; none comes before the first updates could be applied.
 
     Attributes
     ----------
@@ -22,7 +22,7 @@ class Outages(NamedTuple):
         Start of the first outage, duration of each, period.
     """
 
-    first: float = 6.0
+    first: float = 20.0
     lasting: float = 8.0
     every: float = 40.0
 

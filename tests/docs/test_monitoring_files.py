@@ -5,9 +5,9 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
-from typing import Any
 
 import pytest
+from monitoring_files import DASHBOARD, EDGE, FOLDER, RULES
 from servers import needed
 from service_system import twin_file
 
@@ -17,15 +17,6 @@ from servotwin.store.store import open_store
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker_pool import WorkerPool
-
-FOLDER = Path(__file__).parents[2] / "docs/operator/prometheus"
-DASHBOARD: Any = json.loads((FOLDER / "dashboard.json").read_text())
-RULES = (FOLDER / "servotwin.rules.yml").read_text()
-EDGE = {
-    "samples": 1, "windows_cut": 1, "version": 0, "fallback": False, "tolerance_m": 0.0, "conflict": False,
-    "windows": {"waiting": 0, "dropped": {}}, "disk": {"safe": True, "faults": {}}, "up": {}, "down": {},
-    "tick": {"number": 1, "median_us": 1, "p99_us": 1, "p999_us": 1, "max_us": 1}, "written": 1.0,
-}  # fmt: skip
 
 
 def exported(folder: Path) -> str:

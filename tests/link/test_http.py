@@ -11,10 +11,12 @@ import pytest
 from faketwin import FakeTwin, Handler
 
 from servotwin.errors import InvalidInput
-from servotwin.link.http import HttpTransport
+from servotwin.link.claim import Held
+from servotwin.link.http import HttpTransport, LiveHttp
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import Acknowledge, Hello, Refusal, Setting, WindowMessage, checksum, encode, pack_channel
 from servotwin.messages.codec import deflated
+from servotwin.messages.live import LiveColumns, Watched, decode_columns, encode_live
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
 HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")
@@ -245,3 +247,38 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
     )
     file.write_bytes(private + made.public_bytes(serialization.Encoding.PEM))
     return file
+
+
+def test_a_live_view_says_what_it_is_asked_and_that_an_older_twin_has_none(twin: FakeTwin) -> None:
+    link = LiveHttp(twin.url, "axis-1", "secret", None, timeout_s=5.0, wait_s=0.2)
+    columns = LiveColumns("axis-1", 1, 7, 0.1, ((0.0, 1.0, 0.0, 1.0, None, None),))
+    asked = []
+
+    def answer(handler: Handler, body: bytes) -> bool:
+        asked.append((handler.path, handler.headers["Servotwin-Claim"], decode_columns(body)))
+        handler.answer(200, encode_live(Watched(len(asked) == 1)))
+        return True
+
+    def older(handler: Handler, _body: bytes) -> bool:
+        handler.refuse(404, Refusal.NOT_UNDERSTOOD)
+        return True
+
+    def proxy(handler: Handler, _body: bytes) -> bool:
+        handler.answer(200, b"<html>log in</html>")
+        return True
+
+    try:
+        twin.fault = answer
+        assert link.send(LiveColumns("axis-1"), Held("b1", 3))
+        assert not link.send(columns, Held("b1", 3))
+        path = "/v1/servos/axis-1/live"
+        assert asked == [(f"{path}?wait=0.2", "3 b1", LiveColumns("axis-1")), (path, "3 b1", columns)]
+        twin.fault = older
+        with pytest.raises(Refused, match="without the live view") as refused:
+            link.send(columns, Held("b1", 3))
+        assert refused.value.reason is Refusal.UNKNOWN_SCHEMA
+        twin.fault = proxy
+        with pytest.raises(Unreachable, match="not the twin"):
+            link.send(columns, Held("b1", 3))
+    finally:
+        link.close()

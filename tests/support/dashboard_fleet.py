@@ -51,9 +51,9 @@ link = {{ delay_s = 0.1 }}
 """
 
 
-def wearing_fleet(folder: Path, ended: float, others: int = 0) -> Path:
+def wearing_fleet(folder: Path, ended: float, others: int = 0, service: str = "") -> Path:
     """Make the twin's file with its store; `ended`: end of what `WEARING` sent, s since the epoch."""
-    path = twin_file(folder, servos=SERVOS)
+    path = twin_file(folder, service, servos=SERVOS)
     store = open_store(f"sqlite:///{folder}/twin.db")
     try:
         _wear(path, store, ended - SECONDS)

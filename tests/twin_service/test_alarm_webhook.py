@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import msgspec
 import pytest
-from service_system import bearer, place, twin_file, window
+from service_system import ENGINEER, OPERATOR, bearer, place, served, twin_file, window
 
 from servotwin.cli.alarm_test import post_test_alarm
 from servotwin.errors import InvalidInput
@@ -302,3 +302,44 @@ def test_what_a_twin_could_not_process_is_posted(tmp_path):
     assert secret == "Bearer s3cret"
     assert (post["servo"], post["kind"]) == ("ax-1", "failed")
     assert post["text"] == "ax-1: failed: given up"
+
+
+def test_an_engineer_tests_the_webhook_and_an_operator_only_sees_its_host(tmp_path):
+    async def body(url, received):
+        async with served(with_webhook(tmp_path, url)) as (system, client):
+            shown = await client.get("/v1/webhook", headers=bearer(OPERATOR))
+            assert shown.json() == {"host": system.config.webhook.host, "may_test": False}
+            assert (await client.get("/v1/webhook", headers=bearer(ENGINEER))).json()["may_test"]
+            assert (await client.post("/v1/webhook/test", headers=bearer(OPERATOR))).status_code == 403
+            assert (await client.post("/v1/webhook/test", headers=bearer())).status_code == 403
+            assert received == []
+            answers = [await client.post("/v1/webhook/test", headers=bearer(ENGINEER)) for _ in range(4)]
+            assert [answer.status_code for answer in answers] == [200, 200, 200, 429]
+            assert received[0][2]["text"] == "test: alarm: this is a test of the webhook by eva"
+
+    with receiver(200) as (url, received):
+        asyncio.run(body(url, received))
+
+
+@pytest.mark.parametrize("status", [404, 500])
+def test_a_webhook_that_does_not_take_the_test_is_one_sentence(tmp_path, status):
+    async def body(url):
+        async with served(with_webhook(tmp_path, url)) as (_, client):
+            answer = await client.post("/v1/webhook/test", headers=bearer(ENGINEER))
+            assert answer.status_code == 503
+            assert f"did not take the test: 127.0.0.1 answers with status {status}" in answer.json()["detail"]
+
+    with receiver(status) as (url, _):
+        asyncio.run(body(url))
+
+
+def test_without_a_webhook_there_is_nothing_to_test(tmp_path):
+    async def body():
+        async with served(twin_file(tmp_path)) as (_, client):
+            assert (await client.get("/v1/webhook", headers=bearer(ENGINEER))).json() == {
+                "host": None,
+                "may_test": False,
+            }
+            assert (await client.post("/v1/webhook/test", headers=bearer(ENGINEER))).status_code == 404
+
+    asyncio.run(body())

@@ -194,7 +194,7 @@ def test_watchers_are_few_and_leave_when_they_may_no_longer_read(tmp_path):
 
         (event,), stream = await first_events(system.feed, 1, position(system), revoked)
         assert event[b"event"] == b"rows"
-        system.feed._send(b"event: rows\n\n")
+        await system.feed._send(b"event: rows\n\n")
         assert (await anext(stream)).startswith(b"event: ended")
         with pytest.raises(StopAsyncIteration):
             await anext(stream)
@@ -212,11 +212,36 @@ def test_a_slow_watcher_holds_nothing_up(tmp_path):
         stream = system.feed.watch(None, lambda: None)
         await anext(stream)
         for number in range(100):
-            system.feed._send(b"event: %d\n\n" % number)
+            await system.feed._send(b"event: %d\n\n" % number)
         async with asyncio.timeout(10.0):
             found = [part async for part in stream]
         assert found[0].startswith(b"event: links")
         assert found[1:] == [b"event: %d\n\n" % k for k in range(16)]
+
+    with_service(tmp_path, body)
+
+
+def test_an_event_goes_to_a_few_watchers_at_a_time(tmp_path):
+    async def body(system, _client):
+        streams = [system.feed.watch(None, lambda: None) for _ in range(30)]
+        for stream in streams:
+            await anext(stream)
+            await anext(stream)
+        got = []
+
+        async def take(stream):
+            got.append(await anext(stream))
+
+        waiting = [asyncio.create_task(take(stream)) for stream in streams]
+        await asyncio.sleep(0)
+        sending = asyncio.create_task(system.feed._send(b"event: x\n\n"))
+        await asyncio.sleep(0)
+        await asyncio.sleep(0)
+        assert len(got) <= 4  # whoever else waits for the loop has had a turn
+        await asyncio.gather(sending, *waiting)
+        assert got == [b"event: x\n\n"] * 30
+        for stream in streams:
+            await stream.aclose()
 
     with_service(tmp_path, body)
 
@@ -324,7 +349,7 @@ def test_a_page_that_does_not_read_counts_and_is_cut_off(tmp_path, monkeypatch, 
         if ends:
             await asyncio.sleep(0.02)
             for _ in range(40):
-                system.feed._send(b"event: rows\n\n")  # its queue overflows
+                await system.feed._send(b"event: rows\n\n")  # its queue overflows
             assert system.feed.watchers == 1
             system.feed.close()
         await asyncio.wait_for(page.aborted.wait(), 20.0)

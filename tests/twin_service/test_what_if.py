@@ -27,6 +27,10 @@ def test_an_operator_s_token_simulates_in_a_process_of_its_own(tmp_path, monkeyp
             assert first.status_code == 200
             assert first.json()["tolerance"] > 0.0
             process = system.what_if.pid
+            file = await client.get("/v1/servos/ax-1/gaps.parquet", headers=headers)
+            assert file.content[:4] == b"PAR1"
+            missing = await client.get("/v1/servos/ax-1/windows/b/7/residual", headers=headers)
+            assert missing.status_code == 404
             refused = await client.post(PATH, json={"gap": -1}, headers=headers)
             assert refused.status_code == 400
             assert "negative" in refused.json()["detail"]

@@ -1,6 +1,7 @@
 """`servotwin up` with real processes: it runs, ends, resumes, and leaves nothing behind, however it ends."""
 
 import io
+import json
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import pytest
 from rich.console import Console
@@ -97,6 +99,14 @@ def times(path: Path) -> list[float]:
     return [0.0 if state is None else state.time_s for state in states]
 
 
+def live_state(url: str, token: str, servo: str) -> str:
+    """State of a machine's live view, for a page that asks."""
+    headers = {"authorization": f"Bearer {token}"}
+    with urlopen(Request(f"{url}/v1/servos/{servo}/live", headers=headers), timeout=20.0) as answer:
+        state: str = json.load(answer)["state"]
+    return state
+
+
 def stored(path: Path) -> dict[str, set[str]]:
     """The numbers of the boots of which the twin has windows, by servo: b1 is the first."""
     store = open_store(f"sqlite:///{path / 'twin.db'}")
@@ -131,6 +141,10 @@ def test_it_continues_after_a_kill_and_ends_in_order(tmp_path: Path, monkeypatch
         with started(path, "--speed", "10") as second:
             lines = lines_until(second, RUNNING)
             assert sum(line.startswith("continuing with") for line in lines) == NUMBER
+            # Both roles show their samples live, as their files allow it.
+            url = next(line.split()[-1] for line in lines if line.startswith("twin: listening on "))
+            token = (path / "operator.token").read_text().strip()
+            assert eventually(lambda: all(live_state(url, token, servo.name) == "live" for servo in STARTED))
             # However slow this machine: each servo's windows come from a boot after the first.
             assert eventually(lambda: all(boots - {"b1"} for boots in stored(path).values()))
             second.send_signal(signal.SIGINT)

@@ -65,12 +65,33 @@ const servo = (name) => `/v1/servos/${encodeURIComponent(name)}`;
 export const windowPath = (name, boot, sequence) => `${servo(name)}/windows/${encodeURIComponent(boot)}/${sequence}`;
 export const histories = (names) => request(`/v1/fleet/histories?servos=${names.map(encodeURIComponent).join(",")}`);
 export const gaps = (name, limit = 400) => request(`${servo(name)}/gaps?limit=${limit}`);
-export const gapsFile = (name) => `${servo(name)}/gaps.csv?limit=1000`;
+export const gapsFile = (name, kind = "csv") => `${servo(name)}/gaps.${kind}?limit=1000`;
+
+// Saves a file that the twin may be unable to make: the reason is thrown, where a plain link would save it as the file.
+export async function save(path) {
+  let response;
+  try {
+    response = await fetch(path, { credentials: "same-origin", signal: AbortSignal.timeout(60000) });
+  } catch {
+    throw new ApiError("The twin cannot be reached.", 0);
+  }
+  if (!response.ok) throw new ApiError((await detail(response)) || WORDS[response.status] || `The twin answers with status ${response.status}.`, response.status);
+  const name = response.headers.get("content-disposition")?.match(/filename="([^"]+)"/)?.[1] ?? "series";
+  const url = URL.createObjectURL(await response.blob());
+  const link = document.createElement("a");
+  Object.assign(link, { href: url, download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(url), 1000);
+}
 export const reportFile = (name) => `${servo(name)}/report.html`;
 export const updates = (name, limit = 20) => request(`${servo(name)}/audit?updates=1&limit=${limit}`);
 export const events = (name, limit = 50) => request(`${servo(name)}/events?limit=${limit}`);
 export const channels = (name, boot, sequence, points, from = null, to = null) =>
   request(`${windowPath(name, boot, sequence)}/channels?points=${points}${from === null ? "" : `&from=${from}&to=${to}`}`);
+export const live = (name, boot, after) => request(`${servo(name)}/live?boot=${boot}&after=${after}`);
+export const residual = (name, boot, sequence) => request(`${windowPath(name, boot, sequence)}/residual`, { signal: AbortSignal.timeout(60000), detailed: true });
+export const webhook = () => request("/v1/webhook");
+export const testWebhook = () => request("/v1/webhook/test", { method: "POST", detailed: true });
 export const oversight = (name) => request(`${servo(name)}/acts`);
 export const act = (name, asked) =>
   request(`${servo(name)}/acts`, { method: "POST", headers: { "content-type": "application/json" }, body: JSON.stringify(asked), detailed: true });

@@ -24,7 +24,7 @@ const live = new Live(
 
 function showState() {
   const words = {
-    starting: "Connecting …",
+    starting: byId("login").hidden ? "Connecting …" : "Not logged in",
     live: "Live",
     trouble: live.why,
     away: live.why,
@@ -41,6 +41,7 @@ function askToken(why) {
   form.hidden = false;
   byId("view").hidden = live.rows.size === 0;
   byId("logout").hidden = true;
+  showState();
   byId("token").focus();
 }
 

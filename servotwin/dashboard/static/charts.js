@@ -2,7 +2,7 @@
 
 /* global uPlot */
 import { colour, element, svg } from "./dom.js";
-import { fixed } from "./format.js";
+import { brief, fixed } from "./format.js";
 
 // Sizes follow that of the page's text.
 const rem = () => parseFloat(getComputedStyle(document.documentElement).fontSize) / 16;
@@ -67,14 +67,15 @@ export class TimePlot {
     const width = this.place.clientWidth;
     if (!width || !this.data) return;
     this.width = width;
+    this.rem = rem();
     this.plot = new uPlot({
       width, height: this.place.clientHeight || 240,
       legend: { show: false },
       cursor: { sync: options.sync ? { key: options.sync } : undefined, drag: { x: true, y: false } },
       scales: { x: { time: Boolean(options.time) }, y: { range: options.range && ((_, low, high) => options.range(low, high)) } },
       axes: [
-        axis(options.xLabel, options.time ? 46 : 34, { values: options.time ? [...TIME_FORMATS] : undefined }),
-        axis(options.yLabel, 58, { values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
+        axis(options.xLabel, options.time ? 46 : 34, { space: (options.time ? 75 : 52) * rem(), values: options.time ? [...TIME_FORMATS] : undefined }),
+        axis(options.yLabel, 58, { space: 30 * rem(), values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
       ],
       series: [{}, ...options.series.map((each) => ({
         label: each.label, stroke: colour(each.color), width: each.width ?? 1.6, dash: each.dash, spanGaps: Boolean(each.spanGaps),
@@ -90,6 +91,7 @@ export class TimePlot {
   resize() {
     if (!this.plot) return this.make();
     const width = this.place.clientWidth;
+    if (this.rem !== rem()) return this.redraw(); // on another screen: fonts are fixed when a plot is made
     if (width && width !== this.width) {
       this.width = width;
       this.plot.setSize({ width, height: this.place.clientHeight || 240 });
@@ -174,6 +176,29 @@ function ticksOf(low, high) {
   const ticks = [];
   for (let tick = Math.ceil(low / step) * step; tick <= high + 1e-12 * step; tick += step) ticks.push(Math.abs(tick) < step / 1e6 ? 0 : tick);
   return ticks;
+}
+
+/* A map of shares from 0 to 1 over two axes, each value at its place along the axis, with a mark where a setting lies.
+   rows, columns: values of the axes; cells: rows of shares, null: not known yet; mark: {row, column} as fractions of a cell. */
+export function mapPlot(rows, columns, cells, mark, { xLabel, yLabel, about }) {
+  const W = 400, H = 300, left = 58, right = 12, top = 10, bottom = 44;
+  const wide = (W - left - right) / columns.length, high = (H - top - bottom) / rows.length;
+  const x = (k) => left + k * wide, y = (k) => H - bottom - (k + 1) * high;
+  const node = svg("svg", { viewBox: `0 0 ${W} ${H}`, role: "img", "aria-label": about });
+  cells.forEach((row, i) => row.forEach((share, k) => {
+    const fill = share === null ? "none" : "var(--blue)";
+    node.append(svg("rect", { x: x(k), y: y(i), width: wide, height: high, fill, "fill-opacity": 0.08 + 0.72 * (share ?? 0), stroke: "var(--line)" }));
+  }));
+  columns.forEach((value, k) => k % 2 || node.append(text(brief(value), x(k + 0.5), H - bottom + 15, "middle")));
+  rows.forEach((value, i) => i % 2 || node.append(text(brief(value), left - 6, y(i) + high / 2 + 4, "end")));
+  const at = [x(Math.min(columns.length, Math.max(0, mark.column + 0.5))), y(Math.min(rows.length, Math.max(0, mark.row + 0.5)) - 1)];
+  node.append(svg("circle", { cx: at[0], cy: at[1], r: 7, fill: "none", stroke: "var(--page)", "stroke-width": 5 }));
+  node.append(svg("circle", { cx: at[0], cy: at[1], r: 7, fill: "none", stroke: "var(--red)", "stroke-width": 2.5 }));
+  node.append(text(xLabel, (left + W - right) / 2, H - 8, "middle"));
+  const side = text(yLabel, 0, 0, "middle");
+  side.setAttribute("transform", `translate(13 ${(top + H - bottom) / 2}) rotate(-90)`);
+  node.append(side);
+  return node;
 }
 
 export function legend(...entries) {

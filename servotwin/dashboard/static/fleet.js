@@ -52,8 +52,10 @@ export class FleetPage {
       element("div", { role: "rowgroup" }, this.heads), this.body);
     this.empty = element("p", { class: "empty", hidden: true });
     this.title = element("h1", {}, "Fleet");
+    this.tested = element("span", { class: "soft", role: "status" });
+    this.test = element("button", { type: "button", hidden: true, on: { click: () => this.testWebhook() } }, "Test the alarm webhook");
     view.replaceChildren(
-      element("div", { class: "head" }, this.title, element("label", { class: "sorting" }, "Sort by", this.order), this.search),
+      element("div", { class: "head" }, this.title, this.tested, this.test, element("label", { class: "sorting" }, "Sort by", this.order), this.search),
       element("div", { class: "chips head", role: "group", "aria-label": "Filter" }, this.chips),
       this.table, this.empty);
     this.abort = new AbortController();
@@ -63,7 +65,29 @@ export class FleetPage {
     addEventListener("keydown", (event) => this.key(event), { signal });
     this.ages = setInterval(() => this.schedule(), AGES_MS);
     this.update(null);
+    this.offerTest();
     requestAnimationFrame(() => scrollTo(0, remembered.scroll));
+  }
+
+  // Engineers may have a test alarm posted, where the twin posts alarms at all.
+  async offerTest() {
+    try {
+      this.test.hidden = !(await api.webhook()).may_test;
+    } catch {
+      this.test.hidden = true; // the state of the page says what is wrong
+    }
+  }
+
+  async testWebhook() {
+    this.test.disabled = true;
+    setText(this.tested, "Posting a test …");
+    try {
+      const { host, status } = await api.testWebhook();
+      setText(this.tested, `${host} took the test (status ${status}).`);
+    } catch (error) {
+      setText(this.tested, error.message);
+    }
+    this.test.disabled = false;
   }
 
   close() {

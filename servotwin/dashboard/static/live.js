@@ -4,6 +4,7 @@ import * as api from "./api.js";
 
 const SILENT_MS = 40000; // the twin sends a sign of life every 15 s
 const RETRY_MS = [1000, 2000, 4000, 8000, 15000];
+const HERE_MS = 20000; // between two signs of life to the worker that holds the stream for all tabs
 const SPREAD_MS = 10000; // within which all pages read the fleet anew, where very much changed at once
 
 export class Live {
@@ -17,8 +18,10 @@ export class Live {
     this.skew = 0;
     this.position = null;
     this.failures = 0;
-    // A browser opens six connections to one twin: a page that nobody sees leaves them to the others.
+    // A page that nobody sees follows nothing.
     document.addEventListener("visibilitychange", () => (document.hidden ? this.pause() : this.resume()));
+    addEventListener("pagehide", () => this.pause());
+    addEventListener("pageshow", (event) => event.persisted && this.resume());
   }
 
   now() {
@@ -55,7 +58,7 @@ export class Live {
 
   follow() {
     if (document.hidden) return this.pause();
-    const source = new EventSource(`/v1/fleet/events?after=${this.position}`);
+    const source = globalThis.SharedWorker ? new SharedSource(this.position) : new EventSource(`/v1/fleet/events?after=${this.position}`);
     this.source = source;
     this.heard();
     for (const name of ["open", "rows", "alive", "trouble"]) source.addEventListener(name, () => this.heard());
@@ -144,6 +147,28 @@ export class Live {
     this.state = state;
     this.why = why;
     document.documentElement.dataset.live = state;
+  }
+}
+
+// The stream that all tabs of this browser share, with what this page uses of an EventSource.
+class SharedSource extends EventTarget {
+  constructor(position) {
+    super();
+    this.readyState = EventSource.CONNECTING;
+    this.port = new SharedWorker("/static/stream_worker.js").port;
+    this.port.onmessage = ({ data: { type, data, lastEventId, readyState } }) => {
+      this.readyState = readyState;
+      this.dispatchEvent(Object.assign(new Event(type), { data, lastEventId }));
+    };
+    this.port.postMessage(position);
+    this.timer = setInterval(() => this.port.postMessage("here"), HERE_MS);
+  }
+
+  close() {
+    clearInterval(this.timer);
+    this.port.onmessage = null;
+    this.port.postMessage("leave");
+    this.port.close();
   }
 }
 

@@ -6,6 +6,8 @@ import { ActsPanel } from "./acts.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
+import { LiveViewPanel } from "./live_view.js";
+import { ResidualPanel } from "./residual.js";
 import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
@@ -26,6 +28,8 @@ export class MachinePage {
     this.closed = true;
     clearInterval(this.ages);
     clearTimeout(this.timer);
+    this.liveView.close();
+    this.whatIf.close();
     for (const plot of this.plots) plot.close();
   }
 
@@ -54,10 +58,12 @@ export class MachinePage {
     };
     this.alarms = element("ul", { class: "alarms", hidden: true, "aria-label": "Alarms of the last day" });
     this.trouble = element("p", { class: "error", role: "status" });
+    this.fileWords = element("p", { class: "error brief", role: "alert" });
     this.choice = element("select", { "aria-label": "Window", on: { change: () => this.pick(this.choice.value) } });
     this.rate = element("button", { type: "button", on: { click: () => this.loadWindow(EVERY) } }, "Every sample");
     this.windowFile = element("a", { download: true }, "CSV");
     this.windowNote = element("p", { class: "soft" });
+    this.rest = element("p", { role: "status" });
     this.loop = element("div", { class: "hysteresis" });
     this.chain = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Updates" });
     this.proof = element("div");
@@ -68,14 +74,18 @@ export class MachinePage {
       return this.plots.at(-1);
     };
     this.whatIf = new WhatIfPanel(name, () => this.start());
+    this.liveView = new LiveViewPanel(name, () => this.gaps?.machine);
+    const chosen = () => (this.shown ? this.shown.split("/") : null);
+    this.residualPanel = new ResidualPanel(name, chosen, () => positionUnit(this.gaps.machine).name === "deg");
     this.acts = new ActsPanel(name, () => this.later());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", {},
-      panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV")],
+      panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV"), this.saver(() => api.gapsFile(name, "parquet"))],
         legend(["blue", "estimate"], ["blue band", "95 % interval"], ["green", "wear (trend)"], ["red dash", "limit"], ["orange", "version applied"], ["red dots", "version refused, or fallback"]),
         places.gap),
-      panel("Window", [this.choice, this.rate, this.windowFile], this.windowNote,
+      panel("Live", [], ...this.liveView.content),
+      panel("Window", [this.choice, this.rate, this.windowFile, this.saver(() => this.windowFile.href.replace(/csv$/, "parquet"))], this.windowNote, this.rest,
         element("div", { class: "pair" },
           element("div", {},
             legend(["orange", "reference"], ["blue", "position"]), places.position,
@@ -84,6 +94,7 @@ export class MachinePage {
           element("div", {}, element("h3", {}, "Hysteresis"),
             element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
             this.loop))),
+      panel("Residual", this.residualPanel.tools, ...this.residualPanel.content),
       panel("What if", this.whatIf.tools, ...this.whatIf.content),
       panel("Did it help?", [],
         legend(["blue", "of each window"], ["orange", "version applied"]),
@@ -95,9 +106,9 @@ export class MachinePage {
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
     this.tilesList = element("dl", { class: "facts" },
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
-    this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.blank, this.content);
+    this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.fileWords, this.blank, this.content);
     this.makePlots(plot, places);
-    this.plots.push(...this.whatIf.plots);
+    this.plots.push(...this.whatIf.plots, ...this.liveView.plots, ...this.residualPanel.plots);
   }
 
   // Where a trial on the model begins: at what is known of the machine.
@@ -166,6 +177,22 @@ export class MachinePage {
       this.alarms.dataset.lines = lines.join("\n");
       this.alarms.replaceChildren(...lines.map((line) => element("li", {}, line)));
     }
+  }
+
+  // A button that saves a Parquet file, or says why there is none.
+  saver(path) {
+    const button = element("button", { type: "button", class: "plain", on: { click: () => saved() } }, "Parquet");
+    const saved = async () => {
+      button.disabled = true;
+      setText(this.fileWords, "");
+      try {
+        await api.save(path());
+      } catch (error) {
+        setText(this.fileWords, `No Parquet file: ${error.message}`);
+      }
+      button.disabled = false;
+    };
+    return button;
   }
 
   tile(key, value, notes) {
@@ -244,6 +271,7 @@ export class MachinePage {
   async loadWindow(points) {
     const key = this.choice.value, [boot, sequence] = key.split("/");
     this.windowFile.href = `${api.windowPath(this.name, boot, sequence)}/channels.csv`;
+    const before = this.shown;
     this.shown = key;
     try {
       let window = await api.channels(this.name, boot, sequence, points);
@@ -252,10 +280,18 @@ export class MachinePage {
       this.showWindow(window);
     } catch (error) {
       if (this.closed) return;
-      setText(this.windowNote, error.status === 404 ? "The samples of this window are no longer stored." : error.message);
+      if (error.status !== 404) {
+        // What was shown stays; the next refresh tries again.
+        this.shown = before;
+        setText(this.windowNote, before ? `${error.message} What is shown is the window before.` : error.message);
+        if (error.status === 401) this.live.end(error.message);
+        else this.later();
+        return;
+      }
+      setText(this.rest, "");
+      setText(this.windowNote, "The samples of this window are no longer stored.");
       this.loop.replaceChildren();
       for (const plot of [this.positionPlot, this.motorPlot, this.voltagePlot]) if (plot.data) plot.show([[], ...plot.data.slice(1).map(() => [])], "no samples");
-      if (error.status === 401) this.live.end(error.message);
     }
   }
 
@@ -287,6 +323,7 @@ export class MachinePage {
     const every = kept >= window.samples;
     this.rate.disabled = every;
     setText(this.windowNote, `${duration(window.samples / window.rate)} at ${brief(window.rate)} Hz, sent for: ${window.reason}; version ${window.version} in force. ${every ? "Every sample is shown." : "The least and greatest sample of each column are shown."} Drag to look closer, double click for all.`);
+    if (window.rest) this.showRest(window.rest, unit);
     this.positionPlot.options.yLabel = `Position (${unit.name})`;
     const joined = (first, second) => uPlot.join([first, second].map((each) => (each ? [each.time, each.values] : [[], []])));
     const stretch = (data, factors) => [data[0], ...data.slice(1).map((values, i) => filled(values).map((value) => (value === null ? null : value * factors[i])))];
@@ -296,6 +333,19 @@ export class MachinePage {
     this.voltagePlot.options.yLabel = `Command (${machine.command_unit})`;
     this.voltagePlot.show(command ? [command.time, command.values] : [[], []], `Command in ${machine.command_unit}`);
     this.showLoop(motor, position, machine);
+  }
+
+  // The limit-cycle indicator.
+  showRest({ word, swing, frequency, seconds }, unit) {
+    const over = `in the ${brief(seconds)} s after the last step`, size = swing === null ? "" : `± ${brief(swing * unit.factor)} ${unit.name}`;
+    const [mark, words] = {
+      rest: ["good", `No limit cycle: the load comes to rest ${over}, within ${size}.`],
+      "limit cycle": ["bad", `Limit cycle: ${over} the load goes on swinging by ${size}${frequency === null ? "" : ` at ${brief(frequency)} Hz`}.`],
+      "swings down": ["none", `The load still swings, but less and less: ${size} at the end, ${brief(frequency)} Hz.`],
+      "not seen": ["none", "The window does not tell whether there is a limit cycle: the reference moves, or the time after its last step is too short."],
+    }[word];
+    this.rest.className = `mark ${mark}`;
+    setText(this.rest, words);
   }
 
   showLoop(motor, position, machine) {

@@ -1,11 +1,12 @@
 /* What if: another gap, dead zone or gains on the machine's model; the twin simulates the step. */
 
 import * as api from "./api.js";
-import { legend, TimePlot } from "./charts.js";
+import { legend, mapPlot, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
 import { brief, DEG, positionUnit } from "./format.js";
 
 const PACE_MS = 60; // below the rate that the twin allows an operator
+const MAP_MS = 700; // until the next look at a map that is being computed
 const STEPS = 400, WIDEST = 3, FACTOR = 4;
 // Gains that have a slider, with the unit of each: U command, X travel.
 const GAINS = {
@@ -23,10 +24,12 @@ export class WhatIfPanel {
     this.note = element("p", { class: "soft" }, "Simulates a step of the machine's model with another gap, dead zone or gains. Nothing is sent to the machine.");
     this.words = element("p", { class: "error", role: "status" });
     this.controls = element("div", { class: "sliders" });
+    this.place = element("p", { class: "soft map-words" });
+    this.map = element("div", { class: "hysteresis map" });
     this.places = { position: element("div", { class: "chart" }), command: element("div", { class: "chart low" }) };
     this.body = element("div", { class: "pair", hidden: true },
       element("div", {}, legend(["orange", "reference"], ["blue", "position"]), this.places.position, legend(["blue", "command"]), this.places.command),
-      this.controls);
+      element("div", {}, this.controls, element("h3", {}, "In the stability map"), this.place, this.map));
     this.tools = [this.open, this.reset];
     this.content = [this.note, this.words, this.body];
     const plot = (place, options) => new TimePlot(place, { xLabel: "Time (s)", ...options });
@@ -66,6 +69,19 @@ export class WhatIfPanel {
     }
     this.asking = false;
     if (this.again) this.ask();
+    else if (this.found?.map.left && !this.words.textContent && !this.closed) this.later ??= setTimeout(() => this.look(), MAP_MS);
+  }
+
+  // The map is filled cell by cell: the same question again shows more of it.
+  look() {
+    this.later = null;
+    if (this.closed || document.hidden) return;
+    this.ask();
+  }
+
+  close() {
+    this.closed = true;
+    clearTimeout(this.later);
   }
 
   show(found) {
@@ -81,11 +97,31 @@ export class WhatIfPanel {
       this.makeSliders(found, unit);
     }
     for (const slider of this.sliders) slider.show(found);
+    this.showMap(found.map);
     this.position.options.yLabel = `Position (${unit.name})`;
     const scaled = (values) => values.map((value) => value * unit.factor);
     this.position.show([found.time, scaled(found.reference), scaled(found.position)], `Simulated step in ${unit.name}`);
     this.command.options.yLabel = `Command (${found.command_unit})`;
     this.command.show([found.time, found.command], `Command of the simulated step in ${found.command_unit}`);
+  }
+
+  showMap(map) {
+    if (map.why) {
+      setText(this.place, `${map.why[0].toUpperCase()}${map.why.slice(1)}`);
+      this.map.replaceChildren();
+      return;
+    }
+    const share = map.settled[map.row][map.column], near = `${brief(map.tolerances[map.row])} and ${brief(map.steps[map.column])}`;
+    const here = share === null
+      ? "is being computed"
+      : `settles from ${Math.round(share * map.starts)} of ${map.starts} starts`;
+    const left = map.left ? ` ${map.left} cells are still being computed.` : "";
+    setText(this.place, `Dead zone ${brief(map.tolerance)} and step ${brief(map.step)}, each over half the travel in the gap. The nearest cell, ${near}, ${here}. Darker cells settle from more starts.${left}`);
+    const mark = { row: placeOf(map.tolerances, map.tolerance), column: placeOf(map.steps.map(Math.log), Math.log(map.step)) };
+    this.map.replaceChildren(mapPlot(map.tolerances, map.steps, map.settled, mark, {
+      xLabel: "Step over half the travel in the gap", yLabel: "Dead zone over the same",
+      about: `Stability map of these gains without sampling and limits: darker cells settle from more of their ${map.starts} starts. ${this.place.textContent}`,
+    }));
   }
 
   makeSliders(found, unit) {
@@ -109,6 +145,14 @@ export class WhatIfPanel {
     this.sliders = made;
     this.controls.replaceChildren(...made.map((slider) => slider.row));
   }
+}
+
+// Place of a value between rising ones, in steps of the list.
+function placeOf(values, value) {
+  const above = values.findIndex((each) => each > value);
+  if (above < 0) return values.length - 1;
+  if (above === 0) return 0;
+  return above - 1 + (value - values[above - 1]) / (values[above] - values[above - 1]);
 }
 
 // A quarter to four times a value, whatever its sign; in the middle the value itself.

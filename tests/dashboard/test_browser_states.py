@@ -1,0 +1,162 @@
+"""The dashboard in Debian's Chromium: streams and tabs, bad input, a twin or a session that ends."""
+
+import itertools
+import json
+import re
+
+import httpx
+import pytest
+from browser_pages import MARKUP, has_text, open_machine, reaches, watchers
+from dashboard_fleet import SILENT, WEARING
+from service_system import OPERATOR, OTHER, TOKEN, bearer, place, window
+
+from servotwin.link.seal import verifier_of
+from servotwin.messages import encode
+from servotwin.twin_service.auth import Verifiers, write_tokens
+
+pytestmark = pytest.mark.slow
+
+
+def test_states_without_data_are_said_in_words(open_page):
+    page = open_page(expected=("status of 404",))
+    open_machine(page, SILENT)
+    has_text(page, ".empty", "No window of this machine has come yet")
+    open_machine(page, "nobody")
+    has_text(page, ".empty", "The twin knows no machine of this name")
+    open_machine(page, "m-0001")  # its window holds no samples that can be read
+    has_text(page, "[aria-label=Window] p", "no longer stored")
+
+
+def test_a_page_that_nobody_sees_leaves_its_stream_to_others(open_page, twin):
+    reaches(lambda: watchers(twin), 0)
+    page = open_page()
+    reaches(lambda: watchers(twin), 1)
+    see = "hidden => { Object.defineProperty(document, 'hidden', { get: () => hidden, configurable: true });"
+    see += " document.dispatchEvent(new Event('visibilitychange')); }"
+    page.evaluate(see, True)
+    reaches(lambda: watchers(twin), 0)
+    page.evaluate(see, False)
+    reaches(lambda: watchers(twin), 1)
+
+
+def test_a_new_window_appears_by_itself(open_page, twin):
+    page = open_page()
+    page.fill(".search", SILENT)
+    has_text(page, ".rows .row", "none yet")
+    sent = window(5, SILENT)
+    answer = httpx.put(twin.url + place(sent), content=encode(sent), headers=bearer(OTHER))
+    assert answer.status_code == 201
+    has_text(page, ".rows .row [data-column=window]", "s ago")
+
+
+def test_text_from_outside_is_never_executed(open_page, twin):
+    page = open_page(expected=("status of 400", "status of 404"))
+    rows = httpx.get(f"{twin.url}/v1/fleet?limit=1", headers=bearer(OPERATOR)).json()
+    hostile = {**rows["rows"][0], "servo": MARKUP, "status": MARKUP, "receipt": MARKUP}
+    rows["rows"] = [{**hostile, "alarms": [{"time": 0.0, "sentence": MARKUP}]}]
+    page.route("**/v1/fleet?*", lambda route: route.fulfill(body=json.dumps(rows), content_type="application/json"))
+    page.reload()
+    has_text(page, ".rows .row a", "<img src=x")
+    page.locator(".rows .row a").first.click()
+    has_text(page, "h1", "<script>")
+    has_text(page, ".alarms li", "onerror")
+
+
+def test_seven_tabs_of_a_browser_share_one_stream(open_page, twin):
+    reaches(lambda: watchers(twin), 0)
+    page = open_page()
+    tabs = [page.context.new_page() for _ in range(6)]
+    for tab in tabs:
+        tab.goto(twin.url)
+        tab.wait_for_selector(".rows .row")
+        tab.wait_for_selector("[data-live=live]", state="attached")
+    assert watchers(twin) == 1
+    sent = window(7, SILENT)
+    assert httpx.put(twin.url + place(sent), content=encode(sent), headers=bearer(OTHER)).status_code == 201
+    for tab in (page, *tabs):
+        tab.fill(".search", SILENT)
+        tab.locator(".rows .row", has_text=SILENT).locator("[data-column=window]", has_text="s ago").wait_for()
+    for tab in tabs:
+        tab.close()
+    assert watchers(twin) == 1
+    page.close()
+    reaches(lambda: watchers(twin), 0)
+
+
+def test_a_malformed_event_keeps_the_last_good_data(open_page):
+    page = open_page()
+    page.add_init_script("delete globalThis.SharedWorker")  # where there is none, each page has a stream of its own
+    broken = "id: 1-1\nevent: rows\ndata: {broken\n\n"
+    page.route("**/v1/fleet/events*", lambda route: route.fulfill(body=broken, content_type="text/event-stream"))
+    page.reload()
+    has_text(page, "#state", "What is shown is of")
+    assert page.locator(".rows .row").count() > 10
+    assert page.locator(".table.stale").count() == 1
+    page.unroute("**/v1/fleet/events*")
+    page.wait_for_selector("[data-live=live]", state="attached")
+
+
+def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):
+    page = open_page(expected=("ERR_", "Failed to load"))
+    page.evaluate("window.kept = 1")
+    twin.kill()
+    has_text(page, "#state", "cannot be reached")
+    has_text(page, "#state", "What is shown is of")
+    assert page.locator(".rows .row").count() > 10
+    twin.restart()
+    page.wait_for_selector("[data-live=live]", state="attached")
+    assert page.evaluate("window.kept") == 1
+    page.locator(".table:not(.stale)").wait_for()
+
+
+def test_an_answer_of_the_live_view_that_cannot_be_read_is_said_and_forgotten(open_page):
+    page = open_page()
+    answers = itertools.cycle(("{broken", "[1]", '{"state": "live"}'))
+    page.route("**/live?*", lambda route: route.fulfill(body=next(answers), content_type="application/json"))
+    open_machine(page, WEARING)
+    has_text(page, "[aria-label=Live] p", "The twin's answer cannot be read")
+    page.unroute("**/live?*")
+    has_text(page, "[aria-label=Live] p", "The edge is not connected")
+
+
+def test_a_browser_whose_clock_is_two_hours_slow_shows_the_twin_s_ages(open_page):
+    page = open_page()
+    page.add_init_script("const now = Date.now; Date.now = () => now() - 7.2e6;")
+    page.reload()
+    page.fill(".search", WEARING)
+    row = page.locator(".rows .row", has_text=WEARING)
+    row.locator("[data-column=window]", has_text=re.compile(r"^[\d.]+ (s|min) ago")).wait_for()
+
+
+def test_a_session_that_has_ended_asks_for_the_token_and_keeps_what_is_shown(open_page):
+    page = open_page(expected=("status of 401",))
+    open_machine(page, WEARING)
+    page.wait_for_selector(".hysteresis svg")
+    page.context.clear_cookies()
+    page.select_option("[aria-label=Window] select", index=1)
+    page.wait_for_selector("#token")
+    has_text(page, "#state", "session has ended")
+    assert page.locator("[aria-label=Window] .uplot").count() == 3
+    has_text(page, "[aria-label=Window] p", "What is shown is the window before")
+    assert page.is_visible(".hysteresis svg")
+    page.fill("#token", OPERATOR)
+    page.press("#token", "Enter")
+    page.wait_for_selector("[data-live=live]", state="attached")
+    page.locator("#login").wait_for(state="hidden")
+
+
+def test_a_revoked_token_ends_the_session(open_page, twin):
+    page = open_page(expected=("status of 401", "status of 403"))
+    known = {"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}
+    write_tokens(twin.path.parent / "tokens.toml", Verifiers(known, {"me": verifier_of("another")}))
+    try:
+        page.wait_for_timeout(1500)  # the twin looks at the file once a second
+        open_machine(page, WEARING)
+        page.wait_for_selector("#token")
+        has_text(page, "#state", "session has ended")
+        assert page.is_visible("h1 >> text=ax-1")
+        page.fill("#token", "another")
+        page.press("#token", "Enter")
+        page.wait_for_selector(".hysteresis svg")
+    finally:
+        write_tokens(twin.path.parent / "tokens.toml", Verifiers(known, {"me": verifier_of(OPERATOR)}))
