@@ -16,7 +16,7 @@ from servotwin.estimation.kinematic.strokes import Strokes, play_and_side
 from servotwin.plant.signals import Array
 
 ROWS = 150_000  # samples that count, evenly chosen; the play itself passes all of them
-_SPAN = 5  # samples on either side of a difference quotient
+SPAN = 5  # samples on either side of a difference quotient
 LOAD, RATIO, OFFSET, LAG, WIND_UP, INERTIA = "load", "ratio", "offset", "lag", "wind-up", "acceleration"
 
 
@@ -53,11 +53,17 @@ class Regression(NamedTuple):
 
 
 def regression(
-    recording: EncoderRecording, strokes: Strokes, first: int, cycles: Sequence[float] = (), lag: float = 0.0
+    recording: EncoderRecording,
+    strokes: Strokes,
+    first: int,
+    known: Any = None,
+    cycles: Sequence[float] = (),
+    lag: float = 0.0,
 ) -> Regression:
-    """Choose the rows from sample `first` on."""
+    """Choose the rows from sample `first` on; those that `known` (n,) says not to count do not."""
     begin = max(first, int(strokes.begin[0]))
     rows = np.unique(np.linspace(begin, recording.motor.size - 1, min(ROWS, recording.motor.size - begin)).astype(int))
+    rows = rows if known is None or not known[rows].any() else rows[known[rows]]
     bounds = np.searchsorted(rows, np.maximum(strokes.begin, begin))
     kept = np.diff(bounds, append=rows.size) > 0
     strokes = Strokes(strokes.begin[kept], strokes.side[kept])
@@ -86,8 +92,8 @@ def columns(design: Regression, gap: float) -> tuple[Array, Array]:
 def _rate(time: Array, values: Array) -> Array:
     """Difference quotient over a few samples on either side."""
     result = np.zeros_like(values)
-    if values.size > 2 * _SPAN:
-        result[_SPAN:-_SPAN] = (values[2 * _SPAN :] - values[: -2 * _SPAN]) / (time[2 * _SPAN :] - time[: -2 * _SPAN])
+    if values.size > 2 * SPAN:
+        result[SPAN:-SPAN] = (values[2 * SPAN :] - values[: -2 * SPAN]) / (time[2 * SPAN :] - time[: -2 * SPAN])
     return result
 
 

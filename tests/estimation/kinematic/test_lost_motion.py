@@ -1,10 +1,11 @@
 """The gap between two encoders, without a model of the dynamics."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from recordings import recording, swings
+from recordings import recording, short_strokes, swings
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
@@ -149,3 +150,21 @@ def test_intervals_cover():
         inside += found.interval_motor[0] <= 0.08 <= found.interval_motor[1]
     assert inside >= 11
     assert accepted >= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("amplitude", "seed"), [(1.5, 4), (2.5, 1), (4.0, 3)])
+def test_strokes_little_longer_than_the_gap_show_it_on_both_sides(amplitude, seed):
+    # Before: 1.9973 +- 0.0006 rad for 2 rad, the end of a grid; 1.96 +- 0.1 rad; and, at the load, 3.198 mm for 3.2 mm.
+    found = estimate_lost_motion(short_strokes(2.0, amplitude, seed))
+    assert found.ok, found.reasons
+    for (low, high), gap in ((found.interval_motor, 2.0), (found.interval_load, 3.2)):
+        assert low <= gap <= high
+        assert high - low < 4e-3 * gap
+
+
+@pytest.mark.slow
+def test_the_lag_that_is_told_is_that_of_the_final_fit():
+    made = short_strokes(2.0, 2.5, 0)
+    late = replace(made, load=np.interp(made.time - 3e-3, made.time, made.load))
+    assert estimate_lost_motion(late).lag == pytest.approx(3e-3, abs=1e-4)

@@ -15,7 +15,7 @@ def test_where_no_gap_is_seen_the_largest_lead_bounds_it(reach):
         gap=0.0,
         by_travel=0.0,
         simpler={},
-        spread=Spread(np.zeros(300), np.zeros(300), 10),
+        spread=Spread(np.zeros(300), np.zeros(300), np.zeros(300), 10),
         half=0.01,
         quantisation=0.002,
         left=0.001,
