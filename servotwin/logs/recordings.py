@@ -28,6 +28,9 @@ _BACKWARDS = 0.9  # of the steps in time
 _LEFT = 0.3  # of the samples, at least: with fewer the log is not what it seems
 # A number in brackets is a row of a matrix.
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
+_BEHIND_COMMA = re.compile(
+    r"^(?P<name>.*\w)\s*[,/]\s*(?P<unit>rad|mrad|deg|°|rev|m|mm|um|µm|nm|s|ms|us|ns|V|A|N|N m)\s*$"
+)
 # Longer ones first: the end of _n_m is no metre.
 _ENDINGS = ("n_m", "deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n")
 _SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
@@ -246,7 +249,7 @@ def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
 
 def bare_name(name: str) -> str:
     """A column's name without its unit."""
-    found = _UNIT.match(name)
+    found = _UNIT.match(name) or _BEHIND_COMMA.match(name)
     if found:
         return found["name"]
     ending = _ending(name)
@@ -255,7 +258,7 @@ def bare_name(name: str) -> str:
 
 def named_unit(name: str) -> str:
     """The unit that a column's name says; empty where it says none."""
-    found = _UNIT.match(name)
+    found = _UNIT.match(name) or _BEHIND_COMMA.match(name)
     if found:
         return found["unit"].strip()
     return _ending(name)
