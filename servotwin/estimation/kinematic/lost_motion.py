@@ -11,7 +11,7 @@ from scipy.stats import t as student
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
-from servotwin.estimation.kinematic.breaks import check_one_machine
+from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
@@ -43,6 +43,7 @@ _ROUNDS = 8
 _END, _SAME = 0.9, 0.7  # of a grid's width: a minimum beyond lies outside; of the spread on a wider grid
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
+_JUMPS, _NEAR_BY = 5.0, 0.01  # times the step to the next sample but one, and of the range: two motions by turns
 _PIECES = 10  # of a stroke on the average, in each of which noise and hunting average out
 _SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
 _SKEW = 2.0  # samples between two channels that are nothing unusual
@@ -141,6 +142,7 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     least = _least_motion(recording.motor, motor_count)
     strokes = strokes_of(recording, least)
     _check(recording, least, strokes.reversals)
+    check_not_joined(recording)
     if not _follows(recording.load, load_count, strokes.reversals):
         return _bound(recording)
     prepared = regression(recording, strokes, 0)
@@ -181,6 +183,12 @@ def _follows(load: Array, count: float, reversals: int) -> bool:
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
     unit, source = recording.motor_unit, recording.source
     reach = float(np.ptp(recording.motor))
+    for part, values in (("motor", recording.motor), ("load", recording.load)):
+        if _alternates(values):
+            raise InvalidInput(
+                f"{source}: the {part}'s position jumps to and fro from sample to sample: two machines by turns in one "
+                "log; give each by itself"
+            )
     if not reach > 2.0 * least:
         raise InvalidInput(
             f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and its noise or hunting "
@@ -191,6 +199,14 @@ def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
             f"{source}: the motor reverses {max(reversals, 0)} times in {np.ptp(recording.time):.4g} s: the gap shows "
             f"at reversals only; record at least {_LEAST_REVERSALS}, better ten"
         )
+
+
+def _alternates(values: Array) -> bool:
+    """True where every second sample belongs to another motion: far from its neighbours, near the next but one."""
+    near, far = np.diff(values), values[2:] - values[:-2]
+    return float(np.median(np.abs(near))) > _JUMPS * max(
+        float(np.median(np.abs(far))), _NEAR_BY * float(np.ptp(values))
+    )
 
 
 def _settled(recording: EncoderRecording, gap: float) -> int | None:
@@ -366,6 +382,7 @@ def _no_gap() -> LostMotion:
 def _bound(recording: EncoderRecording) -> LostMotion:
     reach = float(np.ptp(recording.motor))
     reason = (
-        f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the lost motion is larger"
+        f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the lost "
+        "motion is larger, or the load's column is of something else"
     )
     return LostMotion(reach, np.inf, (reach, np.inf), np.nan, 1.0, 0.0, GapStatus.LOWER_BOUND, (reason,))

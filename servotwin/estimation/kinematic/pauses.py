@@ -26,7 +26,7 @@ def behind_pauses(recording: EncoderRecording, gap: float) -> Any:
     time, motor = recording.time, recording.motor
     allowed = max(_COUNTS * counts_of(recording)[0], _SHARE * gap)
     result = np.zeros(motor.size, dtype=np.bool_)
-    for row in _pauses(time, motor):
+    for row in pauses_of(time, motor):
         if row <= _EDGE or row + _EDGE >= motor.size:
             continue
         before, behind = _speed(time, motor, row - 1 - _EDGE), _speed(time, motor, row)
@@ -36,12 +36,16 @@ def behind_pauses(recording: EncoderRecording, gap: float) -> Any:
     return result
 
 
-def _pauses(time: Array, motor: Array) -> list[int]:
-    """Samples behind a pause, or behind a jump of the motor."""
-    intervals, steps = np.diff(time), np.abs(np.diff(motor))
-    moving = steps[steps > 0.0]
-    far = _FAR * float(np.quantile(moving, _FAST)) if moving.size else np.inf
-    return [int(row) + 1 for row in np.flatnonzero((intervals > _LONG * np.median(intervals)) | (steps > far))]
+def pauses_of(time: Array, *positions: Array) -> list[int]:
+    """Samples behind a pause, or behind a jump of a position."""
+    intervals = np.diff(time)
+    found = intervals > _LONG * np.median(intervals)
+    for values in positions:
+        steps = np.abs(np.diff(values))
+        moving = steps[steps > 0.0]
+        if moving.size:
+            found |= steps > _FAR * float(np.quantile(moving, _FAST))
+    return [int(row) + 1 for row in np.flatnonzero(found)]
 
 
 def _speed(time: Array, motor: Array, begin: int) -> float:
