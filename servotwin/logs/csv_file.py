@@ -198,38 +198,57 @@ def _values(
     lines: Sequence[str], layout: _Layout, places: Sequence[int], line_number: int
 ) -> tuple[Array, dict[int, str]]:
     """(n, c) numbers, and in words the first cell of each column that is none."""
-    if not lines:
-        return np.empty((0, len(places))), {}
-    text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
     try:
-        return np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None), {}
+        return _numbers(lines, layout, places), {}
     except ValueError:
-        return _patiently(lines, layout, places, line_number)
+        pass
+    # A comment, or a cell that is no number: no line is looked at before that.
+    kept = [(line_number + row, line) for row, line in enumerate(lines) if _is_row(line)]
+    if len(kept) < len(lines):
+        try:
+            return _numbers([line for _, line in kept], layout, places), {}
+        except ValueError:
+            pass
+    return _patiently(kept, layout, places)
+
+
+def _numbers(lines: Sequence[str], layout: _Layout, places: Sequence[int]) -> Array:
+    if all(map(str.isspace, lines)):
+        return np.empty((0, len(places)))
+    text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
+    return np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None)
+
+
+def _is_row(line: str) -> bool:
+    return not line.isspace() and not line.startswith(_COMMENTS)
 
 
 def _blocks(file: IO[str], line_number: int) -> Iterator[tuple[int, list[str]]]:
-    """Lines with numbers and the number of the first, at least one block."""
+    """Lines with the number of the first, at least one block."""
     lines = list(islice(file, _ROWS))
-    yield line_number, [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
+    yield line_number, lines
     while lines:
         line_number += len(lines)
         lines = list(islice(file, _ROWS))
         if lines:
-            yield line_number, [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
+            yield line_number, lines
 
 
-def _patiently(lines: Sequence[str], layout: _Layout, places: Sequence[int], line: int) -> tuple[Array, dict[int, str]]:
+def _patiently(
+    lines: Sequence[tuple[int, str]], layout: _Layout, places: Sequence[int]
+) -> tuple[Array, dict[int, str]]:
+    """As `_values`, cell by cell; `lines` with their numbers."""
     damaged: dict[int, str] = {}
     result = np.full((len(lines), len(places)), np.nan)
-    for row, text in enumerate(lines):
+    for row, (number, text) in enumerate(lines):
         cells = _cells(text, layout.separator)
         for column, place in enumerate(places):
             cell = cells[place] if place < len(cells) else ""
-            number = _number(cell, layout.decimal_comma)
-            if number is None:
-                damaged.setdefault(column, f"line {line + row}: {cell[:30]!r}")
+            value = _number(cell, layout.decimal_comma)
+            if value is None:
+                damaged.setdefault(column, f"line {number}: {cell[:30]!r}")
             else:
-                result[row, column] = number
+                result[row, column] = value
     return result, damaged
 
 

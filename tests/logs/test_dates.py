@@ -5,6 +5,7 @@ import pytest
 from recordings import recording
 
 from servotwin.errors import InvalidInput
+from servotwin.logs.csv_file import csv_blocks
 from servotwin.logs.dates import time_of
 from servotwin.logs.recordings import RecordingColumns, named_unit, read_recording
 
@@ -73,3 +74,15 @@ def test_text_in_place_of_all_numbers_is_told_with_its_line(tmp_path):
 @pytest.mark.parametrize(("name", "unit"), [("motor, rad", "rad"), ("Weg / mm", "mm"), ("a, b", ""), ("load", "")])
 def test_a_unit_behind_a_comma(name, unit):
     assert named_unit(name) == unit
+
+
+def test_comments_and_blank_lines_between_rows_are_left_out_and_lines_are_counted_with_them(tmp_path):
+    rows = [f"{t:.6f},{m:.6f},{x:.6f}" for t, m, x in TABLE]
+    rows[100:100] = ["", "# stopped for a coffee", "   "]
+    rows[200] = rows[200].rpartition(",")[0] + ",broken"
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["time,motor,load", *rows, "", ""]))
+    log = read_recording(path, RecordingColumns())
+    assert log.found == {"without a number in some column": 1}
+    assert log.recording.time.size == MADE.time.size - 1
+    assert next(csv_blocks(path, ["load"])).damaged == {"load": "line 202: 'broken'"}

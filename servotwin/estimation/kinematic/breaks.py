@@ -59,8 +59,8 @@ def check_not_joined(recording: EncoderRecording) -> None:
         if abs(change) > max(_OTHER, _OFF * spread / way):
             raise InvalidInput(
                 f"{recording.source}: the load moves by {before.slope:.4g} {recording.load_unit} per "
-                f"{recording.motor_unit} until {time[row]:.4g} s and by {after.slope:.4g} from then on: two machines or "
-                "units in one log; give each part by itself"
+                f"{recording.motor_unit} until {time[row]:.4g} s and by {after.slope:.4g} from then on: two machines "
+                "or units in one log; give each part by itself"
             )
         if abs(after.load - before.load) > _OFF * spread:
             raise InvalidInput(_slipped(recording, row, after.load - before.load))

@@ -258,7 +258,7 @@ def _tensor(prepared: Regression, coarse: float, least: float) -> tuple[Array, A
     most = max(coarse, least)
     near = np.linspace(1.0 - _NEAR, 1.0 + _NEAR, _FINE)
     grid = most * np.unique(np.concatenate([np.linspace(0.0, 2.0, _FINE), near]))
-    return grid, np.array([products(prepared, gap) for gap in grid])
+    return grid, np.array([products(prepared, gap)[0] for gap in grid])
 
 
 def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
@@ -269,8 +269,9 @@ def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tup
     for _ in range(_ROUNDS):
         middle = gap
         grid = np.linspace(max(middle - width, 0.0), middle + width, _FINE)
-        by_time = np.array([products(prepared, each) for each in grid])
-        by_travel = np.array([products(prepared, each, travel) for each in grid])
+        by_time, by_travel = (
+            np.array(each) for each in zip(*(products(prepared, each, travel) for each in grid), strict=True)
+        )
         spread = draws.bootstrap(grid, by_time, by_travel, places)
         gap, other = (float(least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel))
         wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), least)

@@ -97,17 +97,15 @@ def _rate(time: Array, values: Array) -> Array:
     return result
 
 
-def products(design: Regression, gap: float, weights: Array | None = None) -> Array:
-    """Sums of products of the columns, (m strokes, p, p)."""
+def products(design: Regression, gap: float, *weights: Array) -> tuple[Array, ...]:
+    """Sums of products of the columns, (m strokes, p, p): of all rows alike, and under each of the weights (k,)."""
     values, _ = columns(design, gap)
-    weighted = values if weights is None else values * weights
-    parts = [
-        segment @ other.T
-        for segment, other in zip(
-            np.split(weighted, design.bounds[1:], axis=1), np.split(values, design.bounds[1:], axis=1), strict=True
-        )
-    ]
-    return np.array(parts)
+    return tuple(_by_stroke(each, values, design.bounds) for each in (values, *(values * weight for weight in weights)))
+
+
+def _by_stroke(weighted: Array, values: Array, bounds: Any) -> Array:
+    ends = [*bounds[1:], values.shape[1]]
+    return np.array([weighted[:, a:b] @ values[:, a:b].T for a, b in zip(bounds, ends, strict=True)])
 
 
 class Solution(NamedTuple):
