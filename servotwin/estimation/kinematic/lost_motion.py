@@ -328,6 +328,7 @@ def _answer(
             half=half,
             quantisation=quantisation,
             left=left,
+            rms=float(np.sqrt(np.mean(residual**2))) / abs(ratio),
             better_than_none=best.rms < comparisons[-1].rms,
             lead=_lead(prepared, best),
             reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),

@@ -39,6 +39,8 @@ class KinematicFit(NamedTuple):
         Standard deviation of the encoders' quantisation.
     left : float
         What the model leaves of the load's motion, noise aside.
+    rms : float
+        The same with what seems to be noise.
     better_than_none : bool
         Unseen strokes are predicted better with a gap than without.
     reach : float
@@ -54,6 +56,7 @@ class KinematicFit(NamedTuple):
     half: float
     quantisation: float
     left: float
+    rms: float
     better_than_none: bool
     reach: float
     lead: float
@@ -103,6 +106,12 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
         )
     if fit.left > max(_LEFT * fit.gap, fit.quantisation):
         reasons.append(f"the load deviates from the model by {fit.left:.3g} {unit} (rms, at the motor), noise aside")
+    if fit.rms > max(fit.gap, _COUNTS * fit.quantisation):
+        # A load that hunts at a few samples a period looks like noise, and goes through its gap unseen.
+        reasons.append(
+            f"the load deviates by {fit.rms:.3g} {unit} (rms, at the motor) from sample to sample, more than the gap: "
+            "it hunts, or the log is noisier than an encoder"
+        )
     if fit.gap - fit.half > fit.reach:
         reasons.append(
             f"the motor is never further ahead of the load than {fit.reach:.4g} {unit}, less than the gap of "

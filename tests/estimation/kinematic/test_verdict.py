@@ -19,6 +19,7 @@ def test_where_no_gap_is_seen_the_largest_lead_bounds_it(reach):
         half=0.01,
         quantisation=0.002,
         left=0.001,
+        rms=0.001,
         better_than_none=False,
         reach=reach,
         lead=0.0,
@@ -26,3 +27,15 @@ def test_where_no_gap_is_seen_the_largest_lead_bounds_it(reach):
     judged = verdict(fit, "rad")
     assert judged.status is GapStatus.UNIDENTIFIABLE
     assert judged.interval == (0.0, max(reach, 0.01))
+
+
+def test_a_load_that_seems_noisier_than_its_gap_is_doubted_up_to_the_largest_lead():
+    # A ball screw that hunted: 0.65 to 1.39 rad, "lost motion", for a gap of a turn.
+    spread = Spread(*(np.full(300, 1.0) for _ in range(3)), 10)
+    numbers = {"by_travel": 1.0, "simpler": {}, "spread": spread, "half": 0.2, "quantisation": 1e-3, "left": 0.05}
+    fit = KinematicFit(gap=1.0, rms=2.0, better_than_none=True, reach=7.0, lead=0.0, **numbers)
+    judged = verdict(fit, "rad")
+    assert judged.status is GapStatus.MODEL_MISMATCH
+    assert judged.interval[1] == 7.0
+    assert "it hunts, or the log is noisier than an encoder" in judged.reasons[0]
+    assert verdict(fit._replace(rms=0.5), "rad").status is GapStatus.OK
