@@ -6,9 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from servotwin.estimation.estimate import Interval
 from servotwin.estimation.kinematic.models import Model
 from servotwin.estimation.kinematic.regression import Regression, Solution, columns, solved
 from servotwin.plant.signals import Array
+
+_PROFILE = 25  # gaps
 
 
 class FittedCurves(NamedTuple):
@@ -17,10 +20,10 @@ class FittedCurves(NamedTuple):
     Attributes
     ----------
     time, load, lead, residual : (k,) array
-        Times in s, positions of the load, by how much the motor leads it (the motor's unit), and what the model leaves
-        (the load's).
+        Times in s, positions of the load, by how much the motor leads it (the motor's unit, the lag taken off), and
+        what the model leaves (the load's).
     gaps, rms : (g,) array
-        Error of the model, the load's unit, for other gaps.
+        Error of the model, the load's unit, for gaps from 0 to beyond the one found.
     """
 
     time: Array
@@ -31,20 +34,28 @@ class FittedCurves(NamedTuple):
     rms: Array
 
 
-def fitted_curves(prepared: Regression, model: Model, gap: float, grid: Array, squares: Array) -> FittedCurves:
-    """Draw a model with a gap (the motor's unit); `squares` (g,) are what it leaves with the gaps of a grid."""
-    recording, rows = prepared.recording, prepared.rows
+def fitted_curves(prepared: Regression, model: Model, gap: float, interval: Interval) -> FittedCurves:
+    """Draw a model with a gap and its 95 % interval (the motor's unit); `prepared` has the fitted lag."""
+    recording, rows, places = prepared.recording, prepared.rows, model.places(prepared)
     values, _ = columns(prepared, gap)
-    places = model.places(prepared)
     fit = solved(values @ values.T, places)
+    motor = np.interp(recording.time[rows] - prepared.lag, recording.time, recording.motor)
+    reach = float(np.ptp(recording.motor))
+    most = min(max(2.0 * gap, 1.2 * interval[1] if np.isfinite(interval[1]) else 0.0), 0.9 * reach) or 0.5 * reach
+    gaps = np.unique(np.append(np.linspace(0.0, most, _PROFILE), gap))
     return FittedCurves(
         time=recording.time[rows],
         load=values[0],
-        lead=recording.motor[rows] - _follower(values, fit, places),
+        lead=motor - _follower(values, fit, places),
         residual=values[0] - fit.coefficients @ values[places],
-        gaps=grid,
-        rms=np.sqrt(squares / rows.size),
+        gaps=gaps,
+        rms=np.sqrt([_squares(prepared, each, places) / rows.size for each in gaps]),
     )
+
+
+def _squares(prepared: Regression, gap: float, places: list[int]) -> float:
+    values, _ = columns(prepared, gap)
+    return float(solved(values @ values.T, places).squares)
 
 
 def _follower(values: Array, fit: Solution, places: list[int]) -> Array:

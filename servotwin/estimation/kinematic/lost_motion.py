@@ -158,10 +158,9 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
     comparisons = compared(prepared, grid, tensor, counts)
     best = chosen(comparisons[:-1])
-    errors = solved(tensor.sum(axis=1), best.model.places(prepared)).squares
     found = _answer(recording, prepared, best, comparisons, least)
     shown = found.at_motor if math.isfinite(found.at_motor) else 0.0
-    curves = fitted_curves(prepared._replace(lag=found.lag), best.model, shown, grid, errors)
+    curves = fitted_curves(prepared._replace(lag=found.lag), best.model, shown, found.interval_motor)
     return replace(found, curves=curves)
 
 

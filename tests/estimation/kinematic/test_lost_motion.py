@@ -168,3 +168,12 @@ def test_the_lag_that_is_told_is_that_of_the_final_fit():
     made = short_strokes(2.0, 2.5, 0)
     late = replace(made, load=np.interp(made.time - 3e-3, made.time, made.load))
     assert estimate_lost_motion(late).lag == pytest.approx(3e-3, abs=1e-4)
+
+
+def test_curves_take_the_lag_off_and_have_their_least_error_at_the_gap():
+    found = estimate_lost_motion(recording(lag=20e-3))
+    curves = found.curves
+    assert curves.gaps[np.argmin(curves.rms)] == pytest.approx(found.at_motor, rel=1e-6)
+    assert curves.gaps[0] == 0.0
+    # Before: the lag of 20 ms let the loop bulge by several gaps.
+    assert np.ptp(np.quantile(curves.lead, (0.01, 0.99))) == pytest.approx(0.05, rel=0.1)
