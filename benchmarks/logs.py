@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -27,6 +27,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.driven_load.estimate import with_dynamics
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within, wind_up
 from servotwin.logs.recordings import read_recording
 from servotwin.plant.axis import Axis
@@ -156,34 +157,47 @@ def _drawn(name: str, seed: tuple[int, ...]) -> LogCase:
     return LogCase(name, plant, gap, amplitude, speed, cyclic, period, str(random.choice(list(WRITERS))), seed)
 
 
-def measured(case: LogCase) -> dict[str, Any]:
-    """Write a case's log, read it and estimate its gap."""
+class _Answered(NamedTuple):
+    """Answers to one log: without a machine and with it, and its recording in SI units at the load."""
+
+    recording: EncoderRecording
+    alone: TransmissionGap
+    with_axis: TransmissionGap | str
+
+
+def _answered(case: LogCase, path: Path, table: Array) -> _Answered:
+    """Write a log, read it and estimate its gap; a refusal of the axis is its sentence."""
+    recording = read_recording(path, WRITERS[case.file](path, table)).recording
+    lost = estimate_lost_motion(recording)
+    in_si = replace(recording, load_unit=position_unit(case.plant).si)
+    try:
+        known: TransmissionGap | str = gap_of_machine(in_si, lost, Axis.preset(case.name))
+    except InvalidInput as error:
+        known = str(error).partition(": ")[2]
+    return _Answered(in_si, gap_within(lost, None), known)
+
+
+def measured(case: LogCase, dynamics: bool = False) -> dict[str, Any]:
+    """Write a case's log, read it and estimate its gap; with `dynamics` those of a load that swings too."""
     table, defects = damaged(case.recorded(), np.random.default_rng([*case.seed, 3]), wrapped=True)
     found: dict[str, Any] = {
-        "gap": case.gap, "lost": case.gap + case.wind_up, "speed": case.speed, "file": case.file, "defects": defects
+        "gap": case.gap, "lost": case.gap + case.wind_up, "speed": case.speed, "file": case.file, "defects": defects,
+        "gap_load": case.gap * case.plant.p,
     }  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / case.file
-        columns = WRITERS[case.file](path, table)
         try:
-            recording = read_recording(path, columns).recording
-            lost = estimate_lost_motion(recording)
+            answered = _answered(case, Path(folder) / case.file, table)
         except InvalidInput as error:
             return found | {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
-    unit = position_unit(case.plant).si
-    answer = gap_within(lost, None)
-    in_si = replace(recording, load_unit=unit)
-    begun = time.process_time()
-    dynamics = with_dynamics(in_si, answer) if _swings(answer) else answer
-    seconds = time.process_time() - begun
-    try:
-        known = gap_of_machine(in_si, lost, Axis.preset(case.name))
-        of_axis = _said(known) | {"dynamics": _said(with_dynamics(in_si, known) if _swings(known) else known)}
-    except InvalidInput as error:
-        of_axis = {"status": "refused", "reasons": [str(error).partition(": ")[2]]}
+    answer, lost = answered.alone, answered.alone.lost
+    known = answered.with_axis
+    of_axis = {"status": "refused", "reasons": [known]} if isinstance(known, str) else _said(known)
+    if dynamics:
+        begun = time.process_time()
+        fitted = with_dynamics(answered.recording, answer) if _swings(answer) else answer
+        found["dynamics"] = _said(fitted) | {"seconds": time.process_time() - begun}
     return found | {
         "axis": of_axis,
-        "dynamics": _said(dynamics) | {"seconds": seconds},
         "ratio": lost.ratio / case.plant.p,
         "status": answer.status.value,
         "reasons": list(answer.reasons),
@@ -191,13 +205,20 @@ def measured(case: LogCase) -> dict[str, Any]:
         "lost_motion": lost.at_motor if math.isfinite(lost.at_motor) else None,
         "lost_motion_interval": _numbers(lost.interval_motor),
         "interval": _numbers(answer.interval_motor),
+        "interval_load": _numbers(answer.interval_load),
     }
+
+
+def measured_with_dynamics(case: LogCase) -> dict[str, Any]:
+    """As `measured`, with the dynamics of the load where play alone shows nothing."""
+    return measured(case, dynamics=True)
 
 
 def _said(found: TransmissionGap) -> dict[str, Any]:
     return {
         "status": found.status.value,
         "interval": _numbers(found.interval_motor),
+        "interval_load": _numbers(found.interval_load),
         "ratio_found": found.lost.ratio,
         "reasons": list(found.reasons),
         "model": found.lost.model,
@@ -264,3 +285,5 @@ def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
 
 BATCH = Batch(_units, measured, _show, tuple(SHELF))
 """For `benchmarks.batch`."""
+DYNAMICS = Batch(_units, measured_with_dynamics, _show, tuple(SHELF))
+"""The same with the dynamics of loads that swing, which take half a minute each."""

@@ -1,6 +1,7 @@
 """Public measured data by name: fetched when it is asked for, checked, and kept in the user's cache; none is shipped.
 
-The standard library is enough for one file over HTTPS; a package for it (pooch) would bring three more.
+The standard library is enough for one file over HTTPS with a checksum; pooch would bring three more packages into the
+lock, and these hundred lines would stay: one sentence for each failure, the limit on the answer, the notice.
 """
 
 from __future__ import annotations
@@ -51,6 +52,24 @@ class PublicDataset:
     notice: str
 
 
+_UNTRIED = "The address was never tried here. The checksum is that of our copy"
+
+
+def _bros(part: int, sha256: str) -> PublicDataset:
+    """One of three parts of a recording of a planar robot's two joints, each with encoders at motor and joint."""
+    return PublicDataset(
+        url=(
+            "https://raw.githubusercontent.com/niekbeckers/bi-robot-setup/939ba1d9f2f7f343ef5fd4880fa21891e496e7b5/"
+            f"main-projects/data/transmission-ratio/meas-fm1/transmission_data_part{part}.mat"
+        ),
+        file=f"transmission_data_part{part}.mat",
+        sha256=sha256,
+        largest=2_000_000,
+        source="N. Beckers, software and data of the robot BROS (github.com/niekbeckers/bi-robot-setup)",
+        notice=f"published without a licence: for your own use, not to be passed on; cite the source. {_UNTRIED}",
+    )
+
+
 DATASETS: Mapping[str, PublicDataset] = {
     "emps": PublicDataset(
         url="https://drive.google.com/uc?export=download&id=1zwoXYa9-3f8NQ0ohzmjpF7UxbNgRTHkS",
@@ -63,9 +82,12 @@ DATASETS: Mapping[str, PublicDataset] = {
         ),
         notice=(
             "published as a benchmark, no licence stated: for your own use, not to be passed on; cite the source. The "
-            "address is the one that public code names; it was never tried here. The checksum is that of our copy"
+            f"address is the one that public code names. {_UNTRIED}"
         ),
     ),
+    "bros-1": _bros(1, "f4a2e15ea64330c1c3a8225636ab95bb9f7bdc05b0ce353d858ef730a5d8b809"),
+    "bros-2": _bros(2, "ae9610f98a7a7249659f31b2e0719f1cd56a2748b5fc8fbc00946230e36cf2ed"),
+    "bros-3": _bros(3, "be6cdfbea70335a7c91cc8a373e514f5d24bdc92802e73f8f895d5c71aed0261"),
 }
 """By name."""
 

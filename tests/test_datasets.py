@@ -140,3 +140,17 @@ def test_every_set_has_a_digest_and_a_notice():
         assert known.url.startswith("https://")
         assert known.source
         assert known.notice
+
+
+@pytest.mark.parametrize("name", datasets.DATASETS)
+def test_every_set_has_an_address_a_checksum_a_source_and_a_notice(name):
+    known = datasets.DATASETS[name]
+    assert known.url.startswith("https://")
+    assert len(bytes.fromhex(known.sha256)) == 32
+    assert known.source
+    assert "not to be passed on" in known.notice
+    assert "never tried here" in known.notice
+
+
+def test_no_two_sets_share_a_file():
+    assert len({each.file for each in datasets.DATASETS.values()}) == len(datasets.DATASETS)

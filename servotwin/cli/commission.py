@@ -15,8 +15,10 @@ from rich.table import Table
 from servotwin.commissioning.commission import CommissionedAxis, commission
 from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
+from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
+from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
 from servotwin.estimation.kinematic.wind_up import gap_within
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog
 from servotwin.plant.axis import Axis
@@ -208,18 +210,42 @@ def _table(found: CommissionedAxis) -> Table:
     return table
 
 
+def _law(law: FittedLaw, found: CommissionedAxis) -> str:
+    """The controller that ran, in units of the command."""
+    recording, scale = found.logs[0].recording, abs(found.force_per_command or 1.0)
+    unit, command = recording.unit, recording.command_unit or "command"
+    left = f"{100 * law.left:.2g} % of the command is left"
+    if isinstance(law, FittedPid):
+        return (
+            f"controller: PID, {law.Kp / scale:.5g} {command}/{unit}, {law.Ki / scale:.5g} {command}/({unit} s), "
+            f"{law.Kd / scale:.5g} {command} s/{unit}, filter of the derivative {1e3 * law.Tf:.3g} ms; {left}"
+        )
+    reset = "" if law.integral_time is None else f", integral time {law.integral_time:.4g} s"
+    return (
+        f"controller: position gain {law.position_gain:.5g} 1/s, velocity gain {law.velocity_gain / scale:.5g} "
+        f"{command} s/{unit}{reset}, speed filter {1e3 * law.speed_filter:.3g} ms; {left}"
+    )
+
+
+def _law_dict(law: FittedLaw | None) -> dict[str, Any] | None:
+    if law is None:
+        return None
+    if isinstance(law, FittedPid):
+        return {"kind": "pid", "kp": law.Kp, "ki": law.Ki, "kd": law.Kd, "filter_time_s": law.Tf}
+    return {
+        "kind": "cascade",
+        "position_gain_per_s": law.position_gain,
+        "velocity_gain": law.velocity_gain,
+        "integral_time_s": law.integral_time,
+        "speed_filter_s": law.speed_filter,
+    }
+
+
 def _remarks(found: CommissionedAxis) -> list[str]:
     drive, recording = found.drive, found.logs[0].recording
     lines = []
     if drive.law is not None and math.isfinite(drive.law.left):
-        law = drive.law
-        reset = "" if law.integral_time is None else f", integral time {law.integral_time:.4g} s"
-        lines.append(
-            f"controller: position gain {law.position_gain:.5g} 1/s, velocity gain "
-            f"{law.velocity_gain / abs(found.force_per_command or 1.0):.5g} {recording.command_unit or 'command'} s/"
-            f"{recording.unit}{reset}, speed filter {1e3 * law.speed_filter:.3g} ms; "
-            f"{100 * law.left:.2g} % of the command is left"
-        )
+        lines.append(_law(drive.law, found))
     if drive.refinement is not None:
         simulated = drive.refinement.simulated
         lines.append(
@@ -344,14 +370,7 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
             "force_error": refined.simulated.force_error,
             "settled": refined.settled,
         },
-        "controller": None
-        if drive.law is None
-        else {
-            "position_gain_per_s": drive.law.position_gain,
-            "velocity_gain": drive.law.velocity_gain,
-            "integral_time_s": drive.law.integral_time,
-            "speed_filter_s": drive.law.speed_filter,
-        },
+        "controller": _law_dict(drive.law),
         "shaft": _shaft_dict(found),
         "gap": _gap_dict(found.logs[0]),
         "force_per_command": found.force_per_command,

@@ -261,10 +261,7 @@ def _number(value: float) -> float | None:
 
 def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
     lost, recording, unit = found.lost, log.recording, log.recording.load_unit
-    span = float(recording.time[-1] - recording.time[0])
-    parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
-    name = recording.source.removeprefix("log ")
-    console.print(f"{name}: {recording.time.size} samples in {span:.4g} s ({parts})", markup=False)
+    console.print(f"{recording.source.removeprefix('log ')}: {read_line(log)}", markup=False)
     for defect, count in log.found.items():
         console.print(f"  {count} {defect}", style="dim", highlight=False)
     console.print(headline(found, unit, recording.motor_unit), highlight=False)
@@ -272,16 +269,27 @@ def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
         console.print(f"  {reason}", style="yellow", highlight=False)
     if not lost.comparisons:
         return
-    cyclic = "".join(f", cyclic error every {period:.4g} {recording.motor_unit}" for period in lost.cycles)
-    shown = cyclic if "cyclic" in lost.model else ""
-    console.print(
-        f"model: {lost.model}; {abs(lost.ratio):.6g} {unit} per {recording.motor_unit}, "
-        f"lag {1e3 * lost.lag:.3g} ms{shown}, rms left {lost.rms:.3g} {unit}",
-        highlight=False,
-    )
+    console.print(model_line(found, unit, recording.motor_unit), highlight=False)
     console.print(_models(found, unit), highlight=False)
     if len(lost.local) > 1:
         console.print(_local(lost, unit), highlight=False)
+
+
+def read_line(log: RecordedLog) -> str:
+    """Say how many samples of which columns were used."""
+    time = log.recording.time
+    parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
+    return f"{time.size} samples in {time[-1] - time[0]:.4g} s ({parts})"
+
+
+def model_line(found: TransmissionGap, unit: str, motor_unit: str) -> str:
+    """Say which model was chosen, and its numbers."""
+    lost = found.lost
+    cyclic = "".join(f", cyclic error every {period:.4g} {motor_unit}" for period in lost.cycles)
+    return (
+        f"model: {lost.model}; {abs(lost.ratio):.6g} {unit} per {motor_unit}, lag {1e3 * lost.lag:.3g} ms"
+        f"{cyclic if 'cyclic' in lost.model else ''}, rms left {lost.rms:.3g} {unit}"
+    )
 
 
 def headline(found: TransmissionGap, unit: str, motor_unit: str) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from servotwin.cli.lost_motion import model_rows
+from servotwin.cli.lost_motion import model_line, model_rows, read_line
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.recordings import RecordedLog
 from servotwin.report import page, style
@@ -61,23 +61,31 @@ def picture(log: RecordedLog, found: TransmissionGap) -> Any:
         local.plot([each.position for each in lost.local], [each.gap * scale for each in lost.local], "o",
                    markersize=3.0, color=style.BLUE)  # fmt: skip
         loop.set(xlabel=f"Load position ({unit})", ylabel=f"Motor's lead, at the load ({unit})")
-        local.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion of each reversal ({unit})", ylim=(0.0, None))
+        local.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, None))
         left.set(xlabel="Time (s)", ylabel=f"Left by the model ({unit})")
         profile.set(xlabel=f"Lost motion ({unit})", ylabel=f"rms error of the model ({unit})", ylim=(0.0, None))
     return figure
 
 
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes) -> str:
     unit = log.recording.load_unit
     defects = [[str(count), defect] for defect, count in log.found.items()]
+    read = [read_line(log)]
+    if found.lost.comparisons:
+        read.append(model_line(found, unit, log.recording.motor_unit))
     body = [
-        f"<h1>Gap of {escape(log.recording.source.removeprefix('log '))}</h1>",
-        f"<p>{escape(headline)}</p>",
-        *(f"<p>{escape(reason)}</p>" for reason in found.reasons),
+        f"<h1>{'Gap' if found.ok else 'Lost motion'} of {escape(log.recording.source.removeprefix('log '))}</h1>",
+        f"<p><strong>{escape(_sentence(headline))}</strong></p>",
+        *(f"<p>{escape(_sentence(reason))}</p>" for reason in found.reasons),
+        *(f"<p>{escape(_sentence(each))}</p>" for each in read),
         page.figure(
             vector,
             "Lost motion.",
-            "(a) By how much the motor leads the load, lag included, and half the lost motion on either side. "
+            "(a) By how much the motor leads the load, the lag taken off, and half the lost motion on either side. "
             "(b) The lost motion of each reversal. (c) What the model leaves of the load's position. (d) The model's "
             "error for other lost motions; shaded: 95 % interval.",
         ),

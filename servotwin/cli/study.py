@@ -245,7 +245,7 @@ def commission(
 
 
 def dataset(
-    name: Annotated[str, typer.Argument(help="Name of a public set: emps.")],
+    name: Annotated[str, typer.Argument(help="Name of a public set: emps, or bros-1 to bros-3.")],
     folder: Annotated[Path | None, typer.Option(help="Where it is kept; the user's cache by default.")] = None,
 ) -> None:
     """Fetch a public set of measured data, once, and print the path of its file."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from servotwin.analysis.tuning.cascade import tune_cascade
+from servotwin.control.cascade import Cascade
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.closed_loop import rigid_axis
 from servotwin.estimation.inverse_dynamics.conditioning import motion_of
@@ -29,6 +30,7 @@ _WIDEST = 0.99  # relative half-width that an uncertainty may have
 # Relative errors beyond the statistical ones that derivatives and a gap in the shaft brought (test_shaft).
 _SHAFT = {"m": 0.03, "k": 0.1, "c": 0.5}
 _SINE = 2.0 * math.sqrt(2.0)  # range of a sine over its standard deviation
+_APART = 5.0  # crossovers of velocity and position loop, to begin with
 _PHASE_MARGIN = math.radians(60.0)
 _BY_NAME, _FITTED = DriveColumns(), GivenGains()
 
@@ -126,7 +128,9 @@ def commission(
     if axis is not None and feedback == LOAD:
         axis = _with_load_encoder(axis, first.load_resolution or first.resolution)
     if axis is not None and crossover is not None:
-        axis = replace(axis, controller=tune_cascade(axis, crossover, _PHASE_MARGIN).controller)
+        axis = replace(
+            axis, controller=tune_cascade(_with_cascade(axis, crossover), crossover, _PHASE_MARGIN).controller
+        )
     return replace(found, axis=axis, uncertainty=_uncertainty(found, travel))
 
 
@@ -177,9 +181,26 @@ def _with_shaft(axis: Axis, shaft: ShaftResponse, split: ParameterFit) -> Axis:
 
 
 def _with_load_encoder(axis: Axis, resolution: float) -> Axis:
-    law = axis.controller.replace(on=LOAD)  # type: ignore[call-arg]
+    law = axis.controller.replace(on=LOAD) if isinstance(axis.controller, Cascade) else axis.controller
     sensors = Sensors(axis.sensors.encoder_resolution, resolution, LOAD)
     return replace(axis, controller=law, sensors=sensors)
+
+
+def _with_cascade(axis: Axis, crossover: float) -> Axis:
+    """The axis with a cascade to be tuned; where a PID ran, with one of that crossover (rad/s)."""
+    own = axis.controller
+    if isinstance(own, Cascade):
+        return axis
+    gain = crossover * axis.load.m[0] * axis.p * axis.p
+    law = Cascade(
+        crossover / _APART,
+        axis.p,
+        gain,
+        on=axis.sensors.feedback,
+        voltage_limit=own.voltage_limit,
+        sample_rate=own.sample_rate,
+    )
+    return replace(axis, controller=law)
 
 
 def _uncertainty(found: CommissionedAxis, p: float) -> Uncertainty:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -13,6 +14,7 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import LogColumns, SignalTable, parsed
+from servotwin.logs.dates import time_of
 from servotwin.plant.signals import Array
 
 _ROWS = 100_000  # read or written at a time
@@ -20,7 +22,8 @@ _SAMPLE = 65536  # bytes from which the encoding is guessed
 _LOOKED_AT = 40  # lines from which the layout is guessed
 _METADATA = "metadata"  # name of a CSV file's last column; its first row holds the metadata as JSON
 _COMMENTS = ("#", "%", "//")
-_DATE = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d")
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?$")
+_COMMA = re.compile(r"(^|[^\d.,])[+-]?(\d+|\d{1,3}(\.\d{3})+),\d+($|[^\d.,])")
 _BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
 
 
@@ -99,17 +102,31 @@ def _layout(path: Path) -> _Layout:
     if not kept:
         raise InvalidInput(f"log {path}: line 1 must name the columns; the file holds no row")
     separator = _separator([line for _, line in kept[1:_LOOKED_AT]] or [kept[0][1]])
-    comma = separator != "," and any(re.search(r"\d,\d", line) for _, line in kept[1:_LOOKED_AT])
     rows = [_cells(line, separator) for _, line in kept]
+    comma = separator != "," and any(_COMMA.match(cell) for cells in rows[1:_LOOKED_AT] for cell in cells)
     size = _usual_size(rows[1:_LOOKED_AT] or rows)
     first = next((i for i, cells in enumerate(rows) if _numeric(cells[:size], comma)), len(rows))
     # Above the names there may be prose.
+    if first == len(rows) and len(rows) > 2:
+        raise InvalidInput(_no_numbers(path, kept[1:], rows[1:], size))
     heads = [cells for cells in rows[:first] if len(cells) == size] or rows[: min(first, 1)]
     names = heads[0] if heads else [f"col{i + 1}" for i in range(size)]
     if len(heads) > 1 and len(heads[1]) == len(names):
         names = [_with_unit(name, unit) for name, unit in zip(names, heads[1], strict=True)]
     last = kept[first][0] if first < len(kept) else len(lines)
     return _Layout(encoding, separator, comma, tuple(names), bool(heads), last, metadata)
+
+
+def _no_numbers(path: Path, kept: Sequence[tuple[int, str]], rows: Sequence[Sequence[str]], size: int) -> str:
+    """Sentence on a table without a row of numbers, with the first cell that begins as one does."""
+    for (line, _), cells in zip(kept, rows, strict=True):
+        begun = next((cell for cell in cells if re.match(r"[+-]?[.,]?\d", cell) and _number(cell, True) is None), None)
+        if len(cells) == size and begun is not None:
+            return (
+                f"log {path}: line {line + 1}: {begun[:30]!r} is no number: write numbers, or dates such as 2026-03-01 "
+                "08:00:00, and the units in the header"
+            )
+    return f"log {path}: none of its first lines is a row of numbers: is it a table of samples?"
 
 
 def _encoding(path: Path) -> str:
@@ -154,7 +171,9 @@ def _separator(lines: Sequence[str]) -> str | None:
 
 
 def _cells(line: str, separator: str | None) -> list[str]:
-    return [cell.strip().strip('"') for cell in line.split(separator)]
+    if separator is not None and '"' in line:
+        return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
+    return [cell.strip() for cell in line.split(separator)]
 
 
 def _numeric(cells: Sequence[str], comma: bool) -> bool:
@@ -164,55 +183,72 @@ def _numeric(cells: Sequence[str], comma: bool) -> bool:
 
 
 def _number(cell: str, comma: bool) -> float | None:
-    text = cell.replace(",", ".") if comma else cell
+    """The number, date or time of day (s) that a cell holds."""
+    text = cell.replace(".", "").replace(",", ".") if comma and "," in cell else cell
     try:
         return float(text)
     except ValueError:
         pass
-    if _DATE.match(cell):
-        try:
-            return float(np.datetime64(cell.rstrip("Z").replace(" ", "T"), "us").astype(np.int64)) * 1e-6
-        except ValueError:
-            return None
-    return None
+    if _THOUSANDS.match(cell):
+        return float(cell.replace(",", ""))
+    return time_of(cell)
 
 
 def _values(
     lines: Sequence[str], layout: _Layout, places: Sequence[int], line_number: int
 ) -> tuple[Array, dict[int, str]]:
     """(n, c) numbers, and in words the first cell of each column that is none."""
-    if not lines:
-        return np.empty((0, len(places))), {}
-    text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
     try:
-        return np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None), {}
+        return _numbers(lines, layout, places), {}
     except ValueError:
-        return _patiently(lines, layout, places, line_number)
+        pass
+    # A comment, or a cell that is no number: no line is looked at before that.
+    kept = [(line_number + row, line) for row, line in enumerate(lines) if _is_row(line)]
+    if len(kept) < len(lines):
+        try:
+            return _numbers([line for _, line in kept], layout, places), {}
+        except ValueError:
+            pass
+    return _patiently(kept, layout, places)
+
+
+def _numbers(lines: Sequence[str], layout: _Layout, places: Sequence[int]) -> Array:
+    if all(map(str.isspace, lines)):
+        return np.empty((0, len(places)))
+    text = [line.replace(",", ".") for line in lines] if layout.decimal_comma else lines
+    return np.loadtxt(text, delimiter=layout.separator, usecols=places, ndmin=2, comments=None)
+
+
+def _is_row(line: str) -> bool:
+    return not line.isspace() and not line.startswith(_COMMENTS)
 
 
 def _blocks(file: IO[str], line_number: int) -> Iterator[tuple[int, list[str]]]:
-    """Lines with numbers and the number of the first, at least one block."""
+    """Lines with the number of the first, at least one block."""
     lines = list(islice(file, _ROWS))
-    yield line_number, [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
+    yield line_number, lines
     while lines:
         line_number += len(lines)
         lines = list(islice(file, _ROWS))
         if lines:
-            yield line_number, [line for line in lines if not line.isspace() and not line.startswith(_COMMENTS)]
+            yield line_number, lines
 
 
-def _patiently(lines: Sequence[str], layout: _Layout, places: Sequence[int], line: int) -> tuple[Array, dict[int, str]]:
+def _patiently(
+    lines: Sequence[tuple[int, str]], layout: _Layout, places: Sequence[int]
+) -> tuple[Array, dict[int, str]]:
+    """As `_values`, cell by cell; `lines` with their numbers."""
     damaged: dict[int, str] = {}
     result = np.full((len(lines), len(places)), np.nan)
-    for row, text in enumerate(lines):
+    for row, (number, text) in enumerate(lines):
         cells = _cells(text, layout.separator)
         for column, place in enumerate(places):
             cell = cells[place] if place < len(cells) else ""
-            number = _number(cell, layout.decimal_comma)
-            if number is None:
-                damaged.setdefault(column, f"line {line + row}: {cell[:30]!r}")
+            value = _number(cell, layout.decimal_comma)
+            if value is None:
+                damaged.setdefault(column, f"line {number}: {cell[:30]!r}")
             else:
-                result[row, column] = number
+                result[row, column] = value
     return result, damaged
 
 

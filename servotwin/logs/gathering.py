@@ -7,7 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from servotwin.logs.cleaning import NEAR_TURN, WITHIN, Cleaned, cleaned, pauses, unwrapped_turns
+from servotwin.logs.cleaning import MEASURED, OUT_OF_ORDER, Cleaned, cleaned
+from servotwin.logs.wrapping import NEAR_TURN, WITHIN, guessed_turn, pauses, unwrapped_turns
 from servotwin.plant.signals import Array
 
 MOST = 1_500_000
@@ -30,7 +31,8 @@ class Gathering:
     """
 
     def __init__(self, turns: Mapping[str, float], most: int = MOST) -> None:
-        self._turns, self._most = turns, most
+        self._turns, self._most = dict(turns), most
+        self._guessed: dict[str, float] = {}
         self._parts: list[Array] = []
         self._names: tuple[str, ...] = ()
         self._last: Array | None = None
@@ -44,6 +46,8 @@ class Gathering:
 
     def add(self, time: Array, channels: Mapping[str, Array]) -> None:
         """Add the next block: (n,) times in s and (n,) arrays by name, of which the first is the motor."""
+        if not self.samples:
+            self._guess_turns(channels)
         self.samples += len(time)
         self._names = tuple(channels)
         turns = self._within_a_turn(channels)
@@ -68,11 +72,20 @@ class Gathering:
         """All samples so far; of a log that falls apart the longest part."""
         empty = np.empty((0, 1 + len(self._names)))
         table, found = np.concatenate([empty, *self._parts]), dict(self._found)
+        for name, turn in self._guessed.items():
+            found[f"{unwrapped_turns(name)}: its jumps show a turn of {turn:.8g}"] = found.pop(unwrapped_turns(name), 0)
         if self._parted:
             longest = max(np.split(table, np.searchsorted(table[:, 0], self._parted)), key=len)
             found[PARTED] = len(table) - len(longest)
             table = longest
         return Cleaned(table[:, 0], dict(zip(self._names, table[:, 1:].T, strict=True)), found)
+
+    def _guess_turns(self, channels: Mapping[str, Array]) -> None:
+        """Take the turns that positions show of themselves: those of counts, and of encoders of many turns."""
+        for name in MEASURED:
+            turn = guessed_turn(channels[name]) if name in channels else None
+            if turn is not None and not abs(self._turns.get(name, 0.0) / turn - 1.0) < NEAR_TURN:
+                self._turns[name] = self._guessed[name] = turn
 
     def _within_a_turn(self, channels: Mapping[str, Array]) -> dict[str, float]:
         """Full turns of the angles that have stayed within one so far."""
@@ -91,7 +104,7 @@ class Gathering:
             return table
         later = table[:, 0] > self._last[0]
         if not later.all():
-            self._found["earlier than the sample before"] += int(np.sum(~later))
+            self._found[OUT_OF_ORDER] += int(np.sum(~later))
             table = table[later]
         for place, name in enumerate(self._names, 1):
             if name in self._turns and len(table):

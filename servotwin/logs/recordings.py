@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
-from servotwin.logs.cleaning import Cleaned
+from servotwin.logs.cleaning import SAME_TIME, Cleaned
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
 from servotwin.logs.log import read_blocks, read_columns
@@ -22,16 +23,21 @@ from servotwin.plant.signals import Array
 CUT = "last line without its end: the file may have been cut off there"
 _LEAST = 100  # samples
 _BLOCK = 1_000_000  # samples that are cleaned at a time
-_MOST_LOST = 0.5  # of the samples: beyond, the log is not what it seems
+TURNED = "in a log with the newest first, which was turned round"
+_BACKWARDS = 0.9  # of the steps in time
+_LEFT = 0.3  # of the samples, at least: with fewer the log is not what it seems
 # A number in brackets is a row of a matrix.
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
+_BEHIND_COMMA = re.compile(
+    r"^(?P<name>.*\w)\s*[,/]\s*(?P<unit>rad|mrad|deg|°|rev|m|mm|um|µm|nm|s|ms|us|ns|V|A|N|N m)\s*$"
+)
 # Longer ones first: the end of _n_m is no metre.
 _ENDINGS = ("n_m", "deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n")
 _SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
 _TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}
 # Names by which columns are found where none is given, in order of preference.
 _GUESSES = {
-    "time": ("time", "t", "timestamp"),
+    "time": ("time", "t", "timestamp", "time_stamp", "datetime", "date_time", "date", "zeit"),
     "motor": ("motor", "theta_m", "motor_position", "motor_angle", "qm", "motor_pos"),
     "load": ("load", "position", "measured_position", "load_position", "joint", "load_angle", "load_pos", "scale"),
     "command": ("command", "voltage", "torque", "current"),
@@ -99,18 +105,15 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
     load_unit = wanted.load_unit or units["load"] or "load unit"
     turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
     gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
-    cut = False
-    for columns in read_blocks(path, tuple(chosen.values())):
-        damaged, cut = {**columns.damaged, **damaged}, columns.ends_within_line
-        arrays = _arrays(path, chosen, columns)
-        size, before = len(arrays["motor"]), gathering.samples
-        times = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, size, before)
-        for begin in range(0, len(times), _BLOCK):
-            part = {name: values[begin : begin + _BLOCK] for name, values in arrays.items()}
+    cut = turned = False
+    for table in _oldest_first(_tables(path, chosen, units.get("time", ""), wanted.rate)):
+        damaged, cut, turned = {**table.damaged, **damaged}, table.cut, table.turned
+        for begin in range(0, len(table.time), _BLOCK):
+            part = {name: values[begin : begin + _BLOCK] for name, values in table.channels.items()}
             # Thinned samples lie further apart: counts are those of the first block.
             counts = counts or {name: resolution(values[np.isfinite(values)]) for name, values in part.items()}
             try:
-                gathering.add(times[begin : begin + _BLOCK], part)
+                gathering.add(table.time[begin : begin + _BLOCK], part)
             except InvalidInput as error:
                 raise InvalidInput(f"log {path}: {error}") from None
             told(gathering.samples)
@@ -128,7 +131,43 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
         motor_count=counts["motor"] if thinned else None,
         load_count=counts["load"] if thinned else None,
     )
-    return RecordedLog(recording, chosen, gathering.samples, {**clean.found, **({CUT: 1} if cut else {})})
+    others = {CUT: int(cut), TURNED: gathering.samples if turned else 0}
+    found = {**clean.found, **{defect: count for defect, count in others.items() if count}}
+    return RecordedLog(recording, chosen, gathering.samples, found)
+
+
+class _Table(NamedTuple):
+    """A part of a log: (n,) times in s and channels, text in place of numbers, and if its last line has no end."""
+
+    time: Array
+    channels: Mapping[str, Array]
+    damaged: Mapping[str, str]
+    cut: bool
+    turned: bool = False
+
+
+def _tables(path: Path, chosen: Mapping[str, str], unit: str, rate: float | None) -> Iterator[_Table]:
+    before = 0
+    for columns in read_blocks(path, tuple(chosen.values())):
+        arrays = _arrays(path, chosen, columns)
+        size = len(arrays["motor"])
+        time = times_of(path, arrays.pop("time", None), unit, rate, size, before)
+        before += size
+        yield _Table(time, arrays, columns.damaged, columns.ends_within_line)
+
+
+def _oldest_first(tables: Iterator[_Table]) -> Iterator[_Table]:
+    """The tables as they are, or all of them turned round where the newest sample comes first."""
+    first = next(tables)
+    steps = np.diff(first.time[np.isfinite(first.time)])
+    if not (steps.size and np.mean(steps <= 0.0) > _BACKWARDS and np.any(steps < 0.0)):
+        yield first
+        yield from tables
+        return
+    every = [first, *tables]
+    channels = {name: np.concatenate([each.channels[name] for each in every])[::-1] for name in first.channels}
+    damaged = {name: text for each in reversed(every) for name, text in each.damaged.items()}
+    yield _Table(np.concatenate([each.time for each in every])[::-1], channels, damaged, every[-1].cut, True)
 
 
 def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[str, Array]:
@@ -146,14 +185,17 @@ def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[
 
 def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]) -> None:
     left = clean.time.size
+    if left == 1 and clean.found.get(SAME_TIME, 0) > _LEFT * size:
+        raise InvalidInput(f"log {path}: its {size} samples have one time stamp: give --rate in Hz")
     whole = size - clean.found.get(THINNED, 0) - clean.found.get(PARTED, 0)
-    if left >= max(_LEAST, _MOST_LOST * whole):
+    if left >= max(_LEAST, _LEFT * whole):
         return
     what = "; ".join(f"{count} {defect}" for defect, count in clean.found.items()) or "the log is short"
     first = next(iter(damaged.items()), None)
     where = f"; column {first[0]!r}, {first[1]}" if first else ""
     raise InvalidInput(
-        f"log {path}: {left} of {size} samples can be used, of at least {_LEAST} and half of all ({what}{where})"
+        f"log {path}: {left} of {size} samples can be used, of at least {_LEAST} and {100.0 * _LEFT:.0f} % of all "
+        f"({what}{where})"
     )
 
 
@@ -174,6 +216,11 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
                 f"log {path}: no column is called like the {part}'s position; give --{part} COLUMN, one of "
                 f"{', '.join(names) or 'none'}"
             )
+    if "time" not in result and wanted.rate is None:
+        raise InvalidInput(
+            f"log {path}: no column is called like a time; give --time COLUMN, one of {', '.join(names)}, or --rate in "
+            "Hz above 0"
+        )
     if result["motor"] == result["load"]:
         raise InvalidInput(f"log {path}: --motor and --load are both {result['motor']!r}: give two columns")
     return result
@@ -202,7 +249,7 @@ def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
 
 def bare_name(name: str) -> str:
     """A column's name without its unit."""
-    found = _UNIT.match(name)
+    found = _UNIT.match(name) or _BEHIND_COMMA.match(name)
     if found:
         return found["name"]
     ending = _ending(name)
@@ -211,7 +258,7 @@ def bare_name(name: str) -> str:
 
 def named_unit(name: str) -> str:
     """The unit that a column's name says; empty where it says none."""
-    found = _UNIT.match(name)
+    found = _UNIT.match(name) or _BEHIND_COMMA.match(name)
     if found:
         return found["unit"].strip()
     return _ending(name)

@@ -176,7 +176,7 @@ def test_defects_are_mended_and_counted(tmp_path, made):
     assert log.found == {
         "without a number in some column": 1,
         "stale, long before all others": 1,
-        "earlier than the sample before": 1,
+        "out of order in time": 1,
         "at the time of the sample before": 1,
         "spikes of load": 1,
         "pauses longer than five intervals": 1,

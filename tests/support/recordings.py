@@ -22,3 +22,17 @@ def recording(gap=0.05, ratio=0.1, lag=0.0, noise=2e-5, count=1e-3, error=None, 
     if error is not None:
         load = load + error(output)
     return EncoderRecording(time, np.round(motor / count) * count, load)
+
+
+def short_strokes(gap, amplitude, seed, count=1e-4, noise=3e-4, ratio=1.6):
+    """A recording of 16 strokes to and fro between points that are drawn, with speeds that are drawn too."""
+    random = np.random.default_rng(seed)
+    points = np.concatenate([[0.0], amplitude * random.uniform(0.5, 1.0, 16) * np.where(np.arange(16) % 2, -1.0, 1.0)])
+    spans = np.abs(np.diff(points)) / random.uniform(0.5, 1.5, 16)
+    edges = np.concatenate([[0.0], np.cumsum(40.0 * spans / spans.sum())])
+    time = np.arange(0.0, 40.0, 2e-3)
+    place = np.clip(np.searchsorted(edges, time, side="right") - 1, 0, 15)
+    share = (time - edges[place]) / np.diff(edges)[place]
+    motor = points[place] + np.diff(points)[place] * (3.0 - 2.0 * share) * share**2
+    load = ratio * play(motor, gap) + noise * random.standard_normal(time.size)
+    return EncoderRecording(time, np.round(motor / count) * count, load, load_unit="mm")

@@ -12,10 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servotwin.control.cascade import Cascade
+from servotwin.control.controller import Controller
 from servotwin.control.linear_law import MOTOR
 from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, low_passed, motion_of
 from servotwin.estimation.inverse_dynamics.fit import SYMMETRIC, ParameterFit, Rows, fit_models, regressors, rows_of
 from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade
+from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
@@ -25,6 +27,7 @@ from servotwin.plant.signals import Array, Samples
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
 
+FittedLaw = FittedCascade | FittedPid
 _ROUNDS = 8
 _SETTLED = 1e-3  # relative change of inertia and Coulomb friction, of the force
 _TRACKS = 0.05  # of the position: a simulation that leaves more is not near enough for its motion to be used
@@ -58,7 +61,7 @@ class Refinement:
     settled: bool
 
 
-def rigid_axis(fit: ParameterFit, law: FittedCascade, recording: DriveRecording, p: float) -> Axis:
+def rigid_axis(fit: ParameterFit, law: FittedLaw, recording: DriveRecording, p: float) -> Axis:
     """The axis that a fit describes: a torque drive on a rigid transmission, p travel per radian of the motor.
 
     Raises
@@ -66,24 +69,32 @@ def rigid_axis(fit: ParameterFit, law: FittedCascade, recording: DriveRecording,
     InvalidInput
         A parameter is out of its range.
     """
-    controller = Cascade(
-        position_gain=law.position_gain,
-        ratio=p,
-        velocity_gain=law.velocity_gain * p * p,
-        integral_time=law.integral_time,
-        speed_filter=law.speed_filter,
-        on=law.on,
-        voltage_limit=None if recording.limit is None else recording.limit * p,
-        sample_rate=recording.rate,
-    )
     inertia = fit["inertia"]
     return Axis(
         TorqueDrive(inertia * p * p, friction=max(fit["viscous"], 0.0) * p * p, coulomb=max(fit["coulomb"], 0.0) * p),
         Transmission(p),
         # Rigid with the motor, whose inertia contains it.
         Load((inertia,), motion=ROTARY if recording.rotary else LINEAR),
-        controller,
+        _controller(law, recording, p),
         Sensors(recording.resolution / p, 0.0 if law.on == MOTOR else recording.load_resolution, law.on),
+    )
+
+
+def _controller(law: FittedLaw, recording: DriveRecording, p: float) -> Cascade | Controller:
+    limit = None if recording.limit is None else recording.limit * p
+    if isinstance(law, FittedPid):
+        return Controller(
+            Kp=law.Kp * p, Ki=law.Ki * p, Kd=law.Kd * p, Tf=law.Tf, voltage_limit=limit, sample_rate=recording.rate
+        )
+    return Cascade(
+        position_gain=law.position_gain,
+        ratio=p,
+        velocity_gain=law.velocity_gain * p * p,
+        integral_time=law.integral_time,
+        speed_filter=law.speed_filter,
+        on=law.on,
+        voltage_limit=limit,
+        sample_rate=recording.rate,
     )
 
 
@@ -109,7 +120,7 @@ def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: Re
 
 
 def refine(
-    first: ParameterFit, law: FittedCascade, recording: DriveRecording, band: RegressionBand, cycle: float, p: float
+    first: ParameterFit, law: FittedLaw, recording: DriveRecording, band: RegressionBand, cycle: float, p: float
 ) -> Refinement | None:
     """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track.
 

@@ -16,9 +16,12 @@ from servotwin.plant.signals import Array
 _LEAST_FILTER, _LONGEST_FILTER = 0.1, 50.0  # samples
 _RESET, _LONGEST_RESET = 0.05, 10.0  # s to begin with; logarithm
 _NONE = 1e3  # in place of the residual of gains of the wrong sign
-_RICHER = 0.8  # of the simpler law's residual: a law with integral action must do better
-_EXPLAINED = 0.02  # of the force: nothing is left for an integral
-_UNKNOWN = 0.25  # of the force: a law that leaves more is not the one that ran
+RICHER = 0.8
+"""Of a simpler law's residual: a richer one must do better."""
+EXPLAINED = 0.02
+"""Of the force: a law that leaves no more needs no integral, and no other law."""
+UNKNOWN = 0.25
+"""Of the force: a law that leaves more is not the one that ran."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,7 @@ class FittedCascade:
     @property
     def explains(self) -> bool:
         """True where the law gives the force that was recorded."""
-        return self.left < _UNKNOWN
+        return self.left < UNKNOWN
 
 
 @dataclass(frozen=True)
@@ -101,10 +104,10 @@ def fitted_cascade(recording: DriveRecording, given: GivenGains) -> FittedCascad
     encoders = (MOTOR,) if recording.load is None else (MOTOR, LOAD)
     integral = given.integral_time is not None
     simple = min((_fitted(recording, given, integral, on) for on in encoders), key=lambda law: law.left)
-    if integral or given.complete or simple.left < _EXPLAINED:
+    if integral or given.complete or simple.left < EXPLAINED:
         return simple
     rich = min((_fitted(recording, given, True, on) for on in encoders), key=lambda law: law.left)
-    return rich if rich.left < _RICHER * simple.left else simple
+    return rich if rich.left < RICHER * simple.left else simple
 
 
 def differentiated(position: Array, time: float, rate: float) -> Array:

@@ -7,15 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from servotwin.estimation.inverse_dynamics import checks
-from servotwin.estimation.inverse_dynamics.closed_loop import Refinement, refine
+from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
-from servotwin.estimation.inverse_dynamics.fitted_cascade import FittedCascade, GivenGains, fitted_cascade
+from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
+from servotwin.estimation.inverse_dynamics.fitted_pid import fitted_pid
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
 _FITTED = GivenGains()
+# Of the force: the PID that ran left a thousandth, one fitted to a cascade's log a fifth.
+_PID_LEAVES = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +31,7 @@ class IdentifiedDrive:
         By inverse dynamics, of all recordings together.
     bands : tuple of RegressionBand
         One for each recording.
-    law : FittedCascade or None
+    law : FittedCascade, FittedPid or None
         Of the first recording; None: neither were its gains given, nor does its reference show them.
     refinement : Refinement or None
         By closed-loop simulation of the first recording; None where it is not possible.
@@ -44,7 +47,7 @@ class IdentifiedDrive:
     symmetric: ParameterFit
     asymmetric: ParameterFit
     bands: tuple[RegressionBand, ...]
-    law: FittedCascade | None
+    law: FittedLaw | None
     refinement: Refinement | None
     doubts: tuple[str, ...]
     advice: NextExperiment
@@ -104,12 +107,12 @@ def identify_drive(
 
 def _refined(
     recording: DriveRecording, fit: ParameterFit, gains: GivenGains, filtering: tuple[RegressionBand, float], p: float
-) -> tuple[FittedCascade | None, Refinement | None, tuple[str, ...]]:
+) -> tuple[FittedLaw | None, Refinement | None, tuple[str, ...]]:
     """The law that ran, the refinement, and why there is none."""
     if recording.reference is None:
-        law = fitted_cascade(recording, gains) if gains.complete else None
-        return law, None, ("without a reference the loop cannot be simulated beside the log",)
-    law = fitted_cascade(recording, gains)
+        given = fitted_cascade(recording, gains) if gains.complete else None
+        return given, None, ("without a reference the loop cannot be simulated beside the log",)
+    law = _fitted_law(recording, gains)
     if not law.explains:
         checks.check_reference(recording, gains)
         return (law if gains.complete else None), None, (_unexplained(law),)
@@ -119,11 +122,20 @@ def _refined(
     return law, found, () if found.settled else ("the fit to the simulated motion did not come to rest",)
 
 
-def _unexplained(law: FittedCascade) -> str:
+def _fitted_law(recording: DriveRecording, gains: GivenGains) -> FittedLaw:
+    """A cascade, or a PID where that explains the command better; gains that are given are those of a cascade."""
+    cascade = fitted_cascade(recording, gains)
+    if gains != _FITTED or cascade.left < EXPLAINED:
+        return cascade
+    pid = fitted_pid(recording)
+    return pid if pid.left < min(RICHER * cascade.left, _PID_LEAVES) else cascade
+
+
+def _unexplained(law: FittedLaw) -> str:
     """Say why a law is not the one that ran."""
+    said = "neither a position controller with velocity loop nor a PID explains the command"
     if math.isfinite(law.left):
-        return f"no position controller with velocity loop explains the command ({100.0 * law.left:.0f} % are left)"
+        return f"{said} ({100.0 * law.left:.0f} % are left)"
     return (
-        "no position controller with velocity loop explains the command (its gains would be negative): is the "
-        "reference late, or in another unit or scale than the position?"
+        f"{said} (its gains would be negative): is the reference late, or in another unit or scale than the position?"
     )

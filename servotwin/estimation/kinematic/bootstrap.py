@@ -28,22 +28,31 @@ class Spread(NamedTuple):
         Every moment counts alike.
     by_travel : (r,) array
         Every bit of the motor's way counts alike.
+    at_load : (r,) array
+        `gaps` times the ratio that goes with each.
     units : int
         Cycles that were drawn from.
     """
 
     gaps: Array
     by_travel: Array
+    at_load: Array
     units: int
 
     @property
     def std(self) -> float:
-        return float(self.gaps.std(ddof=1) * np.sqrt(self.units / max(self.units - 1, 1)))
+        return self._std(self.gaps)
 
     @property
     def std_of_difference(self) -> float:
-        difference = self.gaps - self.by_travel
-        return float(difference.std(ddof=1) * np.sqrt(self.units / max(self.units - 1, 1)))
+        return self._std(self.gaps - self.by_travel)
+
+    @property
+    def std_at_load(self) -> float:
+        return self._std(self.at_load)
+
+    def _std(self, values: Array) -> float:
+        return float(values.std(ddof=1) * np.sqrt(self.units / max(self.units - 1, 1)))
 
 
 def bootstrap(grid: Array, tensor: Array, by_travel: Array, used: list[int]) -> Spread:
@@ -51,7 +60,9 @@ def bootstrap(grid: Array, tensor: Array, by_travel: Array, used: list[int]) -> 
     member = units(tensor.shape[1])
     drawn = np.random.default_rng(_SEED).multinomial(len(member), np.full(len(member), 1.0 / len(member)), DRAWS)
     counts = drawn @ member
-    every = [
-        solved(np.einsum("rm,gmij->rgij", counts, each, optimize=True), used).squares for each in (tensor, by_travel)
-    ]
-    return Spread(least_gap(grid, every[0]), least_gap(grid, every[1]), len(member))
+    by_time, other = (
+        solved(np.einsum("rm,gmij->rgij", counts, each, optimize=True), used) for each in (tensor, by_travel)
+    )
+    gaps = least_gap(grid, by_time.squares)
+    ratios = [np.interp(gap, grid, each) for gap, each in zip(gaps, by_time.coefficients[..., 0], strict=True)]
+    return Spread(gaps, least_gap(grid, other.squares), gaps * np.abs(ratios), len(member))

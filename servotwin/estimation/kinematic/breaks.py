@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.kinematic.pauses import pauses_of
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import INERTIA, LAG, LOAD, OFFSET, RATIO, Regression, columns, solved
 from servotwin.plant.signals import Array
@@ -18,6 +19,70 @@ _RATIO = 0.03  # between the halves of a recording
 _SURE = 5.0  # standard deviations of that
 _BLOCKS = 16  # of the recording, of which each is left out once
 _TRAVEL = 10.0  # gaps, from which on the ratio is known
+
+
+_CHOSEN, _MOST = 20_000, (0.01, 0.99)  # samples of a part, and quantiles of what a line leaves
+_PART = 100  # samples on either side of a join
+_JOINS = 20  # looked at: the longest pauses and largest jumps
+_LINE = 0.95  # correlation of load and motor in a part that shows their ratio
+_OFF = 1.5  # spreads of both parts
+_OTHER = 0.1  # of the ratio, and so many times the spread over the way of the shorter part
+
+
+class _Part(NamedTuple):
+    """A line through the load over the motor: slope, load at a given motor position, and spread about it."""
+
+    slope: float
+    load: float
+    spread: float
+    straight: bool
+
+
+def check_not_joined(recording: EncoderRecording) -> None:
+    """Refuse a recording whose load goes on elsewhere, or by another ratio, behind a pause or a jump.
+
+    Such a break hides every gap: it has to be found before one is searched for.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    time, motor, load = recording.time, recording.motor, recording.load
+    joins = [row for row in pauses_of(time, motor, load) if _PART <= row <= time.size - _PART]
+    joins.sort(key=lambda row: -abs(load[row] - load[row - 1]))
+    for row in joins[:_JOINS]:
+        before, after = (_line(motor[part], load[part], motor[row]) for part in (slice(row), slice(row, None)))
+        if not (before.straight and after.straight):
+            continue
+        change, spread = after.slope / before.slope - 1.0, before.spread + after.spread
+        way = min(float(np.ptp(load[:row])), float(np.ptp(load[row:])))
+        if abs(change) > max(_OTHER, _OFF * spread / way):
+            raise InvalidInput(
+                f"{recording.source}: the load moves by {before.slope:.4g} {recording.load_unit} per "
+                f"{recording.motor_unit} until {time[row]:.4g} s and by {after.slope:.4g} from then on: two machines "
+                "or units in one log; give each part by itself"
+            )
+        if abs(after.load - before.load) > _OFF * spread:
+            raise InvalidInput(_slipped(recording, row, after.load - before.load))
+
+
+def _line(motor: Array, load: Array, at: float) -> _Part:
+    """Fit a line to evenly chosen samples; its load at the motor position `at`."""
+    rows = np.unique(np.linspace(0, motor.size - 1, _CHOSEN).astype(int))
+    x, y = motor[rows], load[rows]
+    if not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
+        return _Part(0.0, 0.0, 0.0, False)
+    slope, offset = np.polyfit(x - at, y, 1)
+    spread = float(np.ptp(np.quantile(y - offset - slope * (x - at), _MOST)))
+    return _Part(float(slope), float(offset), spread, abs(float(np.corrcoef(x, y)[0, 1])) > _LINE)
+
+
+def _slipped(recording: EncoderRecording, row: int, size: float) -> str:
+    return (
+        f"{recording.source}: from {recording.time[row]:.4g} s on the load is {size:+.4g} {recording.load_unit} off "
+        "where the motor moved it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were "
+        "joined; give each part by itself"
+    )
 
 
 class ResidualStep(NamedTuple):
@@ -60,12 +125,7 @@ def check_one_machine(recording: EncoderRecording, prepared: Regression, gap: fl
     step = largest_step(values[0] - fit.coefficients @ values[used])
     least = _STEP * gap * abs(float(fit.coefficients[0]))
     if step.explained > _EXPLAINED and abs(step.size) > least:
-        time = recording.time[prepared.rows[step.row]]
-        raise InvalidInput(
-            f"{recording.source}: from {time:.4g} s on the load is {step.size:+.4g} {unit} off where the motor moved "
-            "it: an encoder or a coupling slipped, turns were lost in a pause, or two logs were joined; give each part "
-            "by itself"
-        )
+        raise InvalidInput(_slipped(recording, int(prepared.rows[step.row]), step.size))
 
 
 class _Halves(NamedTuple):

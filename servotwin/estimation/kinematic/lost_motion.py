@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import t as student
@@ -12,10 +11,12 @@ from scipy.stats import t as student
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
-from servotwin.estimation.kinematic.breaks import check_one_machine
+from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
+from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
 from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
 from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
+from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import (
     INERTIA,
@@ -29,40 +30,25 @@ from servotwin.estimation.kinematic.regression import (
     regression,
     solved,
 )
+from servotwin.estimation.kinematic.sensitivity import sensitivity
 from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
-_GAPS = 32  # of the coarse search, geometric from a count to the whole travel
+# Of the coarse search: geometric from a count to the whole travel, then next to the best, so many grids in all.
+_GAPS, _BETWEEN, _FINER = 24, 9, 3
 _FINE = 17  # of each finer one
-_ROUNDS = 4
+_NEAR = 0.12  # of the coarse gap, the span of finer steps on either side
+_ROUNDS = 8
+_END, _SAME = 0.9, 0.7  # of a grid's width: a minimum beyond lies outside; of the spread on a wider grid
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
+_JUMPS, _NEAR_BY = 5.0, 0.01  # times the step to the next sample but one, and of the range: two motions by turns
 _PIECES = 10  # of a stroke on the average, in each of which noise and hunting average out
 _SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
 _SKEW = 2.0  # samples between two channels that are nothing unusual
 _ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
 _CHANCE = 0.025  # on either side of a 95 % interval
-
-
-class FittedCurves(NamedTuple):
-    """Curves for a picture of the fit.
-
-    Attributes
-    ----------
-    time, load, lead, residual : (k,) array
-        Times in s, positions of the load, by how much the motor leads it (the motor's unit), and what the model leaves
-        (the load's).
-    gaps, rms : (g,) array
-        Error of the model, the load's unit, for other gaps.
-    """
-
-    time: Array
-    load: Array
-    lead: Array
-    residual: Array
-    gaps: Array
-    rms: Array
 
 
 @dataclass(frozen=True)
@@ -80,6 +66,8 @@ class LostMotion:
         95 %.
     ratio : float
         Load per motor; NaN where unknown.
+    load_spread : float
+        Half width of the interval at the load over `ratio` times that at the motor: the ratio is estimated too.
     lag : float
         s, by which the load follows.
     status : GapStatus
@@ -102,6 +90,7 @@ class LostMotion:
     std_motor: float
     interval_motor: Interval
     ratio: float
+    load_spread: float
     lag: float
     status: GapStatus
     reasons: tuple[str, ...] = ()
@@ -118,12 +107,18 @@ class LostMotion:
 
     @property
     def std_load(self) -> float:
-        return self.std_motor * abs(self.ratio)
+        return self.std_motor * abs(self.ratio) * self.load_spread
 
     @property
     def interval_load(self) -> Interval:
-        low, high = self.interval_motor
-        return (low * abs(self.ratio), high * abs(self.ratio))
+        return self.seen_at_load(self.at_motor, self.interval_motor)
+
+    def seen_at_load(self, gap: float, interval: Interval) -> Interval:
+        """An interval about a gap, the motor's unit, in the load's unit."""
+        if interval == NOTHING_KNOWN or math.isnan(gap):
+            return (interval[0] * abs(self.ratio), interval[1] * abs(self.ratio))
+        low, high = (abs(self.ratio) * (gap + self.load_spread * (end - gap)) for end in interval)
+        return (max(low, 0.0), high)
 
     @property
     def ok(self) -> bool:
@@ -147,6 +142,7 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     least = _least_motion(recording.motor, motor_count)
     strokes = strokes_of(recording, least)
     _check(recording, least, strokes.reversals)
+    check_not_joined(recording)
     if not _follows(recording.load, load_count, strokes.reversals):
         return _bound(recording)
     prepared = regression(recording, strokes, 0)
@@ -155,17 +151,17 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     first = _settled(recording, 1.1 * coarse)
     if first is None:
         return _no_gap()
-    prepared = regression(recording, strokes, first)
+    prepared = regression(recording, strokes, first, ~behind_pauses(recording, coarse))
     check_one_machine(recording, prepared, coarse)
     prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
     grid, tensor = _tensor(prepared, coarse, least)
     counts = np.diff(prepared.bounds, append=prepared.rows.size)
     comparisons = compared(prepared, grid, tensor, counts)
     best = chosen(comparisons[:-1])
-    errors = solved(tensor.sum(axis=1), best.model.places(prepared)).squares
     found = _answer(recording, prepared, best, comparisons, least)
-    rms = np.sqrt(errors / prepared.rows.size)
-    return replace(found, curves=_curves(recording, prepared, best.model, found, grid, rms))
+    shown = found.at_motor if math.isfinite(found.at_motor) else 0.0
+    curves = fitted_curves(prepared._replace(lag=found.lag), best.model, shown, found.interval_motor)
+    return replace(found, curves=curves)
 
 
 def _least_motion(values: Array, count: float) -> float:
@@ -186,6 +182,12 @@ def _follows(load: Array, count: float, reversals: int) -> bool:
 def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
     unit, source = recording.motor_unit, recording.source
     reach = float(np.ptp(recording.motor))
+    for part, values in (("motor", recording.motor), ("load", recording.load)):
+        if _alternates(values):
+            raise InvalidInput(
+                f"{source}: the {part}'s position jumps to and fro from sample to sample: two machines by turns in one "
+                "log; give each by itself"
+            )
     if not reach > 2.0 * least:
         raise InvalidInput(
             f"{source}: the motor moves by {reach:.4g} {unit} only, which its counts and its noise or hunting "
@@ -198,6 +200,14 @@ def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
         )
 
 
+def _alternates(values: Array) -> bool:
+    """True where every second sample belongs to another motion: far from its neighbours, near the next but one."""
+    near, far = np.diff(values), values[2:] - values[:-2]
+    return float(np.median(np.abs(near))) > _JUMPS * max(
+        float(np.median(np.abs(far))), _NEAR_BY * float(np.ptp(values))
+    )
+
+
 def _settled(recording: EncoderRecording, gap: float) -> int | None:
     """First sample by which the motor has moved by `gap`."""
     motor = recording.motor
@@ -207,19 +217,28 @@ def _settled(recording: EncoderRecording, gap: float) -> int | None:
 
 
 def _coarse(prepared: Regression, least: float) -> float:
-    """Gap of the least sum of squares on a geometric grid, everything else free but the lag.
+    """Gap of the least sum of squares on a geometric grid and finer ones, everything else free but the lag.
 
-    Until the first contact the load rests, wherever in the gap: its motion until then counts against the gap.
+    Until the first contact the load rests, wherever in the gap: on the wide grid its motion until then counts against
+    the gap, next to the best gap it does not count.
     """
     reach = float(np.ptp(prepared.recording.motor))
-    grid = np.concatenate([[0.0], np.geomspace(0.1 * least, 0.95 * reach, _GAPS)])
     used = Model("", (RATIO, "offset")).places(prepared)
-    squares = []
-    for gap in grid:
+
+    def error(gap: float, rests_count: bool) -> float:
         values, side = columns(prepared, gap)
         known, resting = values[:, side != 0], values[0, side == 0]
-        squares.append(float(solved(known @ known.T, used).squares) + resting.size * _variance(resting))
-    return float(grid[int(np.argmin(squares))])
+        squares = float(solved(known @ known.T, used).squares)
+        if rests_count:
+            return squares + resting.size * _variance(resting)
+        return squares / known.shape[1] if known.shape[1] > resting.size else math.inf
+
+    grid, rest = np.concatenate([[0.0], np.geomspace(0.1 * least, 0.95 * reach, _GAPS)]), True
+    for _ in range(_FINER):
+        best = int(np.argmin([error(gap, rest) for gap in grid]))
+        found = float(grid[best])
+        grid, rest = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)], _BETWEEN), False
+    return found
 
 
 def _variance(values: Array) -> float:
@@ -234,44 +253,35 @@ def _cycles(prepared: Regression, gap: float) -> tuple[float, ...]:
 
 
 def _tensor(prepared: Regression, coarse: float, least: float) -> tuple[Array, Array]:
-    """Sums of products on a grid from 0 to twice the coarse gap."""
-    grid = np.linspace(0.0, 2.0 * max(coarse, least), 2 * _FINE + 1)
-    return grid, np.array([products(prepared, gap) for gap in grid])
+    """Sums of products on a grid from 0 to twice the coarse gap, finer next to it."""
+    most = max(coarse, least)
+    near = np.linspace(1.0 - _NEAR, 1.0 + _NEAR, _FINE)
+    grid = most * np.unique(np.concatenate([np.linspace(0.0, 2.0, _FINE), near]))
+    return grid, np.array([products(prepared, gap)[0] for gap in grid])
 
 
 def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
     """Gap by time and by travel, and their bootstrap, on grids that are narrowed to the spread."""
     places = model.places(prepared)
     travel, least = _travel(prepared), 1e-3 * max(gap, width)
+    before = math.inf
     for _ in range(_ROUNDS):
-        grid = np.linspace(max(gap - width, 0.0), gap + width, _FINE)
-        by_time = np.array([products(prepared, each) for each in grid])
-        by_travel = np.array([products(prepared, each, travel) for each in grid])
+        middle = gap
+        grid = np.linspace(max(middle - width, 0.0), middle + width, _FINE)
+        by_time, by_travel = (
+            np.array(each) for each in zip(*(products(prepared, each, travel) for each in grid), strict=True)
+        )
         spread = draws.bootstrap(grid, by_time, by_travel, places)
         gap, other = (float(least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel))
         wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), least)
-        if 0.4 * width <= wanted <= 1.5 * width:
+        at_end = abs(gap - middle) > _END * width and gap > grid[0]
+        if not at_end and 0.4 * width <= wanted <= 1.5 * width and spread.std > _SAME * before:
             break
-        width = wanted
+        # The parabola through three points of a wide grid is off by more than the draws spread, and so is theirs: the
+        # grid narrows by steps, and a spread counts where a finer grid has it too.
+        before = spread.std
+        width = 2.0 * width if at_end else wanted if wanted > width else max(min(wanted, 0.5 * width), 0.25 * width)
     return gap, other, spread
-
-
-def _curves(
-    recording: EncoderRecording, prepared: Regression, model: Model, found: LostMotion, grid: Array, rms: Array
-) -> FittedCurves:
-    gap = found.at_motor if math.isfinite(found.at_motor) else 0.0
-    values, _ = columns(prepared._replace(lag=found.lag), gap)
-    places = model.places(prepared)
-    fit = solved(values @ values.T, places)
-    load, rows = values[0], prepared.rows
-    return FittedCurves(
-        time=recording.time[rows],
-        load=load,
-        lead=recording.motor[rows] - _follower(values, fit, places),
-        residual=load - fit.coefficients @ values[places],
-        gaps=grid,
-        rms=rms,
-    )
 
 
 def _travel(prepared: Regression) -> Array:
@@ -303,7 +313,11 @@ def _answer(
     quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
     left = structured(prepared, residual) / abs(ratio)
     # Counts and what the model leaves are the same in every cycle: the bootstrap does not see that they shift the gap.
-    half = quantile * math.hypot(spread.std, quantisation, _SHIFT * left, _SHIFT * (by_travel - gap))
+    shift, of_model = _SHIFT * (by_travel - gap), sensitivity(values, places, side, gap)
+    half = quantile * math.hypot(spread.std, quantisation, of_model.motor * _SHIFT * left, shift)
+    at_load = math.hypot(
+        spread.std_at_load, *(abs(ratio) * each for each in (quantisation, of_model.load * _SHIFT * left, shift))
+    )
     judged = verdict(
         KinematicFit(
             gap=gap,
@@ -313,7 +327,9 @@ def _answer(
             half=half,
             quantisation=quantisation,
             left=left,
-            better_than_none=best.rms < comparisons[-1].rms,
+            rms=float(np.sqrt(np.mean(residual**2))) / abs(ratio),
+            of_none=(best.rms / comparisons[-1].rms) ** 2 if comparisons[-1].rms else 1.0,
+            accelerated=INERTIA in best.model.used,
             lead=_lead(prepared, best),
             reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),
         ),
@@ -325,7 +341,8 @@ def _answer(
         std_motor=half / quantile if known else math.inf,
         interval_motor=judged.interval,
         ratio=ratio,
-        lag=prepared.lag,
+        load_spread=max(quantile * at_load / (half * abs(ratio)), 1.0) if half else 1.0,
+        lag=prepared.lag + _lag_left(prepared, fit, places),
         status=judged.status,
         reasons=judged.reasons,
         model=best.model.name,
@@ -341,21 +358,19 @@ def _lead(prepared: Regression, best: ModelScore) -> float:
     return -prepared.lag if INERTIA in best.model.used and prepared.lag < -_SKEW * usual else 0.0
 
 
-def _follower(values: Array, fit: Solution, places: list[int]) -> Array:
-    """The load's position in the motor's unit, without what is neither ratio nor gap, such as an offset."""
-    others = fit.coefficients[1:] @ values[places[1:]]
-    return (values[0] - others) / fit.coefficients[0]
-
-
 def _with_lag(prepared: Regression, best: ModelScore) -> Regression:
     """The design with the lag moved from its column, which is right to first order, into the time."""
     places = best.model.places(prepared)
-    lag = places.index(prepared.names.index(LAG))
     for _ in range(3):
         values, _ = columns(prepared, best.gap)
-        fit = solved(values @ values.T, places)
-        prepared = prepared._replace(lag=prepared.lag + float(fit.coefficients[lag] / fit.coefficients[0]))
+        prepared = prepared._replace(lag=prepared.lag + _lag_left(prepared, solved(values @ values.T, places), places))
     return prepared
+
+
+def _lag_left(prepared: Regression, fit: Solution, places: list[int]) -> float:
+    """Lag that a fit finds beyond the one of the regression, s; 0 where the model has none."""
+    column = prepared.names.index(LAG)
+    return float(fit.coefficients[places.index(column)] / fit.coefficients[0]) if column in places else 0.0
 
 
 def _no_gap() -> LostMotion:
@@ -363,12 +378,13 @@ def _no_gap() -> LostMotion:
         "the best fit is a gap as large as the motor's way: the load does not follow the motor through a gap; check "
         "that both columns are of one axis, and that the log is fast enough for its motion"
     )
-    return LostMotion(np.nan, np.inf, NOTHING_KNOWN, np.nan, 0.0, GapStatus.UNIDENTIFIABLE, (reason,))
+    return LostMotion(np.nan, np.inf, NOTHING_KNOWN, np.nan, 1.0, 0.0, GapStatus.UNIDENTIFIABLE, (reason,))
 
 
 def _bound(recording: EncoderRecording) -> LostMotion:
     reach = float(np.ptp(recording.motor))
     reason = (
-        f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the lost motion is larger"
+        f"the motor moves by {reach:.4g} {recording.motor_unit} and the load does not follow: the lost "
+        "motion is larger, or the load's column is of something else"
     )
-    return LostMotion(reach, np.inf, (reach, np.inf), np.nan, 0.0, GapStatus.LOWER_BOUND, (reason,))
+    return LostMotion(reach, np.inf, (reach, np.inf), np.nan, 1.0, 0.0, GapStatus.LOWER_BOUND, (reason,))

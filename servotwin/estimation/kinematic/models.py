@@ -25,6 +25,7 @@ _FOLDS = 5
 # A richer model must predict unseen strokes better by this many standard errors of the difference.
 _EVIDENCE = 2.0
 _WORTH = 0.02  # and by this share
+_TIMES = 3.0  # shares beyond are said as multiples
 
 
 class Model(NamedTuple):
@@ -147,10 +148,9 @@ class _Gain(NamedTuple):
 
     def said(self, before: ModelScore) -> str:
         """In words."""
-        return (
-            f"{100.0 * self.share:.3g} % of the square error of {before.model.name}, better by {self.errors:.1f} "
-            "standard errors"
-        )
+        less = f"{100.0 * self.share:.3g} % of" if self.share < _TIMES else f"{self.share:.3g} times"
+        sense = "better" if self.errors >= 0.0 else "worse"
+        return f"{less} the square error of {before.model.name}, {sense} by {abs(self.errors):.1f} standard errors"
 
 
 def _gain(before: ModelScore, after: ModelScore) -> _Gain:

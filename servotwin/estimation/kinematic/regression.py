@@ -16,7 +16,7 @@ from servotwin.estimation.kinematic.strokes import Strokes, play_and_side
 from servotwin.plant.signals import Array
 
 ROWS = 150_000  # samples that count, evenly chosen; the play itself passes all of them
-_SPAN = 5  # samples on either side of a difference quotient
+SPAN = 5  # samples on either side of a difference quotient
 LOAD, RATIO, OFFSET, LAG, WIND_UP, INERTIA = "load", "ratio", "offset", "lag", "wind-up", "acceleration"
 
 
@@ -53,11 +53,17 @@ class Regression(NamedTuple):
 
 
 def regression(
-    recording: EncoderRecording, strokes: Strokes, first: int, cycles: Sequence[float] = (), lag: float = 0.0
+    recording: EncoderRecording,
+    strokes: Strokes,
+    first: int,
+    known: Any = None,
+    cycles: Sequence[float] = (),
+    lag: float = 0.0,
 ) -> Regression:
-    """Choose the rows from sample `first` on."""
+    """Choose the rows from sample `first` on; those that `known` (n,) says not to count do not."""
     begin = max(first, int(strokes.begin[0]))
     rows = np.unique(np.linspace(begin, recording.motor.size - 1, min(ROWS, recording.motor.size - begin)).astype(int))
+    rows = rows if known is None or not known[rows].any() else rows[known[rows]]
     bounds = np.searchsorted(rows, np.maximum(strokes.begin, begin))
     kept = np.diff(bounds, append=rows.size) > 0
     strokes = Strokes(strokes.begin[kept], strokes.side[kept])
@@ -86,22 +92,20 @@ def columns(design: Regression, gap: float) -> tuple[Array, Array]:
 def _rate(time: Array, values: Array) -> Array:
     """Difference quotient over a few samples on either side."""
     result = np.zeros_like(values)
-    if values.size > 2 * _SPAN:
-        result[_SPAN:-_SPAN] = (values[2 * _SPAN :] - values[: -2 * _SPAN]) / (time[2 * _SPAN :] - time[: -2 * _SPAN])
+    if values.size > 2 * SPAN:
+        result[SPAN:-SPAN] = (values[2 * SPAN :] - values[: -2 * SPAN]) / (time[2 * SPAN :] - time[: -2 * SPAN])
     return result
 
 
-def products(design: Regression, gap: float, weights: Array | None = None) -> Array:
-    """Sums of products of the columns, (m strokes, p, p)."""
+def products(design: Regression, gap: float, *weights: Array) -> tuple[Array, ...]:
+    """Sums of products of the columns, (m strokes, p, p): of all rows alike, and under each of the weights (k,)."""
     values, _ = columns(design, gap)
-    weighted = values if weights is None else values * weights
-    parts = [
-        segment @ other.T
-        for segment, other in zip(
-            np.split(weighted, design.bounds[1:], axis=1), np.split(values, design.bounds[1:], axis=1), strict=True
-        )
-    ]
-    return np.array(parts)
+    return tuple(_by_stroke(each, values, design.bounds) for each in (values, *(values * weight for weight in weights)))
+
+
+def _by_stroke(weighted: Array, values: Array, bounds: Any) -> Array:
+    ends = [*bounds[1:], values.shape[1]]
+    return np.array([weighted[:, a:b] @ values[:, a:b].T for a, b in zip(bounds, ends, strict=True)])
 
 
 class Solution(NamedTuple):

@@ -66,12 +66,12 @@ class TransmissionGap:
 
     @property
     def std_load(self) -> float:
-        return self.std_motor * abs(self.lost.ratio)
+        return self.std_motor * abs(self.lost.ratio) * self.lost.load_spread
 
     @property
     def interval_load(self) -> Interval:
-        low, high = self.interval_motor
-        return (low * abs(self.lost.ratio), high * abs(self.lost.ratio))
+        gap = self.lost.at_motor if math.isnan(self.gap_motor) else self.gap_motor
+        return self.lost.seen_at_load(gap, self.interval_motor)
 
     @property
     def ok(self) -> bool:

@@ -17,7 +17,7 @@ from servotwin.estimation.kinematic.wind_up import gap_within
 from servotwin.plant.axis import Axis
 
 GAP, FREQUENCY, FRICTION = 0.02, 60.0, 0.002  # rad, rad/s, rad: the wind-up is a fifth of the gap
-UNKNOWN = LostMotion(math.nan, math.inf, (0.0, math.inf), 1.03, 0.0, GapStatus.MODEL_MISMATCH, ("it swings",))
+UNKNOWN = LostMotion(math.nan, math.inf, (0.0, math.inf), 1.03, 1.0, 0.0, GapStatus.MODEL_MISMATCH, ("it swings",))
 
 
 def swinging(seconds=6.0, rate=250.0, speed=1.0):
@@ -66,7 +66,7 @@ def test_friction_is_never_so_well_known_that_its_wind_up_does_not_widen_the_int
 
 def test_slow_strokes_without_dynamics_show_no_gap():
     made = recording(seconds=4.0, rate=50.0)
-    lost = LostMotion(0.05, 1e-4, (0.049, 0.051), 0.1, 0.0, GapStatus.OK)
+    lost = LostMotion(0.05, 1e-4, (0.049, 0.051), 0.1, 1.0, 0.0, GapStatus.OK)
     known = with_dynamics(made, gap_within(lost, None))
     assert known.status is GapStatus.LOST_MOTION
     assert math.isnan(known.gap_motor)
@@ -110,6 +110,6 @@ def test_a_machines_load_is_its_masses_on_its_stiffness_with_its_friction():
 
 
 def test_a_gap_that_is_known_is_left_as_it_is(made):
-    lost = LostMotion(0.05, 1e-4, (0.049, 0.051), 0.1, 0.0, GapStatus.OK)
+    lost = LostMotion(0.05, 1e-4, (0.049, 0.051), 0.1, 1.0, 0.0, GapStatus.OK)
     known = gap_within(lost, 0.0)
     assert with_dynamics(made, known) is known

@@ -7,8 +7,9 @@ import pytest
 from recordings import recording
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.kinematic.breaks import largest_step
+from servotwin.estimation.kinematic.breaks import check_not_joined, largest_step
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
+from servotwin.estimation.kinematic.recording import EncoderRecording
 
 
 def broken(change):
@@ -26,7 +27,7 @@ def test_a_slipped_encoder_is_told_with_its_time():
 
 def test_two_machines_in_one_log_are_told():
     with pytest.raises(
-        InvalidInput, match=r"by 0\.0999 rad per rad in its first half and by 0\.1998 in its second: two"
+        InvalidInput, match=r"by 0\.099\d+ rad per rad in its first half and by 0\.1998 in its second: two"
     ):
         estimate_lost_motion(broken(lambda load: 2.0 * load))
 
@@ -50,3 +51,45 @@ def test_the_largest_step_of_a_residual():
     assert (step.row, step.size) == (30, pytest.approx(3.0))
     assert step.explained == pytest.approx(1.0)
     assert largest_step(np.zeros(5)).explained == 0.0
+
+
+def joined(first, second):
+    later = second.time + first.time[-1] + 0.01
+    return EncoderRecording(
+        *(
+            np.concatenate(each)
+            for each in ((first.time, later), (first.motor, second.motor), (first.load, second.load))
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    ("offset", "ratio", "told"),
+    [
+        (5.0, 0.1, r"from 8.005 s on the load is \+5 rad off"),
+        (-0.2, 0.1, r"from 8.005 s on the load is -0.\d+ rad off"),
+        (0.0, 0.2, r"by 0\.\d+ rad per rad until 8.005 s and by 0\.\d+ from then on: two machines"),
+        (0.0, 100.0, r"by 0\.\d+ rad per rad until 8.005 s and by \d+.* from then on: two machines or units"),
+    ],
+)
+def test_two_logs_that_were_joined_are_told_with_the_place(offset, ratio, told):
+    # Before: a gap of 8.8 to 13 rad for 0.3 and 0.1 rad, status ok.
+    first = recording(seconds=8.0, rate=200.0)
+    second = recording(seconds=8.0, rate=200.0, seed=2, gap=0.08, ratio=ratio, speed=1.3)
+    with pytest.raises(InvalidInput, match=told):
+        estimate_lost_motion(joined(first, replace(second, load=second.load + offset)))
+
+
+def test_two_machines_by_turns_are_told():
+    first, second = recording(seconds=8.0, rate=200.0), recording(seconds=8.0, rate=200.0, seed=2, speed=1.3)
+    by_turns = [np.column_stack(each).ravel() for each in ((first.motor, second.motor), (first.load, second.load))]
+    with pytest.raises(InvalidInput, match="the motor's position jumps to and fro from sample to sample: two machines"):
+        estimate_lost_motion(EncoderRecording(np.arange(3200) * 2.5e-3, *by_turns))
+
+
+@pytest.mark.parametrize("hunting", [0.0, 0.05])
+def test_a_log_of_one_machine_with_dropouts_is_not_joined(hunting):
+    made = recording(seconds=20.0, rate=200.0)
+    kept = ~((made.time > 5.0) & (made.time < 7.3)) & ~((made.time > 12.0) & (made.time < 12.4))
+    load = made.load + hunting * np.sin(40.0 * made.time)
+    check_not_joined(replace(made, time=made.time[kept], motor=made.motor[kept], load=load[kept]))

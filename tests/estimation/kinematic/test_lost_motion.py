@@ -1,10 +1,11 @@
 """The gap between two encoders, without a model of the dynamics."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from recordings import recording, swings
+from recordings import recording, short_strokes, swings
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
@@ -152,3 +153,30 @@ def test_intervals_cover():
         assert not found.ok or 1.96 < 0.5 * (high - low) / found.std_motor < 4.4
     assert inside >= 11
     assert accepted >= 6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("amplitude", "seed"), [(1.5, 4), (2.5, 1), (4.0, 3)])
+def test_strokes_little_longer_than_the_gap_show_it_on_both_sides(amplitude, seed):
+    # Before: 1.9973 +- 0.0006 rad for 2 rad, the end of a grid; 1.96 +- 0.1 rad; and, at the load, 3.198 mm for 3.2 mm.
+    found = estimate_lost_motion(short_strokes(2.0, amplitude, seed))
+    assert found.ok, found.reasons
+    for (low, high), gap in ((found.interval_motor, 2.0), (found.interval_load, 3.2)):
+        assert low <= gap <= high
+        assert high - low < 4e-3 * gap
+
+
+@pytest.mark.slow
+def test_the_lag_that_is_told_is_that_of_the_final_fit():
+    made = short_strokes(2.0, 2.5, 0)
+    late = replace(made, load=np.interp(made.time - 3e-3, made.time, made.load))
+    assert estimate_lost_motion(late).lag == pytest.approx(3e-3, abs=1e-4)
+
+
+def test_curves_take_the_lag_off_and_have_their_least_error_at_the_gap():
+    found = estimate_lost_motion(recording(lag=20e-3))
+    curves = found.curves
+    assert curves.gaps[np.argmin(curves.rms)] == pytest.approx(found.at_motor, rel=1e-6)
+    assert curves.gaps[0] == 0.0
+    # Before: the lag of 20 ms let the loop bulge by several gaps.
+    assert np.ptp(np.quantile(curves.lead, (0.01, 0.99))) == pytest.approx(0.05, rel=0.1)
