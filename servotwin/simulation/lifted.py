@@ -24,18 +24,19 @@ from servotwin.simulation.lifted_tables import (
     LiftedMemory,
     Place,
     Places,
+    fill_here,
     slot_of,
 )
 
 tick = verbatim(law.tick)
 
-UNFILLED = 3
-"""Status of a run that needs the tables of the mode and branch where it is."""
+# Status of a run that needs the tables of the mode and branch where it is.
+_UNFILLED = 3
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, FINE
-# Ticks until a longer block is tried again, of which not even the first interval was clean.
-_SOON = 4 * FINE
+# Longest time in ticks until a block is tried again of which again and again not even the first interval was clean.
+_LONGEST = 8 * FINE
 # Ticks that a count must last before a block pays: the next ones are likely to last as long, this one as long again.
 _LASTS = 16
 TICKED = -1
@@ -237,7 +238,7 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced. Stops where
     `deepens`."""
     slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
-    n, again, later = lifted.states, begin, begin
+    n, again, later, wait = lifted.states, begin, begin, 0
     low, high, slack, out = memory.low, memory.high, memory.slack, memory.out
     squares, change = memory.squares, memory.change
     while end - place.at[0] >= 2 and segments.size[0] + 4 < len(segments.tick):
@@ -262,7 +263,7 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
                 place.at[0], place.at[5] = k, place.at[5] + clean * FINE
             if clean == limit:
                 continue
-            later = k + (_SOON if clean == 0 else 0)
+            later, wait = (k + wait, min(2 * wait + FINE, _LONGEST)) if clean == 0 else (k, 0)
         limit = min(FINE, end - k)
         clean = clean_ticks(
             lifted, lifted.fine, slot, watches, FINE, limit, low, high, slack, settles, squares, change, z, out
@@ -276,8 +277,8 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     return place.at[0] - begin
 
 
-@bare
-def run_lifted(
+@subroutine
+def _run_lifted(
     t: Tables,
     loop: LiftedLoop,
     places: Places,
@@ -292,8 +293,7 @@ def run_lifted(
     scratch: Scratch,
     memory: LiftedMemory,
 ) -> int:
-    """Run ticks up to `end` under one cubic of the reference, that begins at `origin` (s); `rate` in ticks/s. Returns
-    FULL where a record must grow, and UNFILLED where `fill_here` is due."""
+    """Run as `run_lifted` does; returns `_UNFILLED` where `fill_here` is due."""
     at, x = place.at, z[: places.plant]
     room = len(record.event_step) - 2 * EVENTS_PER_STEP
     while at[0] < end:
@@ -307,7 +307,7 @@ def run_lifted(
             filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
             at[6] = 1 if deepens(place, end, filled) else 0
             if filled == 0 or at[6] == 1:
-                return UNFILLED
+                return _UNFILLED
             watches = set_bounds(t, loop, places, place, memory)
             if advance_block(z, place, watches, end, segments, memory) > 0:
                 if at[0] >= end:
@@ -338,3 +338,31 @@ def run_lifted(
         at[5] = at[5] + 1 if alike else 0
         at[0] += 1
     return DONE
+
+
+@bare
+def run_lifted(
+    t: Tables,
+    loop: LiftedLoop,
+    places: Places,
+    coefficients: Array,
+    origin: float,
+    rate: float,
+    z: Array,
+    place: Place,
+    end: int,
+    segments: Segments,
+    record: RunRecord,
+    scratch: Scratch,
+    memory: LiftedMemory,
+) -> int:
+    """Run ticks up to `end` under one cubic of the reference, that begins at `origin` (s); `rate` in ticks/s. Returns
+    FULL where a record must grow."""
+    status = _UNFILLED
+    while status == _UNFILLED:
+        status = _run_lifted(
+            t, loop, places, coefficients, origin, rate, z, place, end, segments, record, scratch, memory
+        )
+        if status == _UNFILLED:
+            fill_here(t, loop, places, place, memory)
+    return status
