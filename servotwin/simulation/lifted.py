@@ -24,14 +24,13 @@ from servotwin.simulation.lifted_tables import (
     LiftedMemory,
     Place,
     Places,
-    fill_here,
     slot_of,
 )
 
 tick = verbatim(law.tick)
 
-# Status of a run that needs the tables of the mode and branch where it is.
-_UNFILLED = 3
+UNFILLED = 3
+"""Status of a run that needs the tables of the mode and branch where it is."""
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, FINE
@@ -277,8 +276,8 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     return place.at[0] - begin
 
 
-@subroutine
-def _run_lifted(
+@bare
+def run_lifted(
     t: Tables,
     loop: LiftedLoop,
     places: Places,
@@ -293,7 +292,8 @@ def _run_lifted(
     scratch: Scratch,
     memory: LiftedMemory,
 ) -> int:
-    """Run as `run_lifted` does; returns `_UNFILLED` where `fill_here` is due."""
+    """Run ticks up to `end` under one cubic of the reference, that begins at `origin` (s); `rate` in ticks/s. Returns
+    FULL where a record must grow, and UNFILLED where `fill_here` is due."""
     at, x = place.at, z[: places.plant]
     room = len(record.event_step) - 2 * EVENTS_PER_STEP
     while at[0] < end:
@@ -307,7 +307,7 @@ def _run_lifted(
             filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
             at[6] = 1 if deepens(place, end, filled) else 0
             if filled == 0 or at[6] == 1:
-                return _UNFILLED
+                return UNFILLED
             watches = set_bounds(t, loop, places, place, memory)
             if advance_block(z, place, watches, end, segments, memory) > 0:
                 if at[0] >= end:
@@ -338,31 +338,3 @@ def _run_lifted(
         at[5] = at[5] + 1 if alike else 0
         at[0] += 1
     return DONE
-
-
-@bare
-def run_lifted(
-    t: Tables,
-    loop: LiftedLoop,
-    places: Places,
-    coefficients: Array,
-    origin: float,
-    rate: float,
-    z: Array,
-    place: Place,
-    end: int,
-    segments: Segments,
-    record: RunRecord,
-    scratch: Scratch,
-    memory: LiftedMemory,
-) -> int:
-    """Run ticks up to `end` under one cubic of the reference, that begins at `origin` (s); `rate` in ticks/s. Returns
-    FULL where a record must grow."""
-    status = _UNFILLED
-    while status == _UNFILLED:
-        status = _run_lifted(
-            t, loop, places, coefficients, origin, rate, z, place, end, segments, record, scratch, memory
-        )
-        if status == _UNFILLED:
-            fill_here(t, loop, places, place, memory)
-    return status

@@ -28,6 +28,7 @@ from servotwin.simulation.continuous import at_zero
 from servotwin.simulation.inputs import RunInputs
 from servotwin.simulation.lifted import (
     TICKED,
+    UNFILLED,
     latest_direction,
     more_segments,
     new_segments,
@@ -36,7 +37,7 @@ from servotwin.simulation.lifted import (
     take_tick,
 )
 from servotwin.simulation.lifted_output import sample_lifted
-from servotwin.simulation.lifted_tables import KINDS, LiftedLoop, LiftedMemory, Place, Places
+from servotwin.simulation.lifted_tables import KINDS, LiftedLoop, LiftedMemory, Place, Places, fill_here
 from servotwin.simulation.start import plant_start, set_states, started
 
 # Room of a record: the system provides the memory that is used.
@@ -263,6 +264,8 @@ class LiftedEngine:
                 self.scratch,
                 self.memory,
             )
+            if status == UNFILLED:
+                fill_here(self.tables, self.loop, self.places, self.place, self.memory)
             self._grow(status)
 
     def _grow(self, status: int) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from servotwin.control.law import LawParameters
 from servotwin.hybrid.automaton import Array
-from servotwin.hybrid.compiled import inlined, subroutine
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.hybrid.flow import product
 from servotwin.hybrid.lifted import LiftedTables, LiftedWorkspace, add_square, cubic_weights, fill_slot
 from servotwin.hybrid.lifted_vast import deepen_slot
@@ -338,7 +338,7 @@ def slot_of(mode: int, active: bool, kind: int) -> int:
     return (mode * 2 + (1 if active else 0)) * KINDS + kind
 
 
-@subroutine
+@bare
 def fill_here(t: Tables, loop: LiftedLoop, places: Places, place: Place, memory: LiftedMemory) -> None:
     """Fill the slot of the plant's mode and the law's branch where a run is; the vast scale where it is needed."""
     mode, active, kind = place.at[1], place.at[2] == 1, place.at[3]

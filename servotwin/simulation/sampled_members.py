@@ -17,6 +17,7 @@ from servotwin.hybrid.members import figures_of
 from servotwin.hybrid.tables import Tables
 from servotwin.simulation.lifted import (
     TICKED,
+    UNFILLED,
     Segments,
     latest_direction,
     note,
@@ -25,7 +26,7 @@ from servotwin.simulation.lifted import (
     take_tick,
 )
 from servotwin.simulation.lifted_output import sample_lifted
-from servotwin.simulation.lifted_tables import LiftedLoop, LiftedMemory, Place, Places
+from servotwin.simulation.lifted_tables import LiftedLoop, LiftedMemory, Place, Places, fill_here
 
 _LATE = 1e-9  # ticks: a knot that rounding puts behind the tick it belongs to
 
@@ -140,10 +141,14 @@ def run_one(
             direction = latest_direction(worker.coefficients[0] - past, direction)
             past = worker.coefficients[0]
             z[places.feedforward] = parameters.feedforward + parameters.friction * direction
-        status = run_lifted(
-            worker.tables, loop, places, worker.coefficients, family.times[piece], rate, z, worker.place, stop,
-            segments, record, worker.scratch, worker.lifted,
-        )  # fmt: skip
+        status = UNFILLED
+        while status == UNFILLED:
+            status = run_lifted(
+                worker.tables, loop, places, worker.coefficients, family.times[piece], rate, z, worker.place, stop,
+                segments, record, worker.scratch, worker.lifted,
+            )  # fmt: skip
+            if status == UNFILLED:
+                fill_here(worker.tables, loop, places, worker.place, worker.lifted)
         if status != DONE:
             return status
         if stop == end and (piece + 1 == len(family.times) or family.times[piece + 1] * rate - _LATE > end):
