@@ -99,10 +99,16 @@ def sweeping(workload: SweepWorkload, threads: int) -> Contestant:
     return Contestant(f"{NAME}, {threads} thread{'s' * (threads > 1)}", lambda: job)
 
 
+@cache
+def _two_mass_drive() -> Axis:
+    """The preset two-mass-drive under its own law in continuous time, read once as the other presets."""
+    return Axis.preset("two-mass-drive").replace(sample_rate=None)
+
+
 def _two_masses(duration: float) -> Simulation:
-    """The preset two-mass-drive under its own law in continuous time, its gap growing to ten times the healthy one."""
+    """The two-mass drive, its gap growing to ten times the healthy one."""
     return Simulation(
-        Axis.preset("two-mass-drive").replace(sample_rate=None),
+        _two_mass_drive(),
         duration,
         reference=SquareWave(0.2, 0.2 * duration),
         gap=SCurve(0.0, 0.02, duration),

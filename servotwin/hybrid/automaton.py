@@ -147,8 +147,8 @@ class AutomatonStack:
         InvalidInput
             They differ in structure.
         """
-        structure = _structure(automata[0])
-        if any(_structure(automaton) != structure for automaton in automata[1:]):
+        structure = structure_key(automata[0])
+        if any(structure_key(automaton) != structure for automaton in automata[1:]):
             raise InvalidInput("the automata of an ensemble must have the same states, modes, guards and targets")
         modes, n = automata[0].modes, len(automata[0].names)
         most = max(1, *(len(mode.guards) for mode in modes))
@@ -162,7 +162,8 @@ class AutomatonStack:
         return cls(automata[0], np.array([automaton.flows for automaton in automata]), rows, resets)
 
 
-def _structure(automaton: Automaton) -> tuple[object, ...]:
+def structure_key(automaton: Automaton) -> tuple[object, ...]:
+    """States, guards, targets and places of resets: equal for automata that differ in numbers only."""
     targets = tuple(tuple((g.target, g.reset is None) for g in mode.guards) for mode in automaton.modes)
     return automaton.names, targets
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple, TypeVar
@@ -12,12 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
-from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, shared_flows, speeds
+from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, shared_flows, speeds, structure_key
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
 from servotwin.hybrid.output import empty_outputs, new_output_workspace
-from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables, nothing_pending
+from servotwin.hybrid.stock import Stock
+from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables
 from servotwin.hybrid.trajectory import ZenoError
 
 _PARTS_PER_WORKER = 8
@@ -188,78 +189,82 @@ def _run(
 ) -> None:
     """Fill `results`; each worker takes the next part when it has finished one."""
     starts = _checked_starts(structure, len(family.step), members, results, options)
+    flow_of = shared_flows(family.flows.reshape(len(family.flows), *structure.flows.shape))
+    kind = structure_key(structure), flow_of.tobytes(), family.outputs.shape[1]
+    job = _Job(family, structure, flow_of, kind, starts, results, 1 if options is None else options.last)
     count = len(starts.order)
     workers = max(1, min(threads or os.cpu_count() or 1, count))
     # Members cost unequally: many small parts keep every worker busy to the end.
     size = max(1, count // (_PARTS_PER_WORKER * workers))
     # An iterator shared by the threads: the interpreter lock makes taking the next part safe.
     parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
-    tail = 1 if options is None else options.last
-
-    stuck = on_threads(lambda: _run_parts(family, structure, starts, results, parts, tail), workers)
+    stuck = on_threads(lambda: _run_parts(job, parts), workers)
     if zeno := [member for each in stuck for member in each]:
         raise ZenoError(f"member {min(zeno)} changes mode without end: the automaton is Zeno or slides")
 
 
-def _run_parts(
-    family: AutomatonFamily,
-    structure: Automaton,
-    starts: MemberStarts,
-    results: MemberResults,
-    parts: Iterator[tuple[int, int]],
-    tail: int,
-) -> list[int]:
+class _Job(NamedTuple):
+    """Members to be run.
+
+    `kind` is that of the memory that runs need: all automata of this structure share it; `tail` is the number of
+    samples at the end that have figures of their own.
+    """
+
+    family: AutomatonFamily
+    structure: Automaton
+    flow_of: NDArray[np.int64]
+    kind: Hashable
+    starts: MemberStarts
+    results: MemberResults
+    tail: int
+
+
+_STOCK: Stock[tuple[WorkerMemory, RunRecord]] = Stock(most=8)
+
+
+def _run_parts(job: _Job, parts: Iterator[tuple[int, int]]) -> list[int]:
     """Run parts as one worker while there are any; return the members with Zeno behaviour."""
-    memory, record = _new_memory(family, structure), new_record(starts.state.shape[1])
+    family, results, zeno = job.family, job.results, []
     if len(results.figures):
         # Figures need the samples of one member at a time: every worker has its own buffer for them.
         results = results._replace(traces=np.empty_like(results.traces))
-    zeno = []
-    for first, last in parts:
-        status, record = _run_part(family, starts, results, first, last, tail, memory, record)
-        if status >= 0:
-            zeno.append(int(starts.order[status]))
+    with _STOCK.lent(job.kind, lambda: _new_memory(job)) as (kept, record):
+        memory = _loaded(kept, family)
+        for first, last in parts:
+            while first < last:
+                status, first = run_members(family, job.starts, results, first, last, job.tail, memory, record)
+                if status == ZENO:
+                    zeno.append(int(job.starts.order[first]))
+                    break
+                if status != DONE:
+                    record = grown(record)
     return zeno
 
 
-def _run_part(
-    family: AutomatonFamily,
-    starts: MemberStarts,
-    results: MemberResults,
-    first: int,
-    last: int,
-    tail: int,
-    memory: WorkerMemory,
-    record: RunRecord,
-) -> tuple[int, RunRecord]:
-    """Run the members of a part; return the place of the one with Zeno behaviour, -1 when there is none."""
-    while first < last:
-        status, first = run_members(family, starts, results, first, last, tail, memory, record)
-        if status == ZENO:
-            return int(first), record
-        if status != DONE:
-            record = grown(record)
-    return -1, record
-
-
-def _new_memory(family: AutomatonFamily, structure: Automaton) -> WorkerMemory:
-    flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
-    tables = empty_tables(structure, shared_flows(flows))
-    pending = nothing_pending(tables)._replace(
+def _loaded(memory: WorkerMemory, family: AutomatonFamily) -> WorkerMemory:
+    """The memory with the numbers of a family, none of whose tables are filled yet."""
+    memory.loaded[:] = -1
+    pending = memory.scratch.pending._replace(
         flows=family.flows,
         rows=family.guards,
         resets=family.resets,
         step=family.step,
         reach=np.full(len(family.step), NODES_FINE),
     )
-    return WorkerMemory(
+    return memory._replace(scratch=memory.scratch._replace(pending=pending))
+
+
+def _new_memory(job: _Job) -> tuple[WorkerMemory, RunRecord]:
+    tables = empty_tables(job.structure, job.flow_of)
+    memory = WorkerMemory(
         tables,
-        empty_outputs(tables, family.outputs.shape[1]),
+        empty_outputs(tables, job.family.outputs.shape[1]),
         new_output_workspace(tables.states),
-        new_scratch(tables, pending),
+        new_scratch(tables),
         np.zeros(tables.states),
         np.full(1, -1),
     )
+    return memory, new_record(tables.states)
 
 
 def _checked_starts(

@@ -252,15 +252,24 @@ def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, limit
 
     More than rounding, that is: a loop at rest would otherwise be looked at step by step for ever.
     """
-    clean, thirds = limit, t.guard_count[mode] * rows
+    clean, thirds = limit, np.uint64(t.guard_count[mode] * rows)
     for g in range(t.guard_count[mode]):
         least = LINGERING * rounding(t, mode, g, 0, x)
-        for k in range(clean):
-            at = g * rows + k
-            begin, end = out[at], out[at + 1]
-            if max(begin, begin + out[thirds + at], end - out[thirds + at + 1], end) > least:
-                clean = k
-                break
+        first, beyond = np.uint64(g * rows), 0
+        # Counted at first, for that is many at a time: most guards stay away.
+        for k in range(np.uint64(clean)):
+            at = first + k
+            begin, end = out[at], out[at + np.uint64(1)]
+            second, third = begin + out[thirds + at], end - out[thirds + at + np.uint64(1)]
+            beyond += max(max(begin, second), max(third, end)) > least
+        if beyond > 0:
+            for k in range(np.uint64(clean)):
+                at = first + k
+                begin, end = out[at], out[at + np.uint64(1)]
+                second, third = begin + out[thirds + at], end - out[thirds + at + np.uint64(1)]
+                if max(max(begin, second), max(third, end)) > least:
+                    clean = int(k)
+                    break
     return clean
 
 

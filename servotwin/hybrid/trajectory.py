@@ -18,6 +18,8 @@ from servotwin.hybrid.kernel import FULL, ZENO, RunRecord, follow_schedule, grow
 from servotwin.hybrid.output import Outputs, evaluate, output_table, sample_segments
 from servotwin.hybrid.tables import Tables, search_step
 
+# Room of a new record: the system provides the memory that is used, and a copy into more room costs as much as the run.
+_SEGMENTS, _EVENTS = 1 << 16, 1 << 14
 # Jumps this close to a search step, in steps, are taken on it.
 ON_GRID = 1e-9
 
@@ -87,7 +89,7 @@ class Trajectory:
         step, divisor = search_step(self.automaton, self.sample_step)
         self.step, self.divisor = step / self.refine, divisor * self.refine
         self.tables = tables_for(self.automaton, self.step)
-        self.record = new_record(len(self.state))
+        self.record = new_record(len(self.state), _SEGMENTS, _EVENTS)
         self._scratch = new_scratch(self.tables)
         self._place = np.zeros(1)
         self._at = np.array([self.first * self.divisor, self.mode, 0, 1], dtype=np.int64)

@@ -33,7 +33,9 @@ UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
 # The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
 # earlier.
-_PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, 8 * BLOCK
+_PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, FINE
+# Longest time in ticks until a block is tried again of which again and again not even the first interval was clean.
+_LONGEST = 8 * FINE
 # Ticks that a count must last before a block pays: the next ones are likely to last as long, this one as long again.
 _LASTS = 16
 TICKED = -1
@@ -235,7 +237,7 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     """Advance by blocks while nothing switches, to tick `end` at most; return the ticks advanced. Stops where
     `deepens`."""
     slot, begin, lifted = slot_of(place.at[1], place.at[2] == 1, place.at[3]), place.at[0], memory.lifted
-    n, again = lifted.states, begin
+    n, again, later, wait = lifted.states, begin, begin, 0
     low, high, slack, out = memory.low, memory.high, memory.slack, memory.out
     squares, change = memory.squares, memory.change
     while end - place.at[0] >= 2 and segments.size[0] + 4 < len(segments.tick):
@@ -248,7 +250,7 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
                 continue
             # What is near its bound now is so for a while.
             again, k = place.at[0] + 4 * BLOCK, place.at[0]
-        if place.at[5] >= FINE and end - k >= FINE:
+        if place.at[5] >= FINE and k >= later and end - k >= FINE:
             limit = min(COARSE, (end - k) // FINE)
             clean = clean_ticks(
                 lifted, lifted.coarse, slot, watches, COARSE, limit, low, high, slack, settles, squares, change, z, out
@@ -260,6 +262,7 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
                 place.at[0], place.at[5] = k, place.at[5] + clean * FINE
             if clean == limit:
                 continue
+            later, wait = (k + wait, min(2 * wait + FINE, _LONGEST)) if clean == 0 else (k, 0)
         limit = min(FINE, end - k)
         clean = clean_ticks(
             lifted, lifted.fine, slot, watches, FINE, limit, low, high, slack, settles, squares, change, z, out

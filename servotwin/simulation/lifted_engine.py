@@ -40,7 +40,8 @@ from servotwin.simulation.lifted_output import sample_lifted
 from servotwin.simulation.lifted_tables import KINDS, LiftedLoop, LiftedMemory, Place, Places, fill_here
 from servotwin.simulation.start import plant_start, set_states, started
 
-_ROOM = 4096
+# Room of a record: the system provides the memory that is used.
+_ROOM = 1 << 14
 # Ticks, of a run and per piece of the inputs, below which blocks do not pay.
 _TICKS_PER_RUN, _TICKS_PER_PIECE = 20_000, 64
 
@@ -155,6 +156,8 @@ class LiftedEngine:
     samples: int
     delay: int = 0
     index: int = field(default=0, init=False)
+    tolerance: float | None = field(default=None, init=False)
+    """m, whose thresholds the loop has."""
 
     def __post_init__(self) -> None:
         rate = self.controller.sample_rate
@@ -232,7 +235,8 @@ class LiftedEngine:
         piece = _piece(self.inputs.reference, time, self.rate)
         if self.inputs.tolerance is not None:
             tolerance = float(self.inputs.tolerance.coeffs[_piece(self.inputs.tolerance, time, self.rate), 0])
-            self.loop = self.loop._replace(parameters=self.controller.law(tolerance))
+            if tolerance != self.tolerance:
+                self.tolerance, self.loop = tolerance, self.loop._replace(parameters=self.controller.law(tolerance))
         coefficients = self.inputs.reference.coeffs[piece]
         if (friction := self.controller.friction_feedforward) != 0.0:
             # The reference is constant in every piece.

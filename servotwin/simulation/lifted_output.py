@@ -52,7 +52,7 @@ def _sample(table: Array, base: int, begin: int, stop: int, stride: int, z: Arra
         for sample in range(first, last):
             out[sample] = dot(table, base + (sample * stride - begin) * z.size, z)
     elif last > first:
-        product(table, base, BLOCK, last - first, z, out[first:last])
+        tall_product(table, base, BLOCK, last - first, z, out[first:last])
 
 
 @subroutine

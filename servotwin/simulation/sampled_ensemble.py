@@ -20,7 +20,14 @@ from servotwin.simulation.ensemble import Cases, check_constants, samples_of
 from servotwin.simulation.inputs import RunInputs, with_forces
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.sampled import SampledEngine
-from servotwin.simulation.sampled_groups import SampledMembers, SampledSpan, groups_of, in_blocks, run_group
+from servotwin.simulation.sampled_groups import (
+    GroupRun,
+    SampledMembers,
+    SampledSpan,
+    groups_of,
+    in_blocks,
+    run_groups,
+)
 from servotwin.simulation.sampled_law import SampledLawEngine
 from servotwin.simulation.sampled_members import SampledResults
 
@@ -104,11 +111,17 @@ def summarise_sampled(
     members, span = sampled_members(servos, controllers, cases), _span(duration, sample_rate, outputs, last, shape)
     bounds = _bounds(members, limits or {}, outputs)
     values = np.empty((len(bounds), len(outputs), len(Figures._fields)))
-    for group in groups_of(members, span):
-        figures = np.empty((len(group.which), *values.shape[1:]))
-        results = SampledResults(np.empty((1, len(outputs), span.samples)), figures)
-        run_group(group, span, bounds[group.which], results, threads)
-        values[group.which] = results.figures
+    runs = [
+        GroupRun(
+            group,
+            bounds[group.which],
+            SampledResults(np.empty((1, len(outputs), span.samples)), np.empty((len(group.which), *values.shape[1:]))),
+        )
+        for group in groups_of(members, span)
+    ]
+    run_groups(runs, span, threads)
+    for run in runs:
+        values[run.group.which] = run.results.figures
     for k, traces in _ticked(members, span, threads):
         for o, trace in enumerate(traces):
             figures_of(trace, bounds[k, o], span.last, values[k, o])
@@ -155,14 +168,20 @@ def simulate_sampled(
     """
     members, span = sampled_members(servos, controllers, cases), _span(duration, sample_rate, outputs, 0.0, shape)
     traces = np.empty((len(members.servos), len(outputs), span.samples))
-    for group in groups_of(members, span):
-        results = SampledResults(
-            np.empty((len(group.which), *traces.shape[1:])), np.empty((0, len(outputs), len(Figures._fields)))
+    none = np.empty((0, len(outputs), len(Figures._fields)))
+    runs = [
+        GroupRun(
+            group,
+            np.zeros((len(group.which), len(outputs))),
+            SampledResults(np.empty((len(group.which), *traces.shape[1:])), none),
         )
-        run_group(group, span, np.zeros((len(group.which), len(outputs))), results, threads)
-        traces[group.which] = results.traces
-    for k, run in _ticked(members, span, threads):
-        traces[k] = run
+        for group in groups_of(members, span)
+    ]
+    run_groups(runs, span, threads)
+    for run in runs:
+        traces[run.group.which] = run.results.traces
+    for k, trace in _ticked(members, span, threads):
+        traces[k] = trace
     return {name: traces[:, o].reshape(*members.shape, -1) for o, name in enumerate(outputs)}
 
 

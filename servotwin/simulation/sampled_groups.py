@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from itertools import chain, groupby
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,19 +15,20 @@ from numpy.typing import NDArray
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.control.laws import Law, filtered_pid
-from servotwin.hybrid.automaton import Array, shared_flows, speeds
+from servotwin.hybrid.automaton import Array, shared_flows, speeds, structure_key
 from servotwin.hybrid.ensemble import on_threads
 from servotwin.hybrid.flow import new_scratch
-from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, grown, new_record
+from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
-from servotwin.hybrid.tables import divisors, empty_tables, nothing_pending
+from servotwin.hybrid.stock import Stock
+from servotwin.hybrid.tables import divisors, empty_tables
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.plants import Plant, structure_of
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.stack import LoopStack, sampled_plants
 from servotwin.simulation.ensemble_starts import starts_of
-from servotwin.simulation.lifted import more_segments, new_segments
+from servotwin.simulation.lifted import Segments, more_segments, new_segments
 from servotwin.simulation.lifted_engine import new_memory, places_of, start_law, watches_of
 from servotwin.simulation.lifted_tables import KINDS, Place, Places
 from servotwin.simulation.sampled_members import (
@@ -63,7 +67,8 @@ class SampledSpan:
 
 @dataclass(frozen=True)
 class SampledGroup:
-    """Members of one structure: `which` are their indices among all members."""
+    """Members of one structure: `which` are their indices among all members; `flow_of` tells which modes flow alike,
+    and `kind` is that of the memory that runs need: all groups of this structure share it."""
 
     which: NDArray[np.int64]
     loop: ServoAutomaton
@@ -71,6 +76,8 @@ class SampledGroup:
     watches: int
     family: SampledFamily
     starts: SampledStarts
+    flow_of: NDArray[np.int64]
+    kind: Hashable
 
 
 def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
@@ -156,7 +163,10 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     begun = SampledStarts(
         order, plant, law, states, constants["reference"], enter, leave, constants["resolution"], limits
     )
-    return SampledGroup(which, loops.first, places, watches_of(loops.first, laws[0], dead_zone, counts), family, begun)
+    watches, flow_of = watches_of(loops.first, laws[0], dead_zone, counts), shared_flows(loops.automata.flows)
+    outputs = dead_zone, family.modes, len(span.outputs)
+    kind = structure_key(loops.first.automaton), flow_of.tobytes(), places, watches, outputs
+    return SampledGroup(which, loops.first, places, watches, family, begun, flow_of, kind)
 
 
 def _family(
@@ -197,61 +207,94 @@ def _row(loop: ServoAutomaton, name: str, places: Places) -> Array:
     return row
 
 
-def run_group(
-    group: SampledGroup, span: SampledSpan, limits: Array, results: SampledResults, threads: int | None
-) -> None:
-    """Fill `results`; each worker takes the next part when it has finished one.
+class GroupRun(NamedTuple):
+    """Members of a group to be run: `limits` (k, O) beyond which an output counts as outside, and their results."""
+
+    group: SampledGroup
+    limits: Array
+    results: SampledResults
+
+
+class _Part(NamedTuple):
+    """Places of a run's order."""
+
+    run: GroupRun
+    first: int
+    last: int
+
+
+class _Memory(NamedTuple):
+    """Memory of one worker."""
+
+    worker: SampledWorker
+    segments: Segments
+    record: RunRecord
+
+
+_STOCK: Stock[_Memory] = Stock(most=16)
+
+
+def run_groups(runs: Sequence[GroupRun], span: SampledSpan, threads: int | None) -> None:
+    """Fill the results of all groups; each worker takes the next part of any when it has finished one.
 
     Raises
     ------
     ZenoError
         Naming the member.
     """
-    starts, count = group.starts._replace(limits=limits), len(group.which)
+    count = sum(len(run.group.which) for run in runs)
     workers = max(1, min(threads or os.cpu_count() or 1, count))
     size = max(1, count // (_PARTS_PER_WORKER * workers))
-    parts = iter([(first, min(first + size, count)) for first in range(0, count, size)])
-    stuck = on_threads(lambda: _run_parts(group, starts, span, results, parts), workers)
-    if zeno := [int(group.which[place]) for each in stuck for place in each]:
+    parts = iter(
+        [
+            _Part(run, first, min(first + size, len(run.group.which)))
+            for run in runs
+            for first in range(0, len(run.group.which), size)
+        ]
+    )
+    stuck = on_threads(lambda: _run_parts(parts, span), workers)
+    if zeno := [member for each in stuck for member in each]:
         raise ZenoError(f"member {min(zeno)} changes mode without end: the automaton is Zeno or slides")
 
 
-def _run_parts(
-    group: SampledGroup,
-    starts: SampledStarts,
-    span: SampledSpan,
-    results: SampledResults,
-    parts: Iterator[tuple[int, int]],
-) -> list[int]:
+def _run_parts(parts: Iterator[_Part], span: SampledSpan) -> list[int]:
     """Run parts as one worker while there are any; return the members with Zeno behaviour."""
-    worker, n = _new_worker(group), group.places.states
-    segments, record = new_segments(n, _ROOM), new_record(group.places.plant)
-    if len(results.figures):
-        # Figures need the samples of one member at a time: every worker has its own buffer for them.
-        results = results._replace(traces=np.empty_like(results.traces))
     zeno = []
-    for first, last in parts:
-        while first < last:
-            status, first = run_sampled(
-                group.family, starts, results, group.places, span.rate, first, last, span.last, worker, segments, record
-            )
-            if status == ZENO:
-                zeno.append(int(starts.order[first]))
-                break
-            if status != DONE:
-                if record.size[1] > len(record.event_step) - 2 * EVENTS_PER_STEP - CHANGES_AT_ONCE:
-                    record = grown(record)
-                else:
-                    segments = more_segments(segments)
+    # Parts of one group share the memory, and what is filled in it.
+    for _, mine in groupby(parts, key=lambda part: id(part.run)):
+        first = next(mine)
+        group = first.run.group
+        with _STOCK.lent(group.kind, partial(_new_memory, group)) as memory:
+            memory = memory._replace(worker=_loaded(memory.worker, group.family))
+            zeno += [place for part in chain([first], mine) for place in _run_part(part, span, memory)]
     return zeno
 
 
-def _new_worker(group: SampledGroup) -> SampledWorker:
-    structure, family, n = group.loop.automaton, group.family, group.places.states
-    flows = family.flows.reshape(len(family.flows), *structure.flows.shape)
-    tables = empty_tables(structure, shared_flows(flows))
-    slots, outputs = family.modes * 2 * KINDS, len(family.rows)
-    pending = nothing_pending(tables)._replace(
+def _run_part(part: _Part, span: SampledSpan, memory: _Memory) -> list[int]:
+    """Run the members of a part; return the one with Zeno behaviour, if there is one."""
+    (group, limits, results), first, last = part
+    starts, (worker, segments, record) = group.starts._replace(limits=limits), memory
+    if len(results.figures):
+        # Figures need the samples of one member at a time: every part has its own buffer for them.
+        results = results._replace(traces=np.empty_like(results.traces))
+    while first < last:
+        status, first = run_sampled(
+            group.family, starts, results, group.places, span.rate, first, last, span.last, worker, segments, record
+        )
+        if status == ZENO:
+            return [int(group.which[starts.order[first]])]
+        if status != DONE:
+            if record.size[1] > len(record.event_step) - 2 * EVENTS_PER_STEP - CHANGES_AT_ONCE:
+                record = grown(record)
+            else:
+                segments = more_segments(segments)
+    return []
+
+
+def _loaded(worker: SampledWorker, family: SampledFamily) -> SampledWorker:
+    """The worker with the numbers of a family, none of whose tables are filled yet."""
+    worker.loaded[:] = -1
+    pending = worker.scratch.pending._replace(
         flows=family.flows,
         rows=family.guards,
         resets=family.resets,
@@ -259,10 +302,17 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
         reach=family.searches,
     )
-    return SampledWorker(
+    return worker._replace(scratch=worker.scratch._replace(pending=pending))
+
+
+def _new_memory(group: SampledGroup) -> _Memory:
+    family, n = group.family, group.places.states
+    tables = empty_tables(group.loop.automaton, group.flow_of)
+    slots, outputs = family.modes * 2 * KINDS, len(family.rows)
+    worker = SampledWorker(
         tables,
         new_memory(group.places, family.modes, group.watches),
-        new_scratch(tables, pending),
+        new_scratch(tables),
         np.zeros(n),
         Place(np.zeros(9, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),
@@ -270,3 +320,4 @@ def _new_worker(group: SampledGroup) -> SampledWorker:
         np.zeros((outputs, slots), dtype=np.int8),
         np.zeros((outputs, slots * BLOCK * n)),
     )
+    return _Memory(worker, new_segments(n, _ROOM), new_record(group.places.plant))
