@@ -16,7 +16,8 @@ def twin(tmp_path_factory):
     running.kill()
 
 
-@pytest.fixture(scope="package")
+# Not longer than a file: playwright keeps an event loop running in this thread, and other tests run their own.
+@pytest.fixture(scope="module")
 def browser():
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is in the extra dev")
     with sync_api.sync_playwright() as engine:

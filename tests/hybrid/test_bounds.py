@@ -16,7 +16,8 @@ import numpy as np
 
 def interpreted(**options):
     def same(function):
-        function._cache = SimpleNamespace(_cache_file=SimpleNamespace(_load_index=dict, _index_path=""))
+        file = SimpleNamespace(_load_index=dict, _index_path="")
+        function._cache = SimpleNamespace(_cache_file=file, _impl=SimpleNamespace())
         function.compile = None
         return function
     return same

@@ -29,7 +29,7 @@ _OFF = 1.5  # spreads of both parts
 _OTHER = 0.1  # of the ratio, and so many times the spread over the way of the shorter part
 
 
-class _Part(NamedTuple):
+class _Line(NamedTuple):
     """A line through the load over the motor: slope, load at a given motor position, and spread about it."""
 
     slope: float
@@ -66,15 +66,15 @@ def check_not_joined(recording: EncoderRecording) -> None:
             raise InvalidInput(_slipped(recording, row, after.load - before.load))
 
 
-def _line(motor: Array, load: Array, at: float) -> _Part:
+def _line(motor: Array, load: Array, at: float) -> _Line:
     """Fit a line to evenly chosen samples; its load at the motor position `at`."""
     rows = np.unique(np.linspace(0, motor.size - 1, _CHOSEN).astype(int))
     x, y = motor[rows], load[rows]
     if not (np.ptp(x) > 0.0 and np.ptp(y) > 0.0):
-        return _Part(0.0, 0.0, 0.0, False)
+        return _Line(0.0, 0.0, 0.0, False)
     slope, offset = np.polyfit(x - at, y, 1)
     spread = float(np.ptp(np.quantile(y - offset - slope * (x - at), _MOST)))
-    return _Part(float(slope), float(offset), spread, abs(float(np.corrcoef(x, y)[0, 1])) > _LINE)
+    return _Line(float(slope), float(offset), spread, abs(float(np.corrcoef(x, y)[0, 1])) > _LINE)
 
 
 def _slipped(recording: EncoderRecording, row: int, size: float) -> str:
