@@ -28,7 +28,7 @@ _POLLS = 2
 
 @dataclass(slots=True)
 class _View:
-    """What is known of a machine that is watched; times in s, monotonic."""
+    """State of a machine that is watched; times in s, monotonic."""
 
     asked: float
     came: float = -math.inf

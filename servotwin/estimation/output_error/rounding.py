@@ -2,8 +2,8 @@
 
 Play turns an error of the motor's angle into one that is no larger, so that at the true unknowns no residual exceeds
 half a count of each channel together. Least squares does not know that. Errors of a motor that creeps, or repeats its
-motion, depend on each other, and with ratio and delay free it took up to 27 % off the gap for residuals that were a
-hundredth smaller. So the window is fitted at many gaps, and all count whose residuals keep to the bound.
+motion, depend on each other: with ratio and delay free the best fit of one such motion was 27 % off, for residuals that
+were a hundredth smaller. So the window is fitted at many gaps, and all count whose residuals keep to the bound.
 """
 
 from __future__ import annotations
