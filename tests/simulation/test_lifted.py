@@ -83,6 +83,21 @@ def test_ticks_of_one_count_are_advanced_in_blocks() -> None:
     assert np.unique(counts).size > 500
 
 
+@pytest.mark.parametrize("limit", [None, 0.8])
+def test_ramps_of_a_limited_rate_are_advanced_in_blocks(limit: float | None) -> None:
+    law = PAPER.controller.replace(sample_rate=5e3, rate_limit=3.0, voltage_limit=limit)
+    inputs = RunInputs(PiecewiseCubic.constant(1e-3), PiecewiseCubic.constant(10.0 * DEGREE), None, 5e3, 1e-3)
+    case = SampledCase(PAPER, law, inputs, 0.0, 20_001, 0)
+    ticked, blocks = case.ticked(), case.in_blocks()
+    voltage = ticked.channel("voltage", 0, case.samples)
+    assert limit is None or (voltage.max() == limit and voltage.min() == -limit)
+    steps = np.diff(voltage)
+    assert np.mean(np.isclose(steps, 3.0 / 5e3)) > 0.3  # up
+    assert np.mean(np.isclose(steps, -3.0 / 5e3)) > 0.3  # down
+    assert share_of_ticks(blocks) < 0.01
+    assert largest_difference(case, ticked, blocks) < 1e-7
+
+
 def test_most_ticks_are_advanced_in_blocks() -> None:
     law = PAPER.controller.replace(sample_rate=5e3)
     wave = as_pieces(SquareWave(1e-3, 4.0), 20.0)
