@@ -57,7 +57,9 @@ class EnduranceOutcome(NamedTuple):
         windows that a boot's last status before a fault names as cut than are stored or waiting, also at its end; those
         that the edges themselves count as dropped; windows left in the outboxes.
     applied : int
-        Updates that edges applied.
+        Updates that edges applied; one that is answered again, after a kill, counts once.
+    unprocessed : dict of str to int
+        Stored messages that no worker had processed when the twin was ended, by kind.
     refused : dict of str to int
         Messages of the crowd that the twin refused for good since its last start, by status.
     kept_bytes : dict of str to int
@@ -82,6 +84,7 @@ class EnduranceOutcome(NamedTuple):
     counted: int
     waiting: int
     applied: int
+    unprocessed: dict[str, int]
     refused: dict[str, int]
     kept_bytes: dict[str, int]
     bytes_per_window: float
@@ -251,7 +254,8 @@ def _figures(
         boots.setdefault((servo, boot), []).append(sequence)
     counts = "SELECT number FROM counts WHERE what LIKE 'dropped: %'"
     unseen = {each: cut - len(boots.get(each, ())) - waiting.get(each, 0) for each, cut in witness.cut.items()}
-    applied = "SELECT count(*) FROM evidence WHERE kind = 'receipt' AND status = 'applied'"
+    answered = "SELECT DISTINCT servo, version FROM evidence WHERE kind = 'receipt' AND status = 'applied'"
+    undone = "SELECT kind, count(*) FROM messages WHERE done IS NULL GROUP BY kind"
     seconds, crowd = samples[-1][0], site.crowd_status()
     acknowledged = witness.acknowledged | site.acknowledged_by_crowd()
     return EnduranceOutcome(
@@ -270,7 +274,8 @@ def _figures(
         waiting=sum(waiting.values()) + crowd.waiting,
         refused=crowd.refused,
         kept_bytes={file.name: file.stat().st_size for file in sorted(site.folder.glob("twin.db*"))},
-        applied=ask(site.folder / "twin.db", applied)[0][0],
+        applied=len(ask(site.folder / "twin.db", answered)),
+        unprocessed=dict(ask(site.folder / "twin.db", undone)),
         bytes_per_window=(site.folder / "twin.db").stat().st_size / max(1, len(stored)),
         outbox_bytes=max(site.outbox(servo).stat().st_size for servo in site.edges),
         memory={
@@ -329,6 +334,9 @@ def shown(outcome: EnduranceOutcome) -> Table:
         "dropped, counted by edges": str(outcome.counted),
         "left waiting": str(outcome.waiting),
         "refused for good, of the crowd": refused,
+        "stored, not processed at the end: windows; letters": "; ".join(
+            str(outcome.unprocessed.get(kind, 0)) for kind in ("window", "letter")
+        ),
         "updates applied": str(outcome.applied),
         "store, kB per window; GB in a year of a servo": f"{outcome.bytes_per_window / 1e3:.1f}; {year / 1e9:.1f}",
         f"store of {outcome.servos} servos in a year, TB, without retention": f"{year * outcome.servos / 1e12:.1f}",

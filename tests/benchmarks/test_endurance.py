@@ -32,9 +32,15 @@ def database(file: Path, tables: str, **rows: list[tuple[Any, ...]]) -> None:
 def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_is_lost(tmp_path: Path) -> None:
     """One window is acknowledged and gone, one is missing in a boot, two were counted, one waits."""
     (tmp_path / "ax-0").mkdir()
-    stored = [("ax-0", "b1", 0, "window"), ("ax-0", "b1", 2, "window"), ("ax-0", "b2", 0, "window")]
-    tables = "CREATE TABLE messages (servo, boot, sequence, kind); CREATE TABLE evidence (kind, status);"
-    database(tmp_path / "twin.db", tables, messages=stored, evidence=[("receipt", "applied"), ("receipt", "expired")])
+    stored = [("ax-0", "b1", 0, "window", 1.0), ("ax-0", "b1", 2, "window", None), ("ax-0", "b2", 0, "window", 1.0)]
+    letters = [("ax-0", "", -1, "letter", None), ("ax-0", "", -1, "letter", None)]
+    tables = """
+    CREATE TABLE messages (servo, boot, sequence, kind, done); CREATE TABLE evidence (servo, kind, status, version);
+    """
+    # A servo that was killed answers an update once more: it was applied once.
+    receipts = [("ax-0", "receipt", status, version) for status, version in (("applied", 1), ("applied", 1))]
+    receipts.append(("ax-0", "receipt", "expired", 2))
+    database(tmp_path / "twin.db", tables, messages=stored + letters, evidence=receipts)
     database(
         tmp_path / "ax-0/outbox.sqlite",
         TABLES,
@@ -62,6 +68,7 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
     samples = [(float(second), {"twin": 100 + second}) for second in range(10)]
     found = endurance._figures(site, witness, {"edge killed": 3}, samples)
     assert (found.stored, found.boots, found.applied) == (3, 2, 1)
+    assert found.unprocessed == {"window": 1, "letter": 2}
     assert (found.lost_acknowledged, found.holes, found.counted, found.waiting) == (2, 1, 2, 4)
     assert (found.servos, found.refused) == (997, {"400": 2})
     # Seven were cut in b2 up to its last status: one is stored, one waits.
@@ -73,6 +80,7 @@ def test_what_is_acknowledged_and_not_stored_and_what_is_missing_within_a_boot_i
     assert ["acknowledged,", "and", "not", "stored", "2"] in lines
     assert ["growth", "of", "a", "twin,", "bytes", "per", "window;", "MB", "in", "a", "year", "3.0;", "4719"] in lines
     assert ["faults:", "edge", "killed", "3"] in lines
+    assert ["stored,", "not", "processed", "at", "the", "end:", "windows;", "letters", "1;", "2"] in lines
 
 
 @pytest.mark.parametrize(("ended_by", "kept"), [(KeyboardInterrupt, False), (RuntimeError, True)])
