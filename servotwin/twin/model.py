@@ -82,7 +82,7 @@ class TwinModel:
         Raises
         ------
         InvalidInput
-            The policy cannot design for this controller, its table is not this model's, or triage cannot read this axis.
+            The policy cannot design for this controller, its table is not this model's, or triage cannot read the axis.
         """
         settings = settings.on(servo)
         chosen = policy or policy_of(servo, settings)

@@ -253,8 +253,8 @@ class Triage:
             return None
         if servo.at_motor or servo_for(servo) is None:
             raise InvalidInput(
-                "[twin.triage]: needs an axis with an encoder at the load that is held in the gap and has two masses or "
-                "more; leave the table out for this axis: every window is estimated"
+                "[twin.triage]: needs an axis with an encoder at the load that is held in the gap and has two masses "
+                "or more; leave the table out for this axis: every window is estimated"
             )
         return cls(servo, settings)
 
