@@ -82,7 +82,7 @@ class TwinModel:
         Raises
         ------
         InvalidInput
-            The policy cannot design for this controller, or its table is not this model's.
+            The policy cannot design for this controller, its table is not this model's, or triage cannot read the axis.
         """
         settings = settings.on(servo)
         chosen = policy or policy_of(servo, settings)
@@ -94,7 +94,7 @@ class TwinModel:
             motor=motor_learning_of(servo, settings),
             start=start,
             requests=Requests.of(servo, settings),
-            triage=None if settings.triage is None else Triage(servo, settings.triage),
+            triage=Triage.of(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
             controller=servo.controller if isinstance(servo.controller, Controller) else None,

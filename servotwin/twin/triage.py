@@ -240,6 +240,24 @@ class Triage:
     servo: Plant
     settings: TriageSettings
 
+    @classmethod
+    def of(cls, servo: Plant, settings: TriageSettings | None) -> Triage | None:
+        """Make the triage that a twin's settings describe; None: they have none.
+
+        Raises
+        ------
+        InvalidInput
+            No window of this axis can be glanced at.
+        """
+        if settings is None:
+            return None
+        if servo.at_motor or servo_for(servo) is None:
+            raise InvalidInput(
+                "[twin.triage]: needs an axis with an encoder at the load that is held in the gap and has two masses "
+                "or more; leave the table out for this axis: every window is estimated"
+            )
+        return cls(servo, settings)
+
     def glance(
         self,
         state: TriageState,

@@ -19,8 +19,9 @@ from servotwin.simulation import simulate
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.evidence import GapEstimateRecord, RedesignRecord, rows
 from servotwin.twin.model import TwinModel
-from servotwin.twin.settings import TwinSettings, read_twin_settings
+from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
 from servotwin.twin.step import WindowArrival, step
+from servotwin.twin.triage import Triage
 
 MODEL = Servo.preset("paper")
 ONE = MODEL.replace(k=tuple(1.04 * MODEL.stiffnesses), c=tuple(0.8 * MODEL.dampings))
@@ -192,3 +193,14 @@ def test_a_file_that_states_no_estimator_suits_a_free_shaft(name):
     other = parse_toml('policy = "paper"\n[estimator]\nlargest_std_deg = 0.2\n', "twin.toml")
     with pytest.raises(InvalidInput, match="leave them out for this axis"):
         estimator_of(axis, read_twin_settings(other, plant=axis))
+
+
+@pytest.mark.parametrize("name", ["two-mass-drive", "ball-screw"])
+def test_triage_of_an_axis_that_no_glance_can_read_is_refused_at_configuration(name):
+    with pytest.raises(InvalidInput, match=r"\[twin\.triage\]: needs an axis with an encoder at the load"):
+        TwinModel.of(Axis.preset(name), TwinSettings(policy="paper", triage=TriageSettings()))
+
+
+def test_triage_of_an_axis_without_an_encoder_at_the_load_is_refused():
+    with pytest.raises(InvalidInput, match=r"\[twin\.triage\]: needs an axis with an encoder at the load"):
+        Triage.of(Axis.preset("emps"), TriageSettings())
