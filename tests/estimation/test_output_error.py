@@ -20,7 +20,7 @@ from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.estimator import _problem
 from servotwin.estimation.output_error.fit import search
 from servotwin.estimation.output_error.models import Priors, ShaftModel
-from servotwin.estimation.output_error.rounding import possible_half
+from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.verdict import _slow, grown
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.window import Window
