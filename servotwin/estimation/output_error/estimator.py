@@ -17,8 +17,9 @@ from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
+from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
 from servotwin.estimation.output_error.problem import Problem
-from servotwin.estimation.output_error.rounding import possible_half
+from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
@@ -34,7 +35,6 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
-_ONE_STD = 0.683  # share of a normal distribution within one standard deviation
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -70,12 +70,12 @@ def estimate(
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
     expected = prior.gap if isinstance(prior, GapEstimate) else prior
-    problem = _problem(window, theta_m, axis, settings)
-    found = search(problem, 0.5 * axis.p * (expected or 0.0))
     at_motor, at_load, unit = _count_of_motor(axis, theta_m), _count_of_load(axis, window), 2.0 / axis.p
+    motor = MotorAngle(theta_m, 0.0) if axis.play is Play.FREE else without_noise(theta_m, at_motor)
+    problem = _problem(window, motor.angle, axis, settings)
+    found = search(problem, 0.5 * axis.p * (expected or 0.0))
     possible = possible_half(found, 0.5 * (axis.p * at_motor + at_load))
-    jitter = 0.0 if axis.play is Play.FREE else axis.p * _jitter(theta_m, at_motor)
-    return _stated(blank, found, judge(found, settings, unit, possible, jitter), unit)
+    return _stated(blank, found, judge(found, settings, unit, possible, axis.p * motor.noise), unit)
 
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
@@ -116,7 +116,8 @@ def _count_of_load(axis: Axis, window: Window) -> float:
 def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings) -> Problem:
     """The window with its model."""
     interval = 1.0 / window.sample_rate
-    at_motor, at_load = _count_of_motor(axis, theta_m), _count_of_load(axis, window)
+    measured = theta_m if window.theta_m is None else window.theta_m
+    at_motor, at_load = _count_of_motor(axis, measured), _count_of_load(axis, window)
     free, late = axis.play is Play.FREE, _SAMPLES_LATE * interval
     if free:
         own = math.sqrt(axis.transmission.k_d / axis.load.m[0])
@@ -126,12 +127,6 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
     model: MotionModel = ShaftModel(axis, priors) if free else PlayModel(axis, priors)
     count = math.hypot(axis.p * at_motor, at_load)
     return Problem(model, axis.p * theta_m, window.position, interval, count)
-
-
-def _jitter(theta_m: Array, count: float) -> float:
-    """Standard deviation (rad) of an angle's noise, without that of its counts: of what third differences leave."""
-    spread = float(np.quantile(np.abs(np.diff(theta_m, 3)), _ONE_STD)) / math.sqrt(20.0)
-    return math.sqrt(max(0.0, spread**2 - count**2 / 12.0))
 
 
 def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:

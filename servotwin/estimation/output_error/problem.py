@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel
+from servotwin.estimation.output_error.motor_angle import noise_of
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
@@ -18,6 +20,7 @@ _PLACES = tuple(0.1 * step for step in range(-5, 6))  # of the lead's range
 _WIDE = 5.0  # of the lead's range
 _SLOW = 0.1  # of the motor's largest speed
 _MOVED = 0.02  # of the window: what shows the first speed
+_SHARPEST = 0.1  # of the window: larger parts in which the motor's speed jumps are its usual motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +98,24 @@ class Problem:
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
         part = slice(self.margin, self.drive.size - self.margin)
-        return np.asarray((self.motion(values, rate).position - self.position)[part])
+        misfit = np.asarray((self.motion(values, rate).position - self.position)[part])
+        misfit[self.unsure] = 0.0
+        return misfit
+
+    @cached_property
+    def unsure(self) -> Flags:
+        """(m,) samples near which the motor's speed jumps: its place between two samples is not known there.
+
+        A delay moves the load by as much as interpolation errs: by what a parabola through three samples differs from
+        two lines. Without dynamics the load shows that at once; where it is less than the noise it does not matter.
+        """
+        size, reach = self.drive.size - 2 * self.margin, self.margin
+        if self.model.speed > 0.0:
+            return np.zeros(size, dtype=bool)
+        between = np.abs(np.diff(self.drive, 2)) / 8.0
+        sharp = between > max(noise_of(self.position), self.count / math.sqrt(12.0))
+        near = np.convolve(sharp, np.ones(2 * reach - 1), "valid")[: size] > 0.5
+        return near if float(np.mean(near)) < _SHARPEST else np.zeros(size, dtype=bool)
 
     def first(self) -> tuple[float, float]:
         """First position and speed of the load, by a line through the first samples where it has dynamics."""

@@ -12,7 +12,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
 from servotwin.estimation.output_error.models import HALF
-from servotwin.estimation.output_error.rounding import PossibleHalf
+from servotwin.estimation.output_error.possible import PossibleHalf
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.plant.signals import Array
 

@@ -1,0 +1,118 @@
+"""Gaps that a window leaves possible, for a motion without dynamics.
+
+The window is fitted at many gaps, and each counts by how well it explains the window. The best fit and its curvature do
+not do: a motor that creeps to its places with one rate makes the same motion of the load with another gap, ratio and
+delay, so that only what is known of these tells the gaps apart, and noise makes many minima along that valley.
+
+Where rounding is all of the noise, no residual exceeds half a count of each channel together at the true unknowns: play
+turns an error of the motor's angle into one that is no larger. Least squares does not know that. Errors of a motor that
+creeps, or repeats its motion, depend on each other: with ratio and delay free the best fit of one such motion was 27 %
+off, for residuals that were a hundredth smaller. There all gaps count whose residuals keep to the bound.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from servotwin.estimation.output_error.fit import Fit, Search, descend, only_rounding
+from servotwin.estimation.output_error.models import HALF
+from servotwin.plant.signals import Array
+
+_FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next, of the gap, and their growth
+_WIDEST = 2.0  # factor between the best gap and the farthest ones
+_STEPS, _DEEPER = 15, 8
+_BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
+_SLACK = 1.1  # of the bound: least squares does not make the largest residual small
+_FAR = 10.0  # bounds: no gap beyond is possible
+_IMPOSSIBLE, _PATIENCE = 200.0, 0.1  # rise of the cost in noise, over its variance, and logarithm of a ratio of gaps
+
+
+class PossibleHalf(NamedTuple):
+    """Half gap that a window leaves possible, m or rad at the load: mean and standard deviation."""
+
+    mean: float
+    std: float
+
+
+def possible_half(found: Search, bound: float) -> PossibleHalf | None:
+    """Weigh the half gaps by how well they explain a window; None for a model with dynamics.
+
+    Parameters
+    ----------
+    found : Search
+    bound : float
+        Largest error that rounding makes, m or rad at the load. Where no fit keeps to it the model errs too, and the
+        least largest residual takes its place.
+    """
+    if found.problem.model.speed > 0.0:
+        return None
+    rounding = bound > 0.0 and only_rounding(found.problem, found.best)
+    far = _FAR * bound if rounding else math.inf
+    fits = [*reversed(list(_profile(found, -1.0, far))), found.best, *_profile(found, 1.0, far)]
+    halves = np.array([fit.values[HALF] for fit in fits])
+    widths = np.gradient(halves) if halves.size > 1 else np.ones(1)
+    if rounding:
+        weights = widths * _in_rounding(found, fits, bound)
+    else:
+        fits = [_deepest(found, fit, width) for fit, width in zip(fits, widths, strict=True)]
+        halves = np.array([fit.values[HALF] for fit in fits])
+        widths = np.minimum(widths, [_BELL * fit.std(HALF, found.free) for fit in fits])
+        weights = widths * _in_noise(found, fits)
+    weights /= weights.sum()
+    mean = float(weights @ halves)
+    return PossibleHalf(mean, math.sqrt(float(weights @ ((halves - mean) ** 2 + widths**2 / 12.0))))
+
+
+def _deepest(found: Search, fit: Fit, width: float) -> Fit:
+    """The minimum near a fit with a given half gap, where it is narrower than the gaps that the fit stands for."""
+    full = descend(found.problem, fit.values, found.noise, found.free, 0)
+    if full.std(HALF, found.free) > width:
+        return full
+    lower = descend(found.problem, fit.values, found.noise, found.free, _DEEPER)
+    return lower if abs(lower.values[HALF] - fit.values[HALF]) <= width else full
+
+
+def _in_rounding(found: Search, fits: list[Fit], bound: float) -> Array:
+    """(f,) likelihoods of fits, all of whose residuals keep to a bound, or none."""
+    largest = np.array([_largest(fit) for fit in fits])
+    likely = np.exp(-0.5 * np.array([_prior(found, fit) for fit in fits]))
+    return np.asarray(likely * (largest <= _SLACK * max(bound, float(largest.min()))))
+
+
+def _in_noise(found: Search, fits: list[Fit]) -> Array:
+    """(f,) likelihoods of fits in normal noise, over that of the best."""
+    costs = np.array([fit.cost for fit in fits])
+    return np.exp(-0.5 * (costs - costs.min()) / found.best.variance())
+
+
+def _profile(found: Search, side: float, far: float) -> Iterator[Fit]:
+    """Fits at half gaps ever farther from the best one, smaller (-1) or larger (1), each from the one before."""
+    free, best = found.free.copy(), float(found.best.values[HALF])
+    free[HALF] = False
+    fit, share, likely = found.best, 0.0, 0.0
+    step = min(_COARSEST, max(_FINEST, found.best.std(HALF, found.free) / best))
+    limit = found.best.cost + _IMPOSSIBLE * found.best.variance()
+    while share < min(math.log(_WIDEST), likely + _PATIENCE):
+        share, step = share + step, min(_COARSEST, _GROWTH * step)
+        start = fit.values.copy()
+        start[HALF] = best * math.exp(side * share)
+        fit = descend(found.problem, start, found.noise, free, _STEPS)
+        if _largest(fit) > far:
+            return
+        # Minima a sample of delay apart have walls between them where the motor's speed jumps.
+        likely = share if fit.cost < limit or math.isfinite(far) else likely
+        yield fit
+
+
+def _largest(fit: Fit) -> float:
+    return float(np.max(np.abs(fit.raw)))
+
+
+def _prior(found: Search, fit: Fit) -> float:
+    """Squares of how far the model's numbers are off what is known of them, in standard deviations, summed."""
+    spreads = np.array([unknown.std for unknown in found.problem.model.unknowns])
+    return float(np.sum((fit.values / spreads) ** 2))
