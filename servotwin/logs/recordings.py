@@ -126,6 +126,7 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
         source=f"log {path}",
         motor_count=counts["motor"] if thinned else None,
         load_count=counts["load"] if thinned else None,
+        alone=clean.alone,
     )
     others = {CUT: int(cut), TURNED: gathering.samples if turned else 0}
     found = {**clean.found, **clock.found, **{defect: count for defect, count in others.items() if count}}

@@ -24,7 +24,7 @@ ANGLES = {
     "arcsec": math.pi / 648_000.0,
 }
 """Radians per unit."""
-LENGTHS = {"m": 1.0, "cm": 1e-2, "in": 0.0254, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
+LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "cm": 1e-2, "in": 0.0254}
 """Metres per unit."""
 # By how much the recording's load per motor may differ from the machine's; where the load swings it is not well known.
 _RATIO, _RATIO_OF_SWINGING = 0.05, 0.25
