@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,9 @@ import numpy as np
 from servotwin.plant.signals import Array
 
 _STRETCH, _LEAST, _STRETCHES = 1024, 16, 16  # samples of a stretch, at least, and stretches that must fit
+
+_RESTS = 0.01  # of the way in another stretch
+_SEED = 14
 
 
 class Thinned(NamedTuple):
@@ -26,7 +30,10 @@ class Thinned(NamedTuple):
 
 
 class Stretches:
-    """Samples so far, at most so many; where there are more, every second stretch becomes its turning points.
+    """Samples so far, at most so many; where there are more, fewer stretches stay, as densely everywhere in the log.
+
+    Which of neighbouring stretches stays is drawn, lest it goes with the machine's cycle; one at rest makes way for one
+    that moves.
 
     Parameters
     ----------
@@ -37,49 +44,102 @@ class Stretches:
     def __init__(self, most: int) -> None:
         self._most = most
         self._length = max(_LEAST, min(_STRETCH, most // _STRETCHES))
-        self._parts: list[Array] = []
-        self._whole: list[bool] = []
+        self._parts: list[_Part] = []
         self._begun: list[Array] = []  # tables that do not fill a stretch yet
+        self._every = 1  # of so many stretches one stays
+        self._group = 0  # stretches of which the last one that stays was chosen
+        self._random = np.random.default_rng(_SEED)
         self.dropped = 0
 
     def add(self, table: Array) -> None:
         """Add the next samples, (n, c); times in the first column, the motor in the second."""
         joined = np.concatenate([*self._begun, table])
-        full = len(joined) // self._length
-        for place in range(full):
-            self._parts.append(joined[place * self._length : (place + 1) * self._length].copy())
-            self._whole.append(True)
-        self._begun = [joined[full * self._length :]]
-        while sum(map(len, self._parts)) + len(self._begun[0]) > self._most:
+        full = len(joined) // self._length * self._length
+        for begin in range(0, full, self._length):
+            self._take(_Part(joined[begin : begin + self._length].copy(), True))
+        self._begun = [joined[full:]]
+        while self._held() > self._most:
             self._halve()
 
     def thinned(self) -> Thinned:
         """All samples that stayed."""
-        parts, whole = [*self._parts, *self._begun], [*self._whole, *(True for _ in self._begun)]
-        alone = np.repeat(np.logical_not(whole), list(map(len, parts))) if parts else np.zeros(0, dtype=np.bool_)
-        return Thinned(np.concatenate(parts) if parts else np.empty((0, 0)), alone)
+        parts = [*self._parts, *(_Part(table, True) for table in self._begun if len(table))]
+        if not parts:
+            return Thinned(np.empty((0, 0)), np.zeros(0, dtype=np.bool_))
+        alone = np.repeat([not part.whole for part in parts], [len(part.table) for part in parts])
+        return Thinned(np.concatenate([part.table for part in parts]), alone)
+
+    def _held(self) -> int:
+        return sum(len(part.table) for part in self._parts) + sum(map(len, self._begun))
+
+    def _take(self, part: _Part) -> None:
+        """Append the next stretch, or choose between it and the one that stays of its group so far."""
+        if self._group == 0:
+            self._parts.append(part)
+        else:
+            place = next(i for i in reversed(range(len(self._parts))) if self._parts[i].whole)
+            kept = self._parts[place]
+            if self._replaces(kept, part, 1.0 / (self._group + 1)):
+                self._parts[place], last = kept._replace(whole=False), [part]
+            else:
+                last = [part._replace(whole=False)]
+            self._append_joined([*self._cut_alone(), *last])
+        self._group = (self._group + 1) % self._every
+
+    def _replaces(self, kept: _Part, other: _Part, chance: float) -> bool:
+        """True where another stretch is to stay in place of one."""
+        drawn = bool(self._random.random() < chance)
+        if min(kept.way, other.way) > _RESTS * max(kept.way, other.way):
+            return drawn
+        return other.way > kept.way
+
+    def _cut_alone(self) -> list[_Part]:
+        """Take away the parts at the end that are not whole."""
+        place = len(self._parts)
+        while place and not self._parts[place - 1].whole:
+            place -= 1
+        cut, self._parts = self._parts[place:], self._parts[:place]
+        return cut
+
+    def _append_joined(self, parts: list[_Part]) -> None:
+        """Append parts, neighbours that are not whole as what is remembered of them."""
+        for part in parts:
+            if not part.whole:
+                before = self._cut_alone()
+                joined = np.concatenate([*(each.table for each in before), part.table])
+                part = _Part(remembered(joined), False)
+                self.dropped += len(joined) - len(part.table)
+            self._parts.append(part)
 
     def _halve(self) -> None:
-        """Of two stretches keep the one in which the motor moves further, and join what lies between stretches."""
-        before = sum(map(len, self._parts))
-        stretches = [place for place, whole in enumerate(self._whole) if whole]
-        for one, other in zip(stretches[::2], stretches[1::2], strict=False):
-            less = one if np.ptp(self._parts[one][:, 1]) < np.ptp(self._parts[other][:, 1]) else other
-            self._whole[less] = False
-        parts: list[Array] = []
-        whole: list[bool] = []
-        between: list[Array] = []
-        for part, kept in zip(self._parts, self._whole, strict=True):
-            if not kept:
-                between.append(part)
-                continue
-            parts += [remembered(np.concatenate(between)), part] if between else [part]
-            whole += [False, True] if between else [True]
-            between = []
-        parts += [remembered(np.concatenate(between))] if between else []
-        whole += [False] if between else []
-        self._parts, self._whole = parts, whole
-        self.dropped += before - sum(map(len, parts))
+        """Keep one of two stretches."""
+        parts = self._parts
+        places = [place for place, part in enumerate(parts) if part.whole]
+        open_group = len(places) % 2
+        for one, other in zip(places[::2], places[1::2], strict=False):
+            less = one if self._replaces(parts[one], parts[other], 0.5) else other
+            parts[less] = parts[less]._replace(whole=False)
+        self._parts = []
+        self._append_joined(parts)
+        self._group = self._group_after(open_group)
+        self._every *= 2
+
+    def _group_after(self, open_group: int) -> int:
+        """Stretches of the last group, when two groups become one."""
+        last = self._group or self._every
+        return last if open_group else (self._every + last) % (2 * self._every)
+
+
+class _Part(NamedTuple):
+    """Neighbouring samples, (n, c): a whole stretch at the full rate, or what is remembered of several."""
+
+    table: Array
+    whole: bool
+
+    @property
+    def way(self) -> float:
+        """Way from the lowest to the highest position of the motor."""
+        return float(np.ptp(self.table[:, 1]))
 
 
 def remembered(table: Array) -> Array:
@@ -89,11 +149,16 @@ def remembered(table: Array) -> Array:
     of highest and lowest stays, the later one, the extreme of the other side behind that, and so on to the end.
     """
     motor = table[:, 1]
-    high, low = int(np.argmax(motor)), int(np.argmin(motor))
+    # Of equal extremes the last wipes out the others: a machine at rest, whose encoder chatters, leaves two samples.
+    high, low = _last(motor, np.max), _last(motor, np.min)
     places, upper = [min(high, low)], high < low
     while places[-1] < motor.size - 1:
         begin = places[-1] + 1
-        rest = motor[begin:]
-        places.append(begin + int(np.argmin(rest) if upper else np.argmax(rest)))
+        places.append(begin + _last(motor[begin:], np.min if upper else np.max))
         upper = not upper
     return table[places]
+
+
+def _last(values: Array, extreme: Callable[[Array], float]) -> int:
+    """Place of the last of the extreme values."""
+    return int(np.flatnonzero(values == extreme(values))[-1])

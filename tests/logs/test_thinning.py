@@ -24,10 +24,16 @@ def test_a_play_ends_where_it_ends_on_all_samples(seed):
         assert play(table[:, 1], gap)[-1] == pytest.approx(play(motor, gap)[-1])
 
 
+def test_a_machine_at_rest_leaves_two_samples():
+    chatter = np.where(np.arange(1000) % 3 == 1, 1e-3, 0.0)
+    assert len(remembered(np.column_stack([np.arange(1000.0), chatter]))) == 2
+    assert len(remembered(np.zeros((1000, 2)))) == 1
+
+
 def test_stretches_stay_whole_and_the_more_lively_of_two_stays():
     kept = Stretches(1600)
     time = np.arange(20_000.0)
-    motor = np.where(time // 100 % 4 == 2, np.sin(time), 0.0)
+    motor = np.where(time // 100 % 4 == 2, np.sin(time / 30.0), 0.0)
     for part in np.array_split(np.column_stack([time, motor]), 33):
         kept.add(part)
     table, alone = kept.thinned()
@@ -37,6 +43,9 @@ def test_stretches_stay_whole_and_the_more_lively_of_two_stays():
     assert np.all(np.diff(table[:, 0]) > 0.0)
     assert np.mean(np.diff(whole[:, 0]) == 1.0) > 0.98
     assert np.mean(whole[:, 1] != 0.0) > 0.8
+    # As many from each part of the log, whenever it was read.
+    counts, _ = np.histogram(whole[:, 0], 4, (0.0, 20_000.0))
+    assert counts.max() < 1.6 * counts.min()
 
 
 @pytest.mark.parametrize(("lag", "speed"), [(3e-3, 1.0), (12e-3, 3.0)])
