@@ -263,6 +263,12 @@ def _remarks(found: CommissionedAxis) -> list[str]:
             f"no scale of the command is known: parameters are per {recording.force_unit}; give --scale, or "
             "--inertia of all that moves"
         )
+        if recording.command_unit == "V":
+            lines.append(
+                "resistance and torque constant of a motor cannot be told apart here: voltage and position show their "
+                "quotient times inertia and friction, and back EMF as viscous friction; give --inertia, or a log with "
+                "the current as --command, which shows friction and inertia without back EMF"
+            )
     return [*lines, f"next experiment: {drive.advice}"]
 
 

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from recordings import recording
+from typer.testing import CliRunner
 
+from servotwin.cli.app import app
 from servotwin.errors import InvalidInput
 from servotwin.logs import csv_file
 from servotwin.logs.clocks import HOURS_BACK, MIDNIGHTS, LogClock
@@ -68,6 +70,13 @@ def test_times_without_a_unit_count_from_a_known_date(tmp_path, unit, begin, nam
     assert log.recording.time[0] == pytest.approx(time_of("2026-03-01 08:00:00"), abs=0.01)
     assert np.ptp(log.recording.time) == pytest.approx(np.ptp(MADE.time), abs=1e-3)
     assert [name in defect for defect in log.found] == [True]
+
+
+def test_times_of_reversals_count_from_the_first_sample_of_a_dated_log(tmp_path):
+    path = written(tmp_path / "log.csv", [f"{1.7e12 + 1e3 * t:.0f}" for t in MADE.time])
+    said = CliRunner().invoke(app, ["identify", str(path)]).stdout
+    assert "times in ms since 1970" in said
+    assert "1.7e+09" not in said
 
 
 @pytest.mark.parametrize("first", [0.0, 46_000.0, 1.7e9])
