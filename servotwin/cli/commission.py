@@ -17,8 +17,8 @@ from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
-from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
 from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
+from servotwin.estimation.inverse_dynamics.identify import GivenLaw
 from servotwin.estimation.kinematic.wind_up import gap_within
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog
 from servotwin.plant.axis import Axis
@@ -42,7 +42,7 @@ class CommissionOptions:
 
     logs: Sequence[Path]
     columns: DriveColumns
-    gains: GivenGains
+    gains: GivenLaw
     inertia: float | None = None
     feedback: str = "motor"
     applied: bool = False
@@ -113,7 +113,7 @@ def _texts(options: CommissionOptions, found: CommissionedAxis) -> dict[Path, st
         source, doubts = found.logs[0].recording.source, "; ".join(found.drive.doubts)
         raise InvalidInput(
             f"{source}: an axis file holds the controller that ran, which the log does not show: {doubts}; "
-            "give --reference COLUMN, or --position-gain and --velocity-gain"
+            "give --reference COLUMN, or --position-gain and --velocity-gain, or --kp and --kd"
         )
     texts = {options.output: axis_text(found, axis)}
     if options.scenario is not None and options.largest_gap is not None:
@@ -255,12 +255,20 @@ def _remarks(found: CommissionedAxis) -> list[str]:
     lines += _shaft_lines(found)
     lines += [f"no simulation: {doubt}" for doubt in drive.doubts]
     if found.axis is None:
-        lines.append("no axis: the controller that ran is not known; give --position-gain and --velocity-gain")
+        lines.append(
+            "no axis: the controller that ran is not known; give --position-gain and --velocity-gain, or --kp and --kd"
+        )
     if found.force_per_command is None:
         lines.append(
             f"no scale of the command is known: parameters are per {recording.force_unit}; give --scale, or "
             "--inertia of all that moves"
         )
+        if recording.command_unit == "V":
+            lines.append(
+                "resistance and torque constant of a motor cannot be told apart here: voltage and position show their "
+                "quotient times inertia and friction, and back EMF as viscous friction; give --inertia, or a log with "
+                "the current as --command, which shows friction and inertia without back EMF"
+            )
     return [*lines, f"next experiment: {drive.advice}"]
 
 

@@ -272,7 +272,7 @@ def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
     console.print(model_line(found, unit, recording.motor_unit), highlight=False)
     console.print(_models(found, unit), highlight=False)
     if len(lost.local) > 1:
-        console.print(_local(lost, unit), highlight=False)
+        console.print(_local(lost, unit, float(log.recording.time[0])), highlight=False)
 
 
 def read_line(log: RecordedLog) -> str:
@@ -331,14 +331,14 @@ def model_rows(found: TransmissionGap) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def _local(found: LostMotion, unit: str) -> Table:
-    """Median lost motion of parts of the travel and of the time."""
+def _local(found: LostMotion, unit: str, begin: float) -> Table:
+    """Median lost motion of parts of the travel and of the time; dates count from the first sample, `begin` (s)."""
     gaps = np.array([each.gap for each in found.local]) * abs(found.ratio)
     lost = f"lost motion, {unit}"
     table = Table(f"position, {unit}", lost, "reversals", "time, s", lost, "reversals", box=None)
-    places, times = (
-        _binned(np.array([getattr(each, key) for each in found.local]), gaps) for key in ("position", "time")
-    )
+    first = begin if begin > _DATED else 0.0
+    places = _binned(np.array([each.position for each in found.local]), gaps)
+    times = _binned(np.array([each.time - first for each in found.local]), gaps)
     for place, time in zip(places, times, strict=True):
         table.add_row(*place, *time)
     return table

@@ -195,6 +195,12 @@ def commission(
     ] = None,
     integral_time: Annotated[float | None, typer.Option(help="Of the velocity loop, s; fitted by default.")] = None,
     speed_filter: Annotated[float | None, typer.Option(help="Of the measured speed, s; fitted by default.")] = None,
+    kp: Annotated[
+        float | None, typer.Option(help="Of a PID that ran: command per m or rad of the position; fitted by default.")
+    ] = None,
+    ki: Annotated[float | None, typer.Option(help="Of that PID: command per m s or rad s.")] = None,
+    kd: Annotated[float | None, typer.Option(help="Of that PID: command per m/s or rad/s.")] = None,
+    derivative_filter: Annotated[float | None, typer.Option(help="Of that PID's derivative, s.")] = None,
     feedback: Annotated[
         str,
         typer.Option(help="Encoder of the axis that its position loop reads: motor, or load, which the twin needs."),
@@ -220,6 +226,8 @@ def commission(
     """Identify inertia and friction from logs of command and position in closed loop, and write an axis file."""
     from servotwin.cli.commission import CommissionOptions, show
     from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
+    from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid
+    from servotwin.estimation.inverse_dynamics.identify import stated_law
     from servotwin.logs.drive_recordings import DriveColumns, travel_of
 
     columns = DriveColumns(
@@ -230,7 +238,10 @@ def commission(
         CommissionOptions(
             logs=logs,
             columns=columns,
-            gains=GivenGains(position_gain, velocity_gain, integral_time, speed_filter),
+            gains=stated_law(
+                GivenGains(position_gain, velocity_gain, integral_time, speed_filter),
+                GivenPid(kp, ki, kd, derivative_filter),
+            ),
             inertia=inertia,
             feedback=feedback,
             applied=applied,

@@ -17,7 +17,7 @@ from servotwin.estimation.inverse_dynamics.closed_loop import rigid_axis
 from servotwin.estimation.inverse_dynamics.conditioning import motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
-from servotwin.estimation.inverse_dynamics.identify import IdentifiedDrive, identify_drive
+from servotwin.estimation.inverse_dynamics.identify import GivenLaw, IdentifiedDrive, identify_drive
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
 from servotwin.plant.axis import Axis
@@ -74,7 +74,7 @@ def commission(
     logs: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     columns: DriveColumns = _BY_NAME,
     *,
-    gains: GivenGains = _FITTED,
+    gains: GivenLaw = _FITTED,
     inertia: float | None = None,
     feedback: str = MOTOR,
     applied: bool = False,
@@ -88,9 +88,9 @@ def commission(
         Of one drive; the first one's reference is simulated.
     columns : DriveColumns
         Which columns and units; by default found by their names.
-    gains : GivenGains
-        Of the controller that ran, the velocity gain in units of the command per m/s (rotary: rad/s) of the position;
-        fitted where they are not given.
+    gains : GivenGains or GivenPid
+        Of the controller that ran, in units of the command and of m (rotary: rad) of the position; fitted where they
+        are not given.
     inertia : float, optional
         kg (rotary: kg m^2) of all that moves, seen from the load: gives the force per command where no scale is known.
     feedback : {"motor", "load"}
@@ -117,8 +117,7 @@ def commission(
     read = read if inertia is None else _scaled(read, inertia, gains, applied)
     first = read[0].recording
     scale = first.force_per_command
-    if gains.velocity_gain is not None and scale is not None:
-        gains = replace(gains, velocity_gain=gains.velocity_gain * abs(scale))
+    gains = gains if scale is None else gains.scaled(abs(scale))
     travel = 1.0 if read[0].travel is None else read[0].travel
     drive = _without_hidden_shaft(read[0], identify_drive([each.recording for each in read], gains, travel, applied))
     found = CommissionedAxis(read, drive, None, Uncertainty(), scale)
@@ -144,7 +143,7 @@ def _check_alike(logs: Sequence[DriveLog]) -> None:
             )
 
 
-def _scaled(logs: Sequence[DriveLog], inertia: float, gains: GivenGains, applied: bool) -> tuple[DriveLog, ...]:
+def _scaled(logs: Sequence[DriveLog], inertia: float, gains: GivenLaw, applied: bool) -> tuple[DriveLog, ...]:
     """The logs with the force per command that gives the known inertia."""
     if not (math.isfinite(inertia) and inertia > 0.0):
         raise InvalidInput(f"commission: --inertia {inertia!r}: must be positive and finite")

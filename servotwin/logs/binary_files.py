@@ -6,24 +6,53 @@ import json
 import zipfile
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import LogColumns, SignalTable, parsed
+from servotwin.logs.columns import ColumnPlace, LogColumns, SignalTable, parsed, places_of
 
 _ROWS = 500_000  # read at a time
+_DAMAGED = (ValueError, EOFError, zipfile.BadZipFile, AttributeError, KeyError)  # of files that are not NumPy's
 
 
 def read_npz(path: Path, requested: Collection[str]) -> LogColumns:
-    """Read arrays by name."""
+    """Read arrays by name; matrices and records as `places_of` calls their columns."""
     try:
         with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             metadata = parsed(str(file["metadata"])) if "metadata" in file.files else {}
-            return LogColumns({name: file[name] for name in file.files if name in requested}, file.files, metadata)
-    except (ValueError, EOFError, zipfile.BadZipFile, AttributeError, KeyError) as error:
+            places: dict[str, ColumnPlace] = {}
+            for name in file.files:
+                with file.zip.open(f"{name}.npy") as member:
+                    places |= places_of(name, *_head(member))
+            wanted = {name: place for name, place in places.items() if name in requested}
+            arrays = {name: file[name] for name in {place.array for place in wanted.values()}}
+            return LogColumns(
+                {name: place.of(arrays[place.array]) for name, place in wanted.items()}, tuple(places), metadata
+            )
+    except _DAMAGED as error:
         raise InvalidInput(f"log {path}: is not an .npz file of numbers ({str(error).splitlines()[0]})") from None
+
+
+def _head(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    """Shape and type of an array in a .npy file."""
+    version = np.lib.format.read_magic(file)
+    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = read(file)
+    return shape, dtype
+
+
+def read_npy(path: Path, requested: Collection[str]) -> LogColumns:
+    """Read the columns of one array: records by name, those of a matrix as col1, col2 and so on."""
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)
+    except _DAMAGED as error:
+        raise InvalidInput(f"log {path}: is not an .npy file of numbers ({str(error).splitlines()[0]})") from None
+    places = places_of("", array.shape, array.dtype)
+    if not array.dtype.names:
+        places = {f"col{i}": place for i, place in enumerate(places.values(), 1)}
+    return LogColumns({name: place.of(array) for name, place in places.items() if name in requested}, tuple(places), {})
 
 
 def write_npz(table: SignalTable, path: Path) -> None:

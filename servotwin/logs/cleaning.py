@@ -38,12 +38,15 @@ class Cleaned(NamedTuple):
         Number of samples by defect, in words; only defects that occur.
     parted : list of float
         Times, s, of the samples behind pauses in which angles that wrap turned by nobody knows how much.
+    alone : (n,) bool array or None
+        Of a thinned log: samples between the stretches that were kept at the full rate.
     """
 
     time: Array
     channels: Mapping[str, Array]
     found: Mapping[str, int]
     parted: Sequence[float] = ()
+    alone: _Mask | None = None
 
 
 def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, float], first: bool = True) -> Cleaned:

@@ -7,7 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from servotwin.plant.signals import Array
+
+_MOST_ROWS = 64  # of a matrix, each of which is a column
 
 
 class LogColumns(NamedTuple):
@@ -48,3 +52,31 @@ def parsed(text: str) -> Mapping[str, Any]:
     except json.JSONDecodeError:
         return {}
     return metadata if isinstance(metadata, dict) else {}
+
+
+class ColumnPlace(NamedTuple):
+    """Place of a column in a file of arrays: an array's name, and its field, or its row or column."""
+
+    array: str
+    field: str | None = None
+    row: int | None = None
+    flat: bool = False
+
+    def of(self, array: Any) -> Any:
+        """(n,) values of the column."""
+        values = np.squeeze(np.asarray(array[self.field] if self.field is not None else array))
+        if self.row is not None:
+            return values[self.row] if self.flat else values[:, self.row]
+        return np.ravel(values)
+
+
+def places_of(name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> dict[str, ColumnPlace]:
+    """Columns of an array: itself, `name/field` of records, or `name[i]`, counted from 0, of a matrix's rows."""
+    sizes = tuple(size for size in shape if size != 1)
+    if dtype.names and len(sizes) == 1:
+        return {f"{name}/{field}".lstrip("/"): ColumnPlace(name, field) for field in dtype.names}
+    if len(sizes) == 1 and dtype.kind != "V":
+        return {name: ColumnPlace(name)}
+    if len(sizes) == 2 and min(sizes) <= _MOST_ROWS and dtype.kind in "fiu":
+        return {f"{name}[{i}]": ColumnPlace(name, None, i, sizes[0] < sizes[1]) for i in range(min(sizes))}
+    return {}

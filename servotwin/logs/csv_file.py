@@ -109,7 +109,10 @@ def _layout(path: Path) -> _Layout:
     # Above the names there may be prose.
     if first == len(rows) and len(rows) > 2:
         raise InvalidInput(_no_numbers(path, kept[1:], rows[1:], size))
-    heads = [cells for cells in rows[:first] if len(cells) == size] or rows[: min(first, 1)]
+    above = rows[:first]
+    # Without one of the rows' size the last longer line names them, as where rows leave out a last comment.
+    longer = [cells[:size] for cells in above if len(cells) > size > 1][-1:]
+    heads = [cells for cells in above if len(cells) == size] or longer or above[:1]
     names = heads[0] if heads else [f"col{i + 1}" for i in range(size)]
     if len(heads) > 1 and len(heads[1]) == len(names):
         names = [_with_unit(name, unit) for name, unit in zip(names, heads[1], strict=True)]
@@ -130,12 +133,14 @@ def _no_numbers(path: Path, kept: Sequence[tuple[int, str]], rows: Sequence[Sequ
 
 
 def _encoding(path: Path) -> str:
-    """UTF-8, UTF-16 by its mark, or Latin-1, in which older programs write degrees and micrometres."""
+    """UTF-8, UTF-16 by its mark or its zeros, or Latin-1, in which older programs write degrees and micrometres."""
     with path.open("rb") as file:
         begin = file.read(_SAMPLE)
     for mark, name in _BYTE_ORDER_MARKS.items():
         if begin.startswith(mark):
             return name
+    if begin[1::2].count(0) > len(begin) // 4 > 0:
+        return "utf-16-le"
     if any(byte < 9 or 13 < byte < 32 for byte in begin):
         place = next(i for i, byte in enumerate(begin) if byte < 9 or 13 < byte < 32)
         raise InvalidInput(f"log {path}: is not a text file (byte {place} is binary data)")

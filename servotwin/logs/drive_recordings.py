@@ -16,8 +16,10 @@ from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.estimation.kinematic.wind_up import ANGLES, LENGTHS
 from servotwin.logs.cleaning import cleaned
+from servotwin.logs.clocks import LogClock
 from servotwin.logs.log import read_columns
-from servotwin.logs.recordings import CUT, given_column, guessed_column, named_unit, numbers_of, times_of
+from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
+from servotwin.logs.recordings import CUT, TIME_NAMES, numbers_of
 from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
@@ -26,7 +28,7 @@ _HELD = 2.5  # usual intervals: nothing is known of the motion within a longer o
 _POSITIONS = {**LENGTHS, **ANGLES}
 _TORQUES = ("n m", "nm", "n_m", "n·m")
 _GUESSES = {
-    "time": ("time", "t", "timestamp"),
+    "time": TIME_NAMES,
     "motor": ("motor", "theta_m", "motor_position", "motor_angle", "qm", "motor_pos", "position", "q"),
     "command": ("command", "voltage", "torque", "current", "force", "vir", "u"),
     "reference": ("reference", "setpoint", "target", "qg", "demand", "ref"),
@@ -126,7 +128,8 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
             f"log {path}: its columns {', '.join(chosen.values())} have different lengths: one table is needed"
         )
     units = {part: _unit(path, part, chosen, wanted) for part in chosen}
-    time = times_of(path, arrays.pop("time", None), units.get("time", ""), wanted.rate, sizes.pop())
+    clock = LogClock(path, units.get("time", ""), wanted.rate)
+    time = clock.seconds(arrays.pop("time", None), sizes.pop())
     turns = {part: 2.0 * math.pi / ANGLES[units[part]] for part in arrays if units[part] in ANGLES}
     try:
         clean = cleaned(time, arrays, turns)
@@ -136,7 +139,7 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         raise InvalidInput(f"log {path}: {clean.time.size} samples can be used, of at least {_LEAST}")
     grid, usable, rate = _grid(clean.time)
     channels = {part: np.interp(grid, clean.time, values) for part, values in clean.channels.items()}
-    found = {**clean.found, **({CUT: 1} if table.ends_within_line else {})}
+    found = {**clean.found, **clock.found, **({CUT: 1} if table.ends_within_line else {})}
     # Between samples that lie off the grid there are values finer than a count.
     counts = {part: resolution(np.unique(values)) for part, values in clean.channels.items()}
     log = DriveLog(None, chosen, None, found)  # type: ignore[arg-type]
@@ -270,7 +273,7 @@ def _chosen(path: Path, names: tuple[str, ...], wanted: DriveColumns) -> dict[st
 def _unit(path: Path, part: str, chosen: Mapping[str, str], wanted: DriveColumns) -> str:
     """Unit of a column: as given, as the header says, or as that of the encoder that it refers to."""
     given: str | None = getattr(wanted, f"{part}_unit", None)
-    unit = given or named_unit(chosen[part])
+    unit = known_unit(given) if given else named_unit(chosen[part])
     if part in ("time", "command"):
         return unit
     if not unit and part == "reference":

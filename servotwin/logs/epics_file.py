@@ -10,10 +10,11 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import LogColumns
+from servotwin.logs.dates import time_of
 from servotwin.plant.signals import Array
 
 TIME = "time_s"
-_LINE = re.compile(r"^\s*(\S+)\s+(\d{4}-\d\d-\d\d)[T ]+(\d\d:\d\d:\d\d(?:\.\d+)?)\s+(\S+)(.*)$")
+_LINE = re.compile(r"^\s*(\S+)\s+(\d{4}-\d\d-\d\d|\d\d/\d\d/\d{4})[T ]+(\d\d:\d\d:\d\d(?:\.\d+)?)\s+(\S+)(.*)$")
 
 
 def looks_like_epics(line: str) -> bool:
@@ -40,8 +41,10 @@ def read_epics(path: Path, requested: Collection[str]) -> LogColumns:
             except ValueError:
                 damaged.setdefault(name, f"line {number}: {value[:30]!r}")
                 continue
-            times.append(float(np.datetime64(f"{day}T{clock}", "ns").astype(np.int64)) * 1e-9)
-            values.append(measured)
+            stamp = time_of(f"{day} {clock}")
+            if stamp is not None:
+                times.append(stamp)
+                values.append(measured)
     if not events:
         raise InvalidInput(f"log {path}: no line reads NAME YYYY-MM-DD HH:MM:SS VALUE, as camonitor writes")
     names = [TIME, *events]

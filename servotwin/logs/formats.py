@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.binary_files import parquet_blocks, read_npz, read_parquet, write_npz, write_parquet
+from servotwin.logs.binary_files import parquet_blocks, read_npy, read_npz, read_parquet, write_npz, write_parquet
 from servotwin.logs.columns import LogColumns, SignalTable
 from servotwin.logs.csv_file import csv_blocks, read_csv, write_csv
 from servotwin.logs.epics_file import looks_like_epics, read_epics
@@ -69,6 +69,7 @@ _MDF = LogFormat(read_mdf, library="asammdf", extra="mdf")
 FORMATS: Mapping[str, LogFormat] = {
     ".csv": LogFormat(read_csv, write_csv, blocks=csv_blocks),
     ".npz": LogFormat(read_npz, write_npz),
+    ".npy": LogFormat(read_npy),
     ".parquet": LogFormat(read_parquet, write_parquet, library="pyarrow", extra="parquet", blocks=parquet_blocks),
     ".txt": LogFormat(_read_text, blocks=_text_blocks),
     ".tsv": LogFormat(read_csv, blocks=csv_blocks),

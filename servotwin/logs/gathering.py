@@ -1,4 +1,4 @@
-"""Samples of a log that come in blocks: cleaned, joined and, where there are millions, thinned to what strokes need."""
+"""Samples of a log that come in blocks: cleaned, joined and, where there are millions, thinned."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Mapping
 import numpy as np
 
 from servotwin.logs.cleaning import MEASURED, OUT_OF_ORDER, Cleaned, cleaned
+from servotwin.logs.thinning import Stretches
 from servotwin.logs.wrapping import NEAR_TURN, WITHIN, guessed_turn, pauses, unwrapped_turns
 from servotwin.plant.signals import Array
 
 MOST = 1_500_000
 """Samples that are held; a longer log is thinned."""
-_GROUP = 6  # samples, of which the first, and the lowest and the highest of the motor stay
 _BULK = (0.01, 0.99)  # quantiles of an angle, between which no spike counts
-THINNED = "left out of a long log, turning points kept"
+THINNED = "left out of a long log, between stretches at its full rate"
 PARTED = "apart from the longest part: in a pause turns of an angle that wraps may have been lost"
 
 
@@ -31,13 +31,12 @@ class Gathering:
     """
 
     def __init__(self, turns: Mapping[str, float], most: int = MOST) -> None:
-        self._turns, self._most = dict(turns), most
+        self._turns = dict(turns)
         self._guessed: dict[str, float] = {}
-        self._parts: list[Array] = []
+        self._kept = Stretches(most)
         self._names: tuple[str, ...] = ()
         self._last: Array | None = None
         self._found: Counter[str] = Counter()
-        self._thinnings = 0
         self._parted: list[float] = []  # times, before which turns may have been lost
         # Decided once for the log: angles that wrap, and those that cannot, for they go beyond a turn.
         self._wrapped: set[str] = set()
@@ -61,24 +60,22 @@ class Gathering:
         if self._wrapped and self._last is not None and pauses(np.append(self._last[0], table[:, 0]))[:1] == [1]:
             self._parted.append(float(table[0, 0]))
         self._last = table[-1].copy()
-        for _ in range(self._thinnings):
-            table = self._thin(table)
-        self._parts.append(table)
-        while sum(map(len, self._parts)) > self._most:
-            self._parts = [self._thin(np.concatenate(self._parts))]
-            self._thinnings += 1
+        self._kept.add(table)
 
     def cleaned(self) -> Cleaned:
         """All samples so far; of a log that falls apart the longest part."""
-        empty = np.empty((0, 1 + len(self._names)))
-        table, found = np.concatenate([empty, *self._parts]), dict(self._found)
+        table, alone = self._kept.thinned()
+        table = table if table.size else np.empty((0, 1 + len(self._names)))
+        found = dict(self._found) | ({THINNED: self._kept.dropped} if self._kept.dropped else {})
         for name, turn in self._guessed.items():
             found[f"{unwrapped_turns(name)}: its jumps show a turn of {turn:.8g}"] = found.pop(unwrapped_turns(name), 0)
         if self._parted:
-            longest = max(np.split(table, np.searchsorted(table[:, 0], self._parted)), key=len)
+            places = np.split(np.arange(len(table)), np.searchsorted(table[:, 0], self._parted))
+            longest = max(places, key=len)
             found[PARTED] = len(table) - len(longest)
-            table = longest
-        return Cleaned(table[:, 0], dict(zip(self._names, table[:, 1:].T, strict=True)), found)
+            table, alone = table[longest], alone[longest]
+        channels = dict(zip(self._names, table[:, 1:].T, strict=True))
+        return Cleaned(table[:, 0], channels, found, alone=alone if alone.any() else None)
 
     def _guess_turns(self, channels: Mapping[str, Array]) -> None:
         """Take the turns that positions show of themselves: those of counts, and of encoders of many turns."""
@@ -115,15 +112,3 @@ class Gathering:
                 if name in self._wrapped:
                     table[:, place] += turn * np.round(step / turn)
         return table
-
-    def _thin(self, table: Array) -> Array:
-        whole = len(table) // _GROUP * _GROUP
-        groups = table[:whole, 1].reshape(-1, _GROUP)
-        kept = np.zeros(groups.shape, dtype=np.bool_)
-        kept[:, 0] = True
-        rows = np.arange(len(groups))
-        kept[rows, groups.argmin(axis=1)] = True
-        kept[rows, groups.argmax(axis=1)] = True
-        chosen = np.concatenate([np.flatnonzero(kept.ravel()), np.arange(whole, len(table))])
-        self._found[THINNED] += len(table) - len(chosen)
-        return table[chosen]

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import LogColumns
+from servotwin.logs.columns import ColumnPlace, LogColumns, places_of
 from servotwin.logs.hdf5_file import read_hdf5
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
 def read_matlab(path: Path, requested: Collection[str]) -> LogColumns:
-    """Read the numeric arrays; row or column i of a matrix is called name[i], counted from 0."""
+    """Read numeric arrays, those of structures as `structure/field`; row or column i of a matrix is called name[i]."""
     with path.open("rb") as file:
         head = file.read(1024)
     if head[512:520] == _HDF5 or head.startswith(_HDF5):
@@ -26,25 +26,25 @@ def read_matlab(path: Path, requested: Collection[str]) -> LogColumns:
 
     try:
         # mat_dtype: what MATLAB holds as double is read as double.
-        arrays = loadmat(path, mat_dtype=True)
+        arrays = loadmat(path, mat_dtype=True, simplify_cells=True)
     except (MatReadError, ValueError, TypeError, NotImplementedError, EOFError) as error:
         raise InvalidInput(
             f"log {path}: is not a MATLAB file that can be read ({str(error).splitlines()[0]})"
         ) from None
-    columns = columns_of({name: array for name, array in arrays.items() if not name.startswith("__")})
-    return LogColumns({name: columns[name] for name in columns if name in requested}, tuple(columns), {})
+    flat = _flat({name: array for name, array in arrays.items() if not name.startswith("__")})
+    places: dict[str, ColumnPlace] = {}
+    for name, array in flat.items():
+        places |= places_of(name, array.shape, array.dtype)
+    values = {name: place.of(flat[place.array]) for name, place in places.items() if name in requested}
+    return LogColumns(values, tuple(places), {})
 
 
-def columns_of(arrays: Mapping[str, Any]) -> dict[str, Any]:
-    """Vectors by name, and the longer direction of matrices as name[i]."""
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Numeric arrays by name, those of structures as `structure/field`."""
     result: dict[str, Any] = {}
-    for name, array in arrays.items():
-        if not (isinstance(array, np.ndarray) and array.dtype.kind in "fiu"):
-            continue
-        squeezed = np.squeeze(array)
-        if squeezed.ndim == 1 and squeezed.size > 1:
-            result[name] = squeezed
-        elif squeezed.ndim == 2:
-            rows = squeezed if squeezed.shape[0] < squeezed.shape[1] else squeezed.T
-            result |= {f"{name}[{place}]": row for place, row in enumerate(rows)}
+    for name, value in values.items():
+        if isinstance(value, Mapping):
+            result |= {f"{name}/{field}": array for field, array in _flat(value).items()}
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "fiu":
+            result[name] = value
     return result

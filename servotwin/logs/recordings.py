@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,14 +9,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
+from servotwin.estimation.kinematic.wind_up import ANGLES
 from servotwin.logs.cleaning import SAME_TIME, Cleaned
+from servotwin.logs.clocks import LogClock
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
 from servotwin.logs.log import read_blocks, read_columns
+from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
 from servotwin.plant.signals import Array
 
 CUT = "last line without its end: the file may have been cut off there"
@@ -26,18 +27,11 @@ _BLOCK = 1_000_000  # samples that are cleaned at a time
 TURNED = "in a log with the newest first, which was turned round"
 _BACKWARDS = 0.9  # of the steps in time
 _LEFT = 0.3  # of the samples, at least: with fewer the log is not what it seems
-# A number in brackets is a row of a matrix.
-_UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
-_BEHIND_COMMA = re.compile(
-    r"^(?P<name>.*\w)\s*[,/]\s*(?P<unit>rad|mrad|deg|°|rev|m|mm|um|µm|nm|s|ms|us|ns|V|A|N|N m)\s*$"
-)
-# Longer ones first: the end of _n_m is no metre.
-_ENDINGS = ("n_m", "deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n")
-_SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "min": 60.0}
-_TURNS = {"rad": 2.0 * np.pi, "deg": 360.0, "°": 360.0, "mrad": 2e3 * np.pi, "rev": 1.0}
+TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "datetime", "date_time", "date", "zeit", "x_value")
+"""Names of a column of times, in order of preference."""
 # Names by which columns are found where none is given, in order of preference.
 _GUESSES = {
-    "time": ("time", "t", "timestamp", "time_stamp", "datetime", "date_time", "date", "zeit"),
+    "time": TIME_NAMES,
     "motor": ("motor", "theta_m", "motor_position", "motor_angle", "qm", "motor_pos"),
     "load": ("load", "position", "measured_position", "load_position", "joint", "load_angle", "load_pos", "scale"),
     "command": ("command", "voltage", "torque", "current"),
@@ -101,12 +95,14 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
     names = tuple(read_columns(path, ()).names)
     chosen = _chosen(path, names, wanted)
     units = {part: named_unit(name) for part, name in chosen.items()}
-    motor_unit = wanted.motor_unit or units["motor"] or "motor unit"
-    load_unit = wanted.load_unit or units["load"] or "load unit"
-    turns = {part: _TURNS[unit] for part, unit in (("motor", motor_unit), ("load", load_unit)) if unit in _TURNS}
+    motor_unit = known_unit(wanted.motor_unit or units["motor"]) or "motor unit"
+    load_unit = known_unit(wanted.load_unit or units["load"]) or "load unit"
+    both = {"motor": motor_unit, "load": load_unit}
+    turns = {part: 2.0 * np.pi / ANGLES[unit] for part, unit in both.items() if unit in ANGLES}
+    clock = LogClock(path, units.get("time", ""), wanted.rate)
     gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
     cut = turned = False
-    for table in _oldest_first(_tables(path, chosen, units.get("time", ""), wanted.rate)):
+    for table in _oldest_first(_tables(path, chosen, clock)):
         damaged, cut, turned = {**table.damaged, **damaged}, table.cut, table.turned
         for begin in range(0, len(table.time), _BLOCK):
             part = {name: values[begin : begin + _BLOCK] for name, values in table.channels.items()}
@@ -130,9 +126,10 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
         source=f"log {path}",
         motor_count=counts["motor"] if thinned else None,
         load_count=counts["load"] if thinned else None,
+        alone=clean.alone,
     )
     others = {CUT: int(cut), TURNED: gathering.samples if turned else 0}
-    found = {**clean.found, **{defect: count for defect, count in others.items() if count}}
+    found = {**clean.found, **clock.found, **{defect: count for defect, count in others.items() if count}}
     return RecordedLog(recording, chosen, gathering.samples, found)
 
 
@@ -146,13 +143,10 @@ class _Table(NamedTuple):
     turned: bool = False
 
 
-def _tables(path: Path, chosen: Mapping[str, str], unit: str, rate: float | None) -> Iterator[_Table]:
-    before = 0
+def _tables(path: Path, chosen: Mapping[str, str], clock: LogClock) -> Iterator[_Table]:
     for columns in read_blocks(path, tuple(chosen.values())):
         arrays = _arrays(path, chosen, columns)
-        size = len(arrays["motor"])
-        time = times_of(path, arrays.pop("time", None), unit, rate, size, before)
-        before += size
+        time = clock.seconds(arrays.pop("time", None), len(arrays["motor"]))
         yield _Table(time, arrays, columns.damaged, columns.ends_within_line)
 
 
@@ -226,70 +220,6 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
     return result
 
 
-def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str:
-    """The column of that name, with its unit or without.
-
-    Raises
-    ------
-    InvalidInput
-        There is none.
-    """
-    fitting = [name for name in names if given in (name, bare_name(name))]
-    if not fitting:
-        hint = did_you_mean(given, names)
-        raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
-    return fitting[0]
-
-
-def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
-    """The column with the first of the guessed names that occurs."""
-    bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
-    return next((bare[guess] for guess in guesses if guess in bare), None)
-
-
-def bare_name(name: str) -> str:
-    """A column's name without its unit."""
-    found = _UNIT.match(name) or _BEHIND_COMMA.match(name)
-    if found:
-        return found["name"]
-    ending = _ending(name)
-    return name[: -len(ending) - 1] if ending else name
-
-
-def named_unit(name: str) -> str:
-    """The unit that a column's name says; empty where it says none."""
-    found = _UNIT.match(name) or _BEHIND_COMMA.match(name)
-    if found:
-        return found["unit"].strip()
-    return _ending(name)
-
-
-def _ending(name: str) -> str:
-    """The unit at the end of a name; `theta_m` is a name without one."""
-    if any(name.lower() in guesses for guesses in _GUESSES.values()):
-        return ""
-    return next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
-
-
-def times_of(path: Path, time: Array | None, unit: str, rate: float | None, size: int, before: int = 0) -> Array:
-    """Times in s, of a column or by the rate; `before` samples after the first.
-
-    Raises
-    ------
-    InvalidInput
-        An unknown unit, or neither times nor a rate.
-    """
-    if time is not None and rate is None:
-        if unit and unit.lower() not in _SECONDS:
-            raise InvalidInput(f"log {path}: times in {unit!r}: allowed are {', '.join(_SECONDS)}")
-        return time * _SECONDS.get(unit.lower(), 1.0)
-    if rate is not None and not (np.isfinite(rate) and rate > 0.0):
-        raise InvalidInput(f"log {path}: --rate {rate:g}: must be above 0 Hz and finite")
-    if rate is None:
-        raise InvalidInput(f"log {path}: no column is called like a time; give --time COLUMN, or --rate in Hz above 0")
-    return np.arange(before, before + size) / rate
-
-
 def numbers_of(path: Path, name: str, columns: LogColumns) -> Array:
     """A column's numbers.
 
@@ -299,8 +229,9 @@ def numbers_of(path: Path, name: str, columns: LogColumns) -> Array:
         It holds none.
     """
     values = columns.values[name]
-    if getattr(values, "dtype", None) is not None and values.dtype.kind == "M":
-        values = values.astype("datetime64[ns]").astype(np.int64) * 1e-9
+    kind = getattr(getattr(values, "dtype", None), "kind", "")
+    if kind in "mM" and kind:
+        values = values.astype("datetime64[ns]" if kind == "M" else "timedelta64[ns]").astype(np.int64) * 1e-9
     try:
         if np.iscomplexobj(values):
             raise TypeError

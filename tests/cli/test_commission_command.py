@@ -48,6 +48,21 @@ def files(log):
     return names | {"json": json.loads(result.stdout)}
 
 
+def test_of_a_voltage_it_is_said_that_resistance_and_torque_constant_are_not_told_apart(tmp_path):
+    volts = written(tmp_path / "log.csv", header="t [s],motor [mm],command [V],reference [mm]")
+    said = " ".join(run(volts).output.split())
+    assert "resistance and torque constant of a motor cannot be told apart here" in said
+    assert "cannot be told apart" not in run(volts, "--inertia", 20).output
+
+
+def test_a_pid_is_stated_or_a_cascade(log):
+    result = run(log, "--kp", 6e4, "--position-gain", 25)
+    assert result.exit_code == 2
+    assert "state one of the two" in result.output
+    said = " ".join(run(log, "--kp", 6e4, "--ki", 0, "--kd", 100, "--derivative-filter", 0.002).output.split())
+    assert "the controller with the gains that are given leaves" in said
+
+
 def test_the_axis_is_the_machine_of_the_log(log, tmp_path):
     result = run(log, "-o", tmp_path / "axis.toml", "--lead-mm", 10)
     assert result.exit_code == 0, result.output

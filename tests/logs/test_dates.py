@@ -7,7 +7,8 @@ from recordings import recording
 from servotwin.errors import InvalidInput
 from servotwin.logs.csv_file import csv_blocks
 from servotwin.logs.dates import time_of
-from servotwin.logs.recordings import RecordingColumns, named_unit, read_recording
+from servotwin.logs.names import named_unit
+from servotwin.logs.recordings import RecordingColumns, read_recording
 
 MADE = recording(gap=0.05, ratio=0.1, seconds=2.0, rate=200.0)
 DAY = float(np.datetime64("2026-03-25", "s").astype(np.int64))
@@ -23,13 +24,21 @@ DAY = float(np.datetime64("2026-03-25", "s").astype(np.int64))
         ("25/03/2026 08:00", DAY + 28800.0),
         ("12:00:01 AM", 1.0),
         ("23:59:59.5", 86399.5),
+        ("08:00:01:250", 28801.25),
+        ("2026-03-25T08:00:00.25+01:00", DAY + 25200.25),
+        ("2026-03-25 08:00:00 -0530", DAY + 48600.0),
+        ("25-Mar-2026 08:00:00", DAY + 28800.0),
+        ("2026-03-25", DAY),
+        ("25.03.2026", DAY),
     ],
 )
 def test_dates_and_times_of_day(cell, seconds):
     assert time_of(cell) == pytest.approx(seconds)
 
 
-@pytest.mark.parametrize("cell", ["12", "2026-13-01 00:00:00", "30.02.2026 00:00:00", "25:00:00", "8:61:00", "a:bc"])
+@pytest.mark.parametrize(
+    "cell", ["12", "2026-13-01 00:00:00", "30.02.2026 00:00:00", "25:00:00", "8:61:00", "a:bc", "1-Foo-2026 08:00:00"]
+)
 def test_anything_else_is_none(cell):
     assert time_of(cell) is None
 
@@ -86,3 +95,14 @@ def test_comments_and_blank_lines_between_rows_are_left_out_and_lines_are_counte
     assert log.found == {"without a number in some column": 1}
     assert log.recording.time.size == MADE.time.size - 1
     assert next(csv_blocks(path, ["load"])).damaged == {"load": "line 202: 'broken'"}
+
+
+def test_a_day_and_a_time_of_day_in_two_columns_and_rows_shorter_than_their_names(tmp_path):
+    path = tmp_path / "log.csv"
+    rows = [f"2026-03-25,08:00:{t:09.6f},{m:.6f},{x:.6f}" for t, m, x in TABLE]
+    above = ["Some instrument", "Version,2", "", "Date,Time,motor [rad],load [mm],Comment"]
+    path.write_text("\n".join([*above, *rows, ""]))
+    log = read_recording(path, RecordingColumns())
+    assert log.recording.load_unit == "mm"
+    assert log.recording.time[0] == 28800.0
+    assert log.recording.time.size == MADE.time.size

@@ -57,14 +57,46 @@ def test_tables_of_text(tmp_path, made):
     seen(bare, made, RecordingColumns(time="col1", motor="col2", load="col3"))
 
 
+def test_structures_records_and_matrices(tmp_path, made):
+    from scipy.io import savemat
+
+    fields = {"time": made.time, "motor": made.motor, "load": made.load}
+    records = np.array(list(zip(*fields.values(), strict=True)), dtype=[(name, float) for name in fields])
+    savemat(tmp_path / "a.mat", {"rec": {**fields, "note": "text"}})
+    np.savez(tmp_path / "a.npz", rec=records, data=rows(made))
+    np.save(tmp_path / "a.npy", records)
+    np.save(tmp_path / "b.npy", rows(made))
+    inside = RecordingColumns(time="rec/time", motor="rec/motor", load="rec/load")
+    for name in ("a.mat", "a.npz"):
+        seen(tmp_path / name, made, inside)
+    seen(tmp_path / "a.npz", made, RecordingColumns(time="data[0]", motor="data[1]", load="data[2]"))
+    seen(tmp_path / "a.npy", made)
+    seen(tmp_path / "b.npy", made, RecordingColumns(time="col1", motor="col2", load="col3"))
+    h5py = pytest.importorskip("h5py", reason="h5py is an extra: pip install 'servotwin[hdf5]'")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["rec"] = records
+    seen(tmp_path / "a.h5", made, inside)
+
+
+def test_times_of_pandas(tmp_path, made):
+    pyarrow = pytest.importorskip("pyarrow", reason="pyarrow is an extra: pip install 'servotwin[parquet]'")
+    from pyarrow import parquet
+
+    spans = (1e9 * made.time).round().astype("timedelta64[ns]")
+    for name, stamps in (("a.parquet", spans), ("b.parquet", np.datetime64("2026-03-01", "ns") + spans)):
+        parquet.write_table(pyarrow.table({"time": stamps, "motor": made.motor, "load": made.load}), tmp_path / name)
+        assert np.ptp(seen(tmp_path / name, made).recording.time) == pytest.approx(np.ptp(made.time), abs=1e-6)
+
+
 def test_other_encodings_prose_and_units(tmp_path, made):
     values = rows(made)
     text = "\n".join(
         ["Recorded by X, on rig 7", "t [s];Winkel [°];Weg [µm]", *(";".join(f"{x:.9g}" for x in row) for row in values)]
     )
-    (tmp_path / "a.csv").write_bytes(text.encode("latin-1"))
-    log = seen(tmp_path / "a.csv", made, RecordingColumns(motor="Winkel", load="Weg"))
-    assert (log.recording.motor_unit, log.recording.load_unit) == ("°", "µm")
+    for encoding in ("latin-1", "utf-8-sig", "utf-16", "utf-16-le"):
+        (tmp_path / "a.csv").write_bytes(text.encode(encoding))
+        log = seen(tmp_path / "a.csv", made, RecordingColumns(motor="Winkel", load="Weg"))
+        assert (log.recording.motor_unit, log.recording.load_unit) == ("°", "µm")
     named = np.column_stack([values, values[:, 1]])
     path = csv(tmp_path / "b.csv", named, "time_s,theta_m,position_mm,command_n_m")
     assert seen(path, made).columns["command"] == "command_n_m"

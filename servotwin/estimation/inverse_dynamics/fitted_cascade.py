@@ -84,6 +84,10 @@ class GivenGains:
         """True where the law is known but for the filter of its speed."""
         return self.position_gain is not None and self.velocity_gain is not None
 
+    def scaled(self, force: float) -> GivenGains:
+        """Gains in units of a force of which the command's unit is so many."""
+        return self if self.velocity_gain is None else replace(self, velocity_gain=force * self.velocity_gain)
+
 
 def fitted_cascade(recording: DriveRecording, given: GivenGains) -> FittedCascade:
     """Fit what is not given: without integral action first, with it where that explains the force better.

@@ -6,17 +6,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
-from servotwin.estimation.inverse_dynamics.fitted_pid import fitted_pid
+from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
 
-_FITTED = GivenGains()
+GivenLaw = GivenGains | GivenPid
+_FITTED, _FITTED_PID = GivenGains(), GivenPid()
 # Of the force: the PID that ran left a thousandth, one fitted to a cascade's log a fifth.
 _PID_LEAVES = 0.05
 
@@ -56,7 +58,7 @@ class IdentifiedDrive:
 
 
 def identify_drive(
-    recordings: Sequence[DriveRecording], gains: GivenGains = _FITTED, p: float = 1.0, applied: bool = False
+    recordings: Sequence[DriveRecording], gains: GivenLaw = _FITTED, p: float = 1.0, applied: bool = False
 ) -> IdentifiedDrive:
     """Fit inertia, friction and offset, then refine them by simulating the loop.
 
@@ -64,8 +66,8 @@ def identify_drive(
     ----------
     recordings : sequence of DriveRecording
         Of one drive.
-    gains : GivenGains
-        Of the controller that ran.
+    gains : GivenGains or GivenPid
+        Of the controller that ran, a cascade by default.
     p : float
         Travel per radian of the motor.
     applied : bool
@@ -105,25 +107,43 @@ def identify_drive(
     return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split)
 
 
+def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:
+    """The law of which gains are stated; a cascade where none are.
+
+    Raises
+    ------
+    InvalidInput
+        Gains of both are stated.
+    """
+    if pid != _FITTED_PID and cascade != _FITTED:
+        raise InvalidInput(
+            "servotwin commission: --kp, --ki, --kd and --derivative-filter are a PID's, and --position-gain, "
+            "--velocity-gain, --integral-time and --speed-filter a cascade's: state one of the two"
+        )
+    return cascade if pid == _FITTED_PID else pid
+
+
 def _refined(
-    recording: DriveRecording, fit: ParameterFit, gains: GivenGains, filtering: tuple[RegressionBand, float], p: float
+    recording: DriveRecording, fit: ParameterFit, gains: GivenLaw, filtering: tuple[RegressionBand, float], p: float
 ) -> tuple[FittedLaw | None, Refinement | None, tuple[str, ...]]:
     """The law that ran, the refinement, and why there is none."""
     if recording.reference is None:
-        given = fitted_cascade(recording, gains) if gains.complete else None
+        given = _fitted_law(recording, gains) if gains.complete else None
         return given, None, ("without a reference the loop cannot be simulated beside the log",)
     law = _fitted_law(recording, gains)
     if not law.explains:
-        checks.check_reference(recording, gains)
-        return (law if gains.complete else None), None, (_unexplained(law),)
+        checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
+        return (law if gains.complete else None), None, (_unexplained(law, gains),)
     found = refine(fit, law, recording, *filtering, p)
     if found is None:
         return law, None, ("the simulated loop does not follow the log",)
     return law, found, () if found.settled else ("the fit to the simulated motion did not come to rest",)
 
 
-def _fitted_law(recording: DriveRecording, gains: GivenGains) -> FittedLaw:
-    """A cascade, or a PID where that explains the command better; gains that are given are those of a cascade."""
+def _fitted_law(recording: DriveRecording, gains: GivenLaw) -> FittedLaw:
+    """The law whose gains are given; else a cascade, or a PID where that explains the command better."""
+    if isinstance(gains, GivenPid):
+        return fitted_pid(recording, gains)
     cascade = fitted_cascade(recording, gains)
     if gains != _FITTED or cascade.left < EXPLAINED:
         return cascade
@@ -131,8 +151,13 @@ def _fitted_law(recording: DriveRecording, gains: GivenGains) -> FittedLaw:
     return pid if pid.left < min(RICHER * cascade.left, _PID_LEAVES) else cascade
 
 
-def _unexplained(law: FittedLaw) -> str:
+def _unexplained(law: FittedLaw, gains: GivenLaw) -> str:
     """Say why a law is not the one that ran."""
+    if gains != _FITTED and math.isfinite(law.left):
+        return (
+            f"the controller with the gains that are given leaves {100.0 * law.left:.0f} % of the command: check them "
+            "and their units, or leave them out, and they are fitted"
+        )
     said = "neither a position controller with velocity loop nor a PID explains the command"
     if math.isfinite(law.left):
         return f"{said} ({100.0 * law.left:.0f} % are left)"

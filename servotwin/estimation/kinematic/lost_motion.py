@@ -13,32 +13,34 @@ from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
-from servotwin.estimation.kinematic.cyclic import periods
 from servotwin.estimation.kinematic.local import LocalGap, local_gaps
-from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, compared
+from servotwin.estimation.kinematic.models import Model, ModelScore, chosen
 from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import (
     INERTIA,
     LAG,
-    RATIO,
     Regression,
-    Solution,
     columns,
     least_gap,
     products,
     regression,
     solved,
 )
+from servotwin.estimation.kinematic.search import (
+    FINE,
+    coarse_gap,
+    compared_models,
+    compared_with_fitted_lag,
+    cyclic_periods,
+    lag_left,
+    with_lag,
+)
 from servotwin.estimation.kinematic.sensitivity import sensitivity
 from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side, strokes_of
 from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
 from servotwin.plant.signals import Array
 
-# Of the coarse search: geometric from a count to the whole travel, then next to the best, so many grids in all.
-_GAPS, _BETWEEN, _FINER = 24, 9, 3
-_FINE = 17  # of each finer one
-_NEAR = 0.12  # of the coarse gap, the span of finer steps on either side
 _ROUNDS = 8
 _END, _SAME = 0.9, 0.7  # of a grid's width: a minimum beyond lies outside; of the spread on a wider grid
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
@@ -146,18 +148,19 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     if not _follows(recording.load, load_count, strokes.reversals):
         return _bound(recording)
     prepared = regression(recording, strokes, 0)
-    coarse = _coarse(prepared, least)
+    coarse = coarse_gap(prepared, least)
     # Until the gap has been taken up once nobody knows where the load is within it.
     first = _settled(recording, 1.1 * coarse)
     if first is None:
         return _no_gap()
     prepared = regression(recording, strokes, first, ~behind_pauses(recording, coarse))
     check_one_machine(recording, prepared, coarse)
-    prepared = prepared._replace(cycles=np.array(_cycles(prepared, coarse)))
-    grid, tensor = _tensor(prepared, coarse, least)
-    counts = np.diff(prepared.bounds, append=prepared.rows.size)
-    comparisons = compared(prepared, grid, tensor, counts)
+    prepared = prepared._replace(cycles=np.array(cyclic_periods(prepared, coarse)))
+    comparisons = compared_models(prepared, coarse, least)
     best = chosen(comparisons[:-1])
+    if INERTIA in best.model.used:
+        comparisons = compared_with_fitted_lag(prepared, comparisons, coarse, least)
+        best = chosen(comparisons[:-1])
     found = _answer(recording, prepared, best, comparisons, least)
     shown = found.at_motor if math.isfinite(found.at_motor) else 0.0
     curves = fitted_curves(prepared._replace(lag=found.lag), best.model, shown, found.interval_motor)
@@ -216,50 +219,6 @@ def _settled(recording: EncoderRecording, gap: float) -> int | None:
     return None if place > motor.size // 2 else place
 
 
-def _coarse(prepared: Regression, least: float) -> float:
-    """Gap of the least sum of squares on a geometric grid and finer ones, everything else free but the lag.
-
-    Until the first contact the load rests, wherever in the gap: on the wide grid its motion until then counts against
-    the gap, next to the best gap it does not count.
-    """
-    reach = float(np.ptp(prepared.recording.motor))
-    used = Model("", (RATIO, "offset")).places(prepared)
-
-    def error(gap: float, rests_count: bool) -> float:
-        values, side = columns(prepared, gap)
-        known, resting = values[:, side != 0], values[0, side == 0]
-        squares = float(solved(known @ known.T, used).squares)
-        if rests_count:
-            return squares + resting.size * _variance(resting)
-        return squares / known.shape[1] if known.shape[1] > resting.size else math.inf
-
-    grid, rest = np.concatenate([[0.0], np.geomspace(0.1 * least, 0.95 * reach, _GAPS)]), True
-    for _ in range(_FINER):
-        best = int(np.argmin([error(gap, rest) for gap in grid]))
-        found = float(grid[best])
-        grid, rest = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, grid.size - 1)], _BETWEEN), False
-    return found
-
-
-def _variance(values: Array) -> float:
-    return float(np.var(values)) if values.size else 0.0
-
-
-def _cycles(prepared: Regression, gap: float) -> tuple[float, ...]:
-    values, _ = columns(prepared, gap)
-    used = Model("", (RATIO, "offset", LAG)).places(prepared)
-    fit = solved(values @ values.T, used)
-    return periods(values[1], values[0] - fit.coefficients @ values[used])
-
-
-def _tensor(prepared: Regression, coarse: float, least: float) -> tuple[Array, Array]:
-    """Sums of products on a grid from 0 to twice the coarse gap, finer next to it."""
-    most = max(coarse, least)
-    near = np.linspace(1.0 - _NEAR, 1.0 + _NEAR, _FINE)
-    grid = most * np.unique(np.concatenate([np.linspace(0.0, 2.0, _FINE), near]))
-    return grid, np.array([products(prepared, gap)[0] for gap in grid])
-
-
 def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
     """Gap by time and by travel, and their bootstrap, on grids that are narrowed to the spread."""
     places = model.places(prepared)
@@ -267,7 +226,7 @@ def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tup
     before = math.inf
     for _ in range(_ROUNDS):
         middle = gap
-        grid = np.linspace(max(middle - width, 0.0), middle + width, _FINE)
+        grid = np.linspace(max(middle - width, 0.0), middle + width, FINE)
         by_time, by_travel = (
             np.array(each) for each in zip(*(products(prepared, each, travel) for each in grid), strict=True)
         )
@@ -290,6 +249,11 @@ def _travel(prepared: Regression) -> Array:
     side = np.zeros(motor.size, dtype=np.int8)
     smooth = play_and_side(motor, 2.0 * counts_of(prepared.recording)[0], side)[prepared.rows]
     way = np.abs(np.diff(smooth, prepend=smooth[0]))
+    alone = prepared.recording.alone
+    if alone is not None:
+        # The first sample of a stretch is not the one that has moved by all that a thinned log leaves out.
+        behind = np.diff(np.cumsum(alone)[prepared.rows], prepend=0) > 0
+        way[behind] = np.roll(way, -1)[behind]
     return way / max(float(way.mean()), np.finfo(float).tiny)
 
 
@@ -302,7 +266,7 @@ def _answer(
 ) -> LostMotion:
     """Fit the chosen model closely and judge it."""
     if LAG in best.model.used:
-        prepared = _with_lag(prepared, best)
+        prepared = with_lag(prepared, best)
     gap, by_travel, spread = _fitted(prepared, best.model, best.gap, max(0.5 * best.gap, least))
     values, side = columns(prepared, gap)
     places = best.model.places(prepared)
@@ -336,13 +300,15 @@ def _answer(
         recording.motor_unit,
     )
     rows, known = prepared.rows, judged.interval != NOTHING_KNOWN
+    if judged.status is GapStatus.OK:
+        half = max(half, 0.5 * (judged.interval[1] - judged.interval[0]))
     return LostMotion(
         at_motor=gap if known else math.nan,
         std_motor=half / quantile if known else math.inf,
         interval_motor=judged.interval,
         ratio=ratio,
         load_spread=max(quantile * at_load / (half * abs(ratio)), 1.0) if half else 1.0,
-        lag=prepared.lag + _lag_left(prepared, fit, places),
+        lag=prepared.lag + lag_left(prepared, fit, places),
         status=judged.status,
         reasons=judged.reasons,
         model=best.model.name,
@@ -356,21 +322,6 @@ def _answer(
 def _lead(prepared: Regression, best: ModelScore) -> float:
     usual = float(np.median(np.diff(prepared.recording.time)))
     return -prepared.lag if INERTIA in best.model.used and prepared.lag < -_SKEW * usual else 0.0
-
-
-def _with_lag(prepared: Regression, best: ModelScore) -> Regression:
-    """The design with the lag moved from its column, which is right to first order, into the time."""
-    places = best.model.places(prepared)
-    for _ in range(3):
-        values, _ = columns(prepared, best.gap)
-        prepared = prepared._replace(lag=prepared.lag + _lag_left(prepared, solved(values @ values.T, places), places))
-    return prepared
-
-
-def _lag_left(prepared: Regression, fit: Solution, places: list[int]) -> float:
-    """Lag that a fit finds beyond the one of the regression, s; 0 where the model has none."""
-    column = prepared.names.index(LAG)
-    return float(fit.coefficients[places.index(column)] / fit.coefficients[0]) if column in places else 0.0
 
 
 def _no_gap() -> LostMotion:

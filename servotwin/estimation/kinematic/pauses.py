@@ -13,6 +13,7 @@ from servotwin.plant.signals import Array
 
 _LONG = 5.0  # times the usual interval
 _FAR, _FAST = 20.0, 0.99  # times that quantile of the motor's steps: a jump over a pause that the times do not show
+_OF_STRETCH = 8
 _EDGE = 4  # samples on either side that show the speed
 _COUNTS, _SHARE = 4.0, 0.5  # counts, and share of the gap, by which the motor may move otherwise than its speeds say
 
@@ -26,13 +27,31 @@ def behind_pauses(recording: EncoderRecording, gap: float) -> Any:
     time, motor = recording.time, recording.motor
     allowed = max(_COUNTS * counts_of(recording)[0], _SHARE * gap)
     result = np.zeros(motor.size, dtype=np.bool_)
+    if recording.alone is not None:
+        result |= beside_stretches(recording.alone)
     for row in pauses_of(time, motor):
+        if result[row] or result[row - 1]:
+            continue
         if row <= _EDGE or row + _EDGE >= motor.size:
             continue
         before, behind = _speed(time, motor, row - 1 - _EDGE), _speed(time, motor, row)
         guess = 0.5 * (before + behind) * (time[row] - time[row - 1])
         if abs(motor[row] - motor[row - 1] - guess) > allowed:
             result[max(row - SPAN, 0) : max(row + SPAN, _taken_up(motor, row, gap))] = True
+    return result
+
+
+def beside_stretches(alone: Any) -> Any:
+    """(n,) true for samples between the stretches of a thinned log, and in the first and last eighth of a stretch.
+
+    There neither difference quotients nor a lag that is fitted reach beyond the stretch.
+    """
+    result = alone.copy()
+    steps = np.diff(alone.astype(np.int8), prepend=1, append=1)
+    begins, ends = np.flatnonzero(steps == -1).tolist(), np.flatnonzero(steps == 1).tolist()
+    for begin, end in zip(begins, ends, strict=True):
+        edge = max(SPAN, (end - begin) // _OF_STRETCH)
+        result[begin : begin + edge] = result[max(end - edge, 0) : end] = True
     return result
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from servotwin.plant.signals import Array
 
@@ -24,6 +27,8 @@ class EncoderRecording:
         Where it is from, for messages.
     motor_count, load_count : float or None
         One count of each encoder; None: what the samples show.
+    alone : (n,) bool array or None
+        Of a thinned log: turning points between stretches at the full rate; they move the play and count for no fit.
     """
 
     time: Array
@@ -35,3 +40,4 @@ class EncoderRecording:
     source: str = "recording"
     motor_count: float | None = None
     load_count: float | None = None
+    alone: np.ndarray[Any, np.dtype[np.bool_]] | None = None

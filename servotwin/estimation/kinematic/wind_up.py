@@ -14,9 +14,17 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.shown import position_unit
 
-ANGLES = {"rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180.0, "°": math.pi / 180.0, "rev": 2.0 * math.pi}
+ANGLES = {
+    "rad": 1.0,
+    "mrad": 1e-3,
+    "deg": math.pi / 180.0,
+    "°": math.pi / 180.0,
+    "rev": 2.0 * math.pi,
+    "arcmin": math.pi / 10_800.0,
+    "arcsec": math.pi / 648_000.0,
+}
 """Radians per unit."""
-LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9}
+LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "cm": 1e-2, "in": 0.0254}
 """Metres per unit."""
 # By how much the recording's load per motor may differ from the machine's; where the load swings it is not well known.
 _RATIO, _RATIO_OF_SWINGING = 0.05, 0.25

@@ -1,5 +1,6 @@
 """A drive under a PID with a filtered derivative, and a DC motor whose command is a voltage."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -7,9 +8,10 @@ import pytest
 from drive_recordings import PARAMETERS, recording_of, simulated, strokes
 
 import servotwin as st
+from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains, fitted_cascade
-from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid, fitted_pid
-from servotwin.estimation.inverse_dynamics.identify import identify_drive
+from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid, GivenPid, fitted_pid
+from servotwin.estimation.inverse_dynamics.identify import identify_drive, stated_law
 
 P, RATE = 1e-3, 1000.0
 R, K, J, B, TC = 2.0, 0.1, 2e-5, 1.5e-4, 0.012
@@ -59,6 +61,36 @@ def test_a_pid_is_chosen_where_a_cascade_does_not_explain_the_command_and_the_lo
     assert drive.refinement.simulated.position_error < 1e-4
     for name in ("inertia", "viscous", "coulomb"):
         assert drive.refinement.symmetric[name] == pytest.approx(PARAMETERS[name], rel=2e-3), name
+
+
+@pytest.mark.slow
+def test_gains_of_a_pid_that_are_stated_are_kept_and_the_others_fitted():
+    law = fitted_pid(torque(), GivenPid(Kp=60_000.0, Tf=2e-3))
+    assert (law.Kp, law.Ki, law.Tf) == (60_000.0, 0.0, 2e-3)
+    assert law.Kd == pytest.approx(2400.0, rel=2e-3)
+    stated = GivenPid(60_000.0, 0.0, 2400.0, 2e-3)
+    assert fitted_pid(torque(), stated).left < 1e-3
+    drive = identify_drive([torque()], stated, p=P)
+    assert drive.refinement is not None
+    assert drive.refinement.symmetric["inertia"] == pytest.approx(PARAMETERS["inertia"], rel=2e-3)
+    bare = replace(torque(), reference=None)
+    assert identify_drive([bare], stated, p=P).law == FittedPid(60_000.0, 0.0, 2400.0, 2e-3)
+
+
+@pytest.mark.slow
+def test_gains_of_a_pid_that_are_not_those_that_ran_are_told():
+    drive = identify_drive([torque()], GivenPid(20_000.0, 0.0, 900.0, 2e-3), p=P)
+    assert drive.refinement is None
+    assert "with the gains that are given leaves" in drive.doubts[0]
+
+
+def test_gains_of_two_laws_are_refused():
+    assert stated_law(GivenGains(), GivenPid(Kp=1.0)) == GivenPid(Kp=1.0)
+    assert stated_law(GivenGains(position_gain=1.0), GivenPid()) == GivenGains(position_gain=1.0)
+    with pytest.raises(InvalidInput, match="state one of the two"):
+        stated_law(GivenGains(position_gain=1.0), GivenPid(Kp=1.0))
+    with pytest.raises(InvalidInput, match=r"--kp -1\.0: must be positive"):
+        GivenPid(Kp=-1.0)
 
 
 @pytest.mark.slow

@@ -32,6 +32,14 @@ def test_a_lag_is_told_from_the_gap():
     assert found.lag == pytest.approx(5e-3, rel=0.02)
 
 
+def test_a_long_lag_of_a_fast_motion_is_no_wind_up_by_acceleration():
+    # Its column is right to first order; what is left was taken for wind-up, and gap and wind-up looked alike.
+    found = estimate_lost_motion(recording(lag=12e-3, speed=4.0, rate=1000.0, seconds=60.0))
+    assert (found.model, found.status) == ("lag", GapStatus.OK)
+    assert found.lag == pytest.approx(12e-3, rel=2e-3)
+    assert found.at_motor == pytest.approx(0.05, abs=3e-4)
+
+
 def test_a_cyclic_error_of_unknown_period():
     found = estimate_lost_motion(recording(error=lambda angle: 4e-4 * np.sin(angle / 0.13 + 1.0)))
     assert "cyclic" in found.model

@@ -52,3 +52,15 @@ def test_a_load_whose_acceleration_explains_as_much_as_a_gap_is_doubted():
     assert "nearly as well without a gap: 70 %" in judged.reasons[0]
     assert verdict(fit._replace(accelerated=False), "rad").status is GapStatus.OK
     assert verdict(fit._replace(of_none=0.01), "rad").status is GapStatus.OK
+
+
+def test_weightings_that_differ_by_less_than_a_hundredth_widen_the_interval_and_doubt_nothing():
+    spread = Spread(*(np.full(300, 1.0) for _ in range(3)), 10)
+    numbers = {"simpler": {}, "spread": spread, "half": 0.01, "quantisation": 1e-4, "left": 0.02, "rms": 0.02}
+    fit = KinematicFit(gap=1.0, by_travel=1.005, of_none=0.1, reach=1.4, accelerated=False, lead=0.0, **numbers)
+    judged = verdict(fit, "rad")
+    assert judged.status is GapStatus.OK
+    assert judged.interval == pytest.approx((0.95, 1.055))
+    far = verdict(fit._replace(by_travel=1.02), "rad")
+    assert far.status is GapStatus.MODEL_MISMATCH
+    assert far.interval[1] == 1.4

@@ -1,0 +1,83 @@
+"""Names of columns and the units in them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from servotwin.config.table import did_you_mean
+from servotwin.errors import InvalidInput
+from servotwin.estimation.kinematic.wind_up import ANGLES, LENGTHS
+
+# A number in brackets is a row of a matrix.
+_UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")
+# Longer ones first: the end of _n_m is no metre.
+_ENDINGS = ("n_m", "deg", "rad", "mrad", "rev", "mm", "um", "nm", "m", "counts", "s", "ms", "us", "ns", "v", "a", "n")
+_BARE = ("theta_m",)  # names that end as a unit does
+_ALIASES: Mapping[str, str] = {
+    **dict.fromkeys(("degree", "degrees"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+    **dict.fromkeys(("turn", "turns", "revs", "revolution", "revolutions"), "rev"),
+    **dict.fromkeys(("micron", "microns", "\N{GREEK SMALL LETTER MU}m"), "µm"),
+    **dict.fromkeys(("inch", "inches", '"'), "in"),
+    **dict.fromkeys(("metre", "metres", "meter", "meters"), "m"),
+    **dict.fromkeys(("millimetre", "millimetres", "millimeter", "millimeters"), "mm"),
+    "\N{GREEK SMALL LETTER MU}s": "µs",
+    # In any case of letters; of nm it says metres or newtons.
+    **{unit: unit for unit in ("deg", "rad", "mrad", "rev", "mm", "µm", "um", "ms")},
+}
+_KNOWN = {*ANGLES, *LENGTHS, "s", "sec", "ms", "us", "µs", "ns", "min", "h"}
+_BEHIND_COMMA = re.compile(r"^(?P<name>.*\w)\s*[,/]\s*(?P<unit>[^\s,/\d]+|N m)\s*$")
+_COMMANDS = ("V", "A", "N", "N m", "Nm")
+
+
+def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str:
+    """The column of that name, with its unit or without.
+
+    Raises
+    ------
+    InvalidInput
+        There is none.
+    """
+    fitting = [name for name in names if given in (name, bare_name(name))]
+    if not fitting:
+        hint = did_you_mean(given, names)
+        raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
+    return fitting[0]
+
+
+def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
+    """The column with the first of the guessed names that occurs."""
+    bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
+    return next((bare[guess] for guess in guesses if guess in bare), None)
+
+
+def bare_name(name: str) -> str:
+    """A column's name without its unit."""
+    return _parted(name)[0]
+
+
+def named_unit(name: str) -> str:
+    """The unit that a column's name says; empty where it says none."""
+    return known_unit(_parted(name)[1])
+
+
+def known_unit(unit: str) -> str:
+    """A unit as the package writes it: `deg` for `Degrees`, `mm` for `MM`; an unknown one as it is."""
+    bare = unit.strip()
+    return bare if bare in _KNOWN else _ALIASES.get(bare.lower(), bare)
+
+
+def _parted(name: str) -> tuple[str, str]:
+    """Name and unit of a column: `load [mm]`, `load, mm`, `load / mm` or `load_mm`."""
+    found = _UNIT.match(name)
+    if found:
+        return found["name"], found["unit"].strip()
+    found = _BEHIND_COMMA.match(name)
+    if found and (known_unit(found["unit"]) in _KNOWN or found["unit"] in _COMMANDS):
+        return found["name"], found["unit"]
+    if name.lower() in _BARE:
+        return name, ""
+    ending = next((each for each in _ENDINGS if name.lower().endswith(f"_{each}")), "")
+    return (name[: -len(ending) - 1], ending) if ending else (name, "")
