@@ -28,7 +28,7 @@ from servotwin.plant.basis import Play
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "OutputErrorSettings", "estimate", "shortest_window"]
+__all__ = ["METHOD", "OutputErrorSettings", "estimate", "fit", "shortest_window"]
 
 METHOD = "output_error"
 SHORTEST = 400  # samples
@@ -69,13 +69,17 @@ def estimate(
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
-    expected = prior.gap if isinstance(prior, GapEstimate) else prior
-    problem = _problem(window, theta_m, axis, settings)
-    found = search(problem, 0.5 * axis.p * (expected or 0.0))
+    found = fit(window, axis, prior, settings)
     at_motor, at_load, unit = _count_of_motor(axis, theta_m), _count_of_load(axis, window), 2.0 / axis.p
     possible = possible_half(found, 0.5 * (axis.p * at_motor + at_load))
     jitter = 0.0 if axis.play is Play.FREE else axis.p * _jitter(theta_m, at_motor)
     return _stated(blank, found, judge(found, settings, unit, possible, jitter), unit)
+
+
+def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings) -> Search:
+    """Fit a window as `estimate` does; raises InvalidInput as it does."""
+    expected = prior.gap if isinstance(prior, GapEstimate) else prior
+    return search(_problem(window, _checked(window, axis), axis, settings), 0.5 * axis.p * (expected or 0.0))
 
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
