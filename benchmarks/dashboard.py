@@ -1,8 +1,8 @@
 """Cost of the dashboard to the twin, to acknowledgements and the browser: `python -m benchmarks.dashboard [SECONDS]`.
 
-A twin with a thousand machines gets ten windows a second, and each acknowledgement is timed, in turns without and with
-50 clients that watch. Then a browser opens the fleet and a machine while the windows go on, and steps are tried on the
-model.
+A twin with a thousand machines gets ten windows a second, and each acknowledgement is timed, in alternating blocks of
+SECONDS without and with 50 clients that watch. Then a browser opens the fleet and a machine while the windows go on,
+and steps are tried on the model.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from http.client import HTTPConnection
 from multiprocessing import get_context
+from multiprocessing.connection import Connection
 from pathlib import Path
 from threading import Event, Thread
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import SplitResult, urlsplit
 
 from servotwin.messages import Channel, WindowMessage, checksum, encode, pack_channel
@@ -32,7 +33,9 @@ from servotwin.store.records import EvidenceRecord, Incoming, MessageKind, WorkR
 from servotwin.store.store import open_store
 from servotwin.twin.evidence import plain
 
-MACHINES, WATCHERS, RATE_HZ, TURNS, SECONDS = 1000, 50, 10.0, 3, 15.0
+MACHINES, WATCHERS, RATE_HZ, PAIRS, SECONDS = 1000, 50, 10.0, 12, 10.0
+SETTLE_S = 1.0
+"""Left out at the begin of each block: clients connect or leave."""
 _TWIN = """[service]
 port = 0
 workers = 1
@@ -121,34 +124,56 @@ class Edges(Thread):
         self.join()
 
 
-@contextmanager
-def watchers(url: str) -> Iterator[None]:
-    """Clients that read the fleet's events, in a process of their own: they must not hold up who times the edges."""
-    process = get_context("spawn").Process(target=_watch, args=(url,), daemon=True)
-    process.start()
-    time.sleep(3.0)
-    try:
-        yield
-        assert process.is_alive()
-    finally:
-        process.terminate()
-        process.join()
+class Watchers:
+    """Clients that read the fleet's events, in a process of their own: they must not hold up who times the edges.
+
+    The process lives through all blocks, so that its start costs none of them anything.
+    """
+
+    def __init__(self, url: str) -> None:
+        context = get_context("spawn")
+        self._line, other = context.Pipe()
+        self._process = context.Process(target=_watch, args=(url, other), daemon=True)
+        self._process.start()
+        self.set(0)
+
+    def set(self, number: int) -> None:
+        """Have so many clients watch; returns once they do."""
+        self._line.send(number)
+        assert self._line.recv() == number
+
+    def stop(self) -> None:
+        """End the process."""
+        self._process.terminate()
+        self._process.join()
 
 
-def _watch(url: str) -> None:
-    asyncio.run(_read_all(urlsplit(url)))
+def _watch(url: str, line: Connection) -> None:
+    asyncio.run(_follow(urlsplit(url), line))
 
 
-async def _read_all(address: SplitResult) -> None:
-    await asyncio.gather(*(_read(address) for _ in range(WATCHERS)))
+async def _follow(address: SplitResult, line: Connection) -> None:
+    clients: list[asyncio.Task[None]] = []
+    while True:
+        number = await asyncio.to_thread(line.recv)
+        for client in clients:
+            client.cancel()
+        await asyncio.gather(*clients, return_exceptions=True)
+        opened = [asyncio.Event() for _ in range(number)]
+        clients = [asyncio.create_task(_read(address, each)) for each in opened]
+        await asyncio.gather(*(each.wait() for each in opened))
+        line.send(number)
 
 
-async def _read(address: SplitResult) -> None:
+async def _read(address: SplitResult, opened: asyncio.Event) -> None:
     reader, writer = await asyncio.open_connection(address.hostname, address.port)
-    writer.write(b"GET /v1/fleet/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-    while await reader.read(65536):
-        pass
-    raise SystemExit("the twin ended a stream")
+    try:
+        writer.write(b"GET /v1/fleet/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        while await reader.read(65536):
+            opened.set()
+        raise SystemExit("the twin ended a stream")
+    finally:
+        writer.close()
 
 
 def processor_s(pid: int) -> float:
@@ -157,29 +182,62 @@ def processor_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / _TICKS
 
 
+class Block(NamedTuple):
+    """Acknowledgements (s) and the twin's processor time (share of a core) of one block."""
+
+    times: list[float]
+    used: float
+
+
 def watched(pid: int, url: str, edges: Edges, seconds: float) -> dict[str, float]:
-    """Share of a core that 50 watchers cost the twin, and p50 and p99 of acknowledgements without and with them."""
-    times: dict[bool, list[float]] = {False: [], True: []}
-    used = {False: 0.0, True: 0.0}
-    for turn in range(2 * TURNS):
-        on = bool(turn % 2)
-        with watchers(url) if on else nullcontext():
-            first, before = len(edges.times), processor_s(pid)
-            time.sleep(seconds)
-            used[on] += processor_s(pid) - before
-            times[on] += edges.times[first:]
-    length = TURNS * seconds
-    return {
-        "core share without, %": 100 * used[False] / length,
-        "core share with 50 watchers, %": 100 * used[True] / length,
-        **{f"acknowledgement {name}, ms": 1e3 * quantile(times[on], q) for name, q, on in _QUANTILES},
-        "acknowledgements": float(sum(map(len, times.values()))),
+    """What 50 watchers cost the twin and its acknowledgements.
+
+    Blocks without and with them follow each other in pairs, first one and then the other in front, so that what the
+    machine does meanwhile meets both alike. The interval is a bootstrap over pairs.
+    """
+    clients, pairs = Watchers(url), []
+    try:
+        for turn in range(PAIRS):
+            order = (0, WATCHERS) if turn % 2 == 0 else (WATCHERS, 0)
+            blocks = {number: _block(pid, clients, number, edges, seconds) for number in order}
+            pairs.append((blocks[0], blocks[WATCHERS]))
+    finally:
+        clients.stop()
+    without, with_them = ([block for pair in pairs for block in [pair[k]]] for k in (0, 1))
+    found = {
+        "core share without, %": 100 * statistics.mean(each.used for each in without),
+        "core share with 50 watchers, %": 100 * statistics.mean(each.used for each in with_them),
     }
+    for name, share in (("p50", 0.5), ("p99", 0.99)):
+        found[f"acknowledgement {name} without, ms"] = 1e3 * _pooled(without, share)
+        found[f"acknowledgement {name} with, ms"] = 1e3 * _pooled(with_them, share)
+        low, high = _interval(pairs, share)
+        found[f"difference of {name}, low end of 95 %, ms"] = 1e3 * low
+        found[f"difference of {name}, high end of 95 %, ms"] = 1e3 * high
+    found["acknowledgements"] = float(sum(len(block.times) for pair in pairs for block in pair))
+    return found
 
 
-_QUANTILES = (
-    ("p50 without", 0.5, False), ("p50 with", 0.5, True), ("p99 without", 0.99, False), ("p99 with", 0.99, True),
-)  # fmt: skip
+def _block(pid: int, clients: Watchers, number: int, edges: Edges, seconds: float) -> Block:
+    clients.set(number)
+    time.sleep(SETTLE_S)
+    first, before, begun = len(edges.times), processor_s(pid), time.monotonic()
+    time.sleep(seconds)
+    return Block(edges.times[first:], (processor_s(pid) - before) / (time.monotonic() - begun))
+
+
+def _pooled(blocks: Iterable[Block], share: float) -> float:
+    return quantile([value for block in blocks for value in block.times], share)
+
+
+def _interval(pairs: list[tuple[Block, Block]], share: float) -> tuple[float, float]:
+    """95 % interval of a quantile with watchers less that without, s."""
+    draw = random.Random(2)
+    found = []
+    for _ in range(1000):
+        chosen = draw.choices(pairs, k=len(pairs))
+        found.append(_pooled([pair[1] for pair in chosen], share) - _pooled([pair[0] for pair in chosen], share))
+    return quantile(found, 0.025), quantile(found, 0.975)
 
 
 def quantile(values: list[float], share: float) -> float:

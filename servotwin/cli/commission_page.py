@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,8 @@ import numpy as np
 
 from servotwin.commissioning.commission import CommissionedAxis
 from servotwin.estimation.inverse_dynamics.conditioning import low_passed, motion_of
-from servotwin.report import page, style
+from servotwin.report import style
+from servotwin.report.page import page
 from servotwin.runtime import files
 
 _POINTS = 4000  # of a curve
@@ -72,17 +72,12 @@ def _draw_friction(axes: Any, found: CommissionedAxis, force: Any) -> None:
 
 
 def _html(found: CommissionedAxis, headline: str, vector: bytes) -> str:
-    names = ", ".join(log.recording.source.removeprefix("log ") for log in found.logs)
-    caption = (
-        "(a) Position of the log, and of the loop that is simulated with the identified axis. (b) Their forces, "
-        "filtered. (c) Position of the log less the simulated one. (d) Force without that of the acceleration over the "
-        "speed; solid: one friction for both directions, dashed: one for each."
+    return page(
+        "drive.html",
+        "servotwin: commissioned drive",
+        logs=", ".join(log.recording.source.removeprefix("log ") for log in found.logs),
+        headline=headline,
+        doubts=found.drive.doubts,
+        advice=str(found.drive.advice),
+        picture=vector,
     )
-    body = [
-        f"<h1>Drive of {escape(names)}</h1>",
-        f"<p>{escape(headline)}</p>",
-        *(f"<p>{escape(doubt)}</p>" for doubt in found.drive.doubts),
-        f"<p>Next experiment: {escape(str(found.drive.advice))}.</p>",
-        page.figure(vector, "Identified drive.", caption),
-    ]
-    return page.page("servotwin: commissioned drive", body)

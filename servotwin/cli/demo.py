@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from html import escape
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -16,7 +15,8 @@ from rich.table import Table
 
 import servotwin as st
 from servotwin.messages import Update
-from servotwin.report import page, style
+from servotwin.report import style
+from servotwin.report.page import page
 from servotwin.reproduction.figures import wear_panels
 from servotwin.reproduction.measures import SETTLED, TAIL, MeasuredStep
 from servotwin.reproduction.twin_runs import EstimateRecord, TwinJob, TwinRun, run_twin
@@ -226,29 +226,18 @@ def _colored(cell: str) -> str:
 
 
 def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes, preset: str) -> str:
-    caption = (
-        f"Preset {preset}: a square wave of ±1 mm while the gap wears from 0 to 20 deg in 200 s, with a bias of "
-        f"{BIAS * MM:g} mV on the motor's input. (a) The servo's own controller; (b) the paper's twin: after each step "
-        "a dead zone as wide as the gap it estimates; (c) the certified twin: the loop begins on a setting that is "
-        "verified for every gap of the stated range, and gets settings verified for the twin's estimates; (d) the "
-        "gap and the certified twin's estimates."
-    )
-    published = _accuracy([row.published_estimate for row in rows]).replace(
-        "Estimates", "The published twin: estimates"
-    )
-    return page.page(
+    published = _accuracy([row.published_estimate for row in rows])
+    return page(
+        "demo.html",
         TITLE,
-        [
-            f"<h1>{escape(TITLE)}</h1>",
-            f"<p><strong>{escape(' '.join(summary(rows)))}</strong> {escape(definition())}</p>",
-            page.figure(vector, "The same servo three times.", caption),
-            "<h2>Step by step</h2>",
-            page.table((*HEADS, *MORE), [(*cells(row), _estimate(row.published_estimate)) for row in rows]),
-            f"<p>Off by: largest error that remains at the end of the step. {escape(published)}</p>",
-            "<h2>What the certified twin sent</h2>",
-            page.table(_SENT, [sent(update, comparison.servo) for update in comparison.twinned.updates]),
-            "<p>Gains are relative to the servo's own. Each setting was verified on simulated machines within the "
-            "uncertainty of model and estimate.</p>",
-            "<p class='soft small'>Every figure and claim of the paper: <code>servotwin reproduce</code>.</p>",
-        ],
+        summary=" ".join(summary(rows)),
+        definition=definition(),
+        picture=vector,
+        preset=preset,
+        bias=BIAS * MM,
+        heads=(*HEADS, *MORE),
+        steps=[(*cells(row), _estimate(row.published_estimate)) for row in rows],
+        published=published.replace("Estimates", "The published twin: estimates"),
+        sent_heads=_SENT,
+        sent=[sent(update, comparison.servo) for update in comparison.twinned.updates],
     )

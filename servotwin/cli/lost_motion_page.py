@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,8 @@ import numpy as np
 from servotwin.cli.lost_motion import model_line, model_rows, read_line
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.recordings import RecordedLog
-from servotwin.report import page, style
+from servotwin.report import style
+from servotwin.report.page import page
 from servotwin.runtime import files
 
 _SUFFIXES = (".html", ".png", ".svg")
@@ -73,27 +73,17 @@ def _sentence(text: str) -> str:
 
 def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes) -> str:
     unit = log.recording.load_unit
-    defects = [[str(count), defect] for defect, count in log.found.items()]
     read = [read_line(log)]
     if found.lost.comparisons:
         read.append(model_line(found, unit, log.recording.motor_unit))
-    body = [
-        f"<h1>{'Gap' if found.ok else 'Lost motion'} of {escape(log.recording.source.removeprefix('log '))}</h1>",
-        f"<p><strong>{escape(_sentence(headline))}</strong></p>",
-        *(f"<p>{escape(_sentence(reason))}</p>" for reason in found.reasons),
-        *(f"<p>{escape(_sentence(each))}</p>" for each in read),
-        page.figure(
-            vector,
-            "Lost motion.",
-            "(a) By how much the motor leads the load, the lag taken off, and half the lost motion on either side. "
-            "(b) The lost motion of each reversal. (c) What the model leaves of the load's position. (d) The model's "
-            "error for other lost motions; shaded: 95 % interval.",
-        ),
-        "<h2>Models</h2>",
-        page.table(
-            ["model", f"lost motion, {unit}", f"error on unseen strokes, {unit}", "evidence"], model_rows(found)
-        ),
-    ]
-    if defects:
-        body += ["<h2>Defects of the log</h2>", page.table(["number", "what"], defects)]
-    return page.page("servotwin: lost motion", body)
+    return page(
+        "lost_motion.html",
+        "servotwin: lost motion",
+        heading=f"{'Gap' if found.ok else 'Lost motion'} of {log.recording.source.removeprefix('log ')}",
+        headline=_sentence(headline),
+        sentences=[_sentence(each) for each in (*found.reasons, *read)],
+        picture=vector,
+        unit=unit,
+        models=model_rows(found),
+        defects=[(str(count), defect) for defect, count in log.found.items()],
+    )

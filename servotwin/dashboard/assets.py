@@ -8,7 +8,10 @@ from functools import lru_cache
 from importlib import resources
 from typing import NamedTuple
 
+from servotwin.report.theme import style_sheet
+
 INDEX = "index.html"
+_THEME = "theme.css"
 SECURITY = {
     "content-security-policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
@@ -47,11 +50,17 @@ class Asset(NamedTuple):
 @lru_cache(maxsize=1)
 def assets() -> dict[str, Asset]:
     """Files by name."""
-    found = {}
-    for file in resources.files("servotwin.dashboard").joinpath("static").iterdir():
-        kind = _TYPES.get(file.name[file.name.rfind(".") :])
-        if kind is not None:
-            body = file.read_bytes()
-            tag = '"' + hashlib.sha256(body).hexdigest()[:32] + '"'
-            found[file.name] = Asset(kind, body, gzip.compress(body, 9, mtime=0), tag)
-    return found
+    bodies = {
+        file.name: file.read_bytes() for file in resources.files("servotwin.dashboard").joinpath("static").iterdir()
+    }
+    bodies[_THEME] = style_sheet(dark=True).encode()
+    return {name: _asset(kind, body) for name, body in bodies.items() if (kind := _TYPES.get(_suffix(name)))}
+
+
+def _asset(content_type: str, body: bytes) -> Asset:
+    tag = '"' + hashlib.sha256(body).hexdigest()[:32] + '"'
+    return Asset(content_type, body, gzip.compress(body, 9, mtime=0), tag)
+
+
+def _suffix(name: str) -> str:
+    return name[name.rfind(".") :]

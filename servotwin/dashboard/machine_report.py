@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
-from html import escape
 from typing import Any
 
 from servotwin.dashboard.fleet import FleetRow, Interval
 from servotwin.dashboard.machine_facts import MachineFacts
-from servotwin.report.page import figure, page, table
-from servotwin.report.time_chart import GREEN, ORANGE, RED, ChartLine, ChartMark, TimeChart
+from servotwin.report.page import page
+from servotwin.report.time_chart import BLUE, GREEN, ORANGE, RED, ChartLine, ChartMark, TimeChart
 
 DEG = 180.0 / math.pi
-_BLUE = "#0072B2"
 _HOUR, _DAY, _YEAR = 3600.0, 86400.0, 365.25 * 86400.0
 _STATUS = {"ok": "estimate accepted", "nothing moved": "unchanged", "": "no estimate yet"}
 Trace = dict[str, Any]
@@ -36,35 +34,20 @@ def machine_report(row: FleetRow, series: dict[str, Any], traces: Sequence[Trace
     """
     machine: MachineFacts = series["machine"]
     unit, factor = ("deg", DEG) if machine.travel_unit == "rad" else ("mm", 1e3)
-    windows = series["windows"]
-    count = len(windows["received"])
-    body = [f"<h1>{escape(row.servo)}</h1>", f'<p class="soft">As the twin knew it on {stamp(now)} UTC.</p>']
-    body.append(table(("", "", ""), _facts(row)))
-    body += [
-        f'<p class="no"><strong>Alarm</strong> {stamp(each.time)}: {escape(each.sentence)}</p>' for each in row.alarms
-    ]
-    if count:
-        body.append("<h2>Gap over time</h2>")
-        body.append(
-            figure(
-                _gap_chart(series),
-                f"Gap of the last {count} windows.",
-                "Dots: estimates; orange: a version that the edge applied; red: one that it refused, or a fallback.",
-            )
-        )
-        body.append("<h2>Did it help?</h2>")
-        errors = _scaled(windows["tail"], factor)
-        chart = TimeChart(
-            f"Error at the end ({unit})",
-            windows["received"],
-            (ChartLine("error at the end", _BLUE, errors, dots=True),),
-            marks=_marks(series),
-        )
-        body.append(figure(chart.svg(), "Largest tracking error in the last tenth of each window.", ""))
-    else:
-        body.append("<p>No window of this machine has come yet: there is nothing to estimate from.</p>")
-    body += ["<h2>Updates</h2>", *_updates(traces, unit, factor)]
-    return page(f"{row.servo} – servotwin", body)
+    count = len(series["windows"]["received"])
+    return page(
+        "machine.html",
+        f"{row.servo} – servotwin",
+        servo=row.servo,
+        known=stamp(now),
+        facts=list(_facts(row)),
+        alarms=[(stamp(each.time), each.sentence) for each in row.alarms],
+        windows=count,
+        gap=_gap_chart(series) if count else b"",
+        error=_error_chart(series, unit, factor) if count else b"",
+        unit=unit,
+        updates=_updates(traces, factor),
+    )
 
 
 def stamp(time: float | None) -> str:
@@ -101,12 +84,18 @@ def _facts(row: FleetRow) -> Iterator[tuple[str, str, str]]:
 def _gap_chart(series: dict[str, Any]) -> bytes:
     windows, limit = series["windows"], series["machine"].gap_limit
     times, gap = windows["received"], _scaled(windows["gap"], DEG)
-    lines = [ChartLine("estimate", _BLUE, gap, dots=True), ChartLine("trend", GREEN, _scaled(windows["trend"], DEG))]
+    lines = [ChartLine("estimate", BLUE, gap, dots=True), ChartLine("trend", GREEN, _scaled(windows["trend"], DEG))]
     top = max((value for value in gap if value is not None), default=0.0)
     if limit is not None and limit * DEG < 3.0 * top:
         lines.append(ChartLine("limit", RED, [limit * DEG] * len(times), dash="6 4"))
     band = _scaled(windows["low"], DEG), _scaled(windows["high"], DEG)
     return TimeChart("Gap (deg)", times, lines, band, _marks(series)).svg()
+
+
+def _error_chart(series: dict[str, Any], unit: str, factor: float) -> bytes:
+    windows = series["windows"]
+    errors = ChartLine("error at the end", BLUE, _scaled(windows["tail"], factor), dots=True)
+    return TimeChart(f"Error at the end ({unit})", windows["received"], (errors,), marks=_marks(series)).svg()
 
 
 def _marks(series: dict[str, Any]) -> list[ChartMark]:
@@ -120,26 +109,10 @@ def _marks(series: dict[str, Any]) -> list[ChartMark]:
     return [mark for mark in marks if mark.time >= first]
 
 
-def _updates(traces: Iterable[Trace], unit: str, factor: float) -> list[str]:
+def _updates(traces: Iterable[Trace], factor: float) -> list[tuple[str, ...]]:
     steps = [(trace, step) for trace in traces for step in trace["steps"]]
-    if not steps:
-        return ["<p>The twin has sent no update yet.</p>"]
     steps.sort(key=lambda pair: -pair[1]["update"]["version"])
-    head = (
-        "Version",
-        "Sent, UTC",
-        "Window",
-        "Gap, deg",
-        f"Dead zone, {unit}",
-        "Verified on",
-        "The edge",
-        f"Error at the end, before → after ({unit})",
-    )
-    rows = [_update(trace, step, factor) for trace, step in steps]
-    note = (
-        "Verified on simulated machines drawn from what is stated and learnt. A verification in simulation is no proof."
-    )
-    return [table(head, rows, stack=True), f'<p class="soft">{note}</p>']
+    return [_update(trace, step, factor) for trace, step in steps]
 
 
 def _update(trace: Trace, step: Trace, factor: float) -> tuple[str, ...]:

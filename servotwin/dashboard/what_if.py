@@ -9,16 +9,18 @@ import msgspec
 import numpy as np
 
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.control.laws import AnyController
+from servotwin.control.laws import AnyController, law_of
+from servotwin.control.linear_law import LinearLaw
 from servotwin.dashboard.map_position import CoarseMaps
 from servotwin.dashboard.window_view import envelope_indices
 from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains
 from servotwin.messages.checks import InvalidMessage
+from servotwin.plant.margins import sensitivity_peak
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.plant.shown import command_unit, position_unit
-from servotwin.plant.signals import Step
+from servotwin.plant.signals import Array, Step
 from servotwin.simulation.run import Run
 from servotwin.simulation.simulate import simulate
 from servotwin.twin.model_registry import ServoModel
@@ -134,7 +136,10 @@ def simulated_step(model: ServoModel, asked: WhatIf, maps: CoarseMaps | None = N
 @lru_cache(maxsize=256)
 def _sensitivity_peak(servo: Plant, law: AnyController) -> float:
     """Ms, remembered while only the gap or the dead zone is dragged."""
-    return float(servo.replace(controller=law).margins().Ms)
+    changed = servo.replace(controller=law)
+    if isinstance(law_of(law), LinearLaw):
+        return float(changed.margins().Ms)
+    return sensitivity_peak(changed.loop(), changed.closed_loop())
 
 
 def _law(servo: Plant, asked: WhatIf) -> AnyController:
@@ -184,8 +189,14 @@ def _series(run: Run) -> dict[str, Any]:
     position, command = run.position, run.voltage
     kept = sorted({k for values in (position, command) for k in envelope_indices(values.tolist(), _COLUMNS)})
     columns = {"time": run.time, "position": position, "reference": run.reference, "command": command}
-    # Seven digits: a screen shows no more.
-    return {name: [float(f"{value:.7g}") for value in values[kept]] for name, values in columns.items()}
+    return {name: _short(values[kept]) for name, values in columns.items()}
+
+
+def _short(values: Array) -> list[float]:
+    """Seven digits: a screen shows no more."""
+    size = np.abs(values)
+    unit = 10.0 ** (6.0 - np.floor(np.log10(np.where((size > 1e-200) & (size < 1e200), size, 1.0))))
+    return (np.round(values * unit) / unit).tolist()
 
 
 def _figures(run: Run, step: float, tolerance: float) -> dict[str, float | None]:

@@ -1,4 +1,4 @@
-"""Style of every figure: colour-blind safe palette (Okabe & Ito), sizes, panels, decimated traces, files."""
+"""Style of every figure: sizes, panels, decimated traces, files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from matplotlib.ticker import MultipleLocator
 from numpy.typing import ArrayLike, NDArray
 
 from servotwin.hybrid.automaton import Array
+from servotwin.report import theme
 from servotwin.runtime import files
 
 Complex = NDArray[np.complex128]
 
-BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
-YELLOW, BLUE, RED, PINK = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
-GREY = "#7F7F7F"
+BLACK, ORANGE, SKY, GREEN, YELLOW, BLUE, RED, PINK = theme.OKABE_ITO
+GREY = theme.GREY
 MM, DEG = 1e3, float(np.degrees(1.0))  # from m and rad
 
 _LOOK: Any = {
@@ -33,7 +33,7 @@ _LOOK: Any = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.grid": True,
-    "grid.color": "#DDDDDD",
+    "grid.color": theme.GRID,
     "grid.linewidth": 0.6,
     "axes.axisbelow": True,
     "lines.linewidth": 1.3,

@@ -1,4 +1,4 @@
-"""Chart over time as SVG, made of text alone: where a page is made by a service that draws nothing else."""
+"""Chart over time as SVG from a template: where a page is made by a service that draws nothing else."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from html import escape
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-BLUE, ORANGE, GREEN, RED = "#0072B2", "#B06F00", "#00664B", "#B34700"
+from servotwin.report.theme import SHADES
+from servotwin.runtime.templates import render
+
+BLUE, ORANGE, GREEN, RED = (SHADES[name].light for name in ("blue", "orange", "green", "red"))
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 760.0, 300.0, 62.0, 12.0, 26.0, 46.0
 _STEPS_S = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21600, 43200, 86400, 172800, 604800, 2592000, 7776000)
 _DAY = 86400.0
@@ -59,14 +61,22 @@ class TimeChart:
     def svg(self) -> bytes:
         """Draw it."""
         x, y = self._scales()
-        head = (
-            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:g} {_HEIGHT:g}" font-size="12" fill="none">'
+        text = render(
+            "time_chart.svg",
+            width=f"{_WIDTH:g}",
+            height=f"{_HEIGHT:g}",
+            grid=list(_grid(x, y)),
+            grid_color=SHADES["line"].light,
+            labels=list(_labels(x, y)),
+            label=self.label,
+            middle=f"{(_TOP + _HEIGHT - _BOTTOM) / 2:g}",
+            band=self._band_path(x, y),
+            band_color=BLUE,
+            marks=list(self._drawn_marks(x)),
+            lines=[self._drawn(line, x, y) for line in self.lines],
+            legend=list(self._legend()),
         )
-        parts = [*self._grid(x, y), *self._drawn_band(x, y), *self._drawn_marks(x)]
-        parts += [part for line in self.lines for part in self._drawn(line, x, y)]
-        return "".join(
-            [head, '<rect width="100%" height="100%" fill="#fff"/>', *parts, *self._legend(), "</svg>"]
-        ).encode()
+        return text.encode()
 
     def _scales(self) -> tuple[_Scale, _Scale]:
         times = [*self.time, *(mark.time for mark in self.marks)] or [0.0]
@@ -79,61 +89,41 @@ class TimeChart:
         x = _Scale(min(times), max(times), _LEFT, _WIDTH - _RIGHT)
         return x, _Scale(low, low + 1.08 * (top - low), _HEIGHT - _BOTTOM, _TOP)
 
-    def _grid(self, x: _Scale, y: _Scale) -> Iterator[str]:
-        for value in _ticks(y.low, y.high):
-            place = y(value)
-            yield f'<path d="M{_LEFT:g} {place:.1f}H{_WIDTH - _RIGHT:g}" stroke="#DFE3E8"/>'
-            yield _text(f"{value:.6g}", _LEFT - 6, place + 4, "end")
-        for time in _time_ticks(x.low, x.high):
-            yield f'<path d="M{x(time):.1f} {_TOP:g}V{_HEIGHT - _BOTTOM:g}" stroke="#DFE3E8"/>'
-            yield _text(_time_text(time, x.high - x.low), x(time), _HEIGHT - _BOTTOM + 16, "middle")
-        begin = datetime.fromtimestamp(x.low, UTC).strftime("%Y-%m-%d %H:%M")
-        yield _text(f"Time, UTC (from {begin})", (_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 8, "middle")
-        middle = (_TOP + _HEIGHT - _BOTTOM) / 2
-        yield f'<g transform="translate(14 {middle:g}) rotate(-90)">{_text(self.label, 0, 0, "middle")}</g>'
-
-    def _drawn_band(self, x: _Scale, y: _Scale) -> Iterator[str]:
+    def _band_path(self, x: _Scale, y: _Scale) -> str:
         if self.band is None:
-            return
+            return ""
         known = [
             (time, low, min(high, y.high))
             for time, low, high in zip(self.time, *self.band, strict=True)
             if low is not None and high is not None
         ]
-        if known:
-            there = [f"{x(time):.1f} {y(high):.1f}" for time, _, high in known]
-            back = [f"{x(time):.1f} {y(min(low, y.high)):.1f}" for time, low, _ in reversed(known)]
-            yield f'<path d="M{"L".join([*there, *back])}Z" fill="{BLUE}" fill-opacity="0.2"/>'
+        there = [f"{x(time):.1f} {y(high):.1f}" for time, _, high in known]
+        back = [f"{x(time):.1f} {y(min(low, y.high)):.1f}" for time, low, _ in reversed(known)]
+        return f"M{'L'.join([*there, *back])}Z" if known else ""
 
-    def _drawn_marks(self, x: _Scale) -> Iterator[str]:
+    def _drawn_marks(self, x: _Scale) -> Iterator[dict[str, Any]]:
+        """Lines with their words; words that would overlap are left out."""
         free = -math.inf
         for mark in sorted(self.marks):
-            place = x(mark.time)
-            yield f'<path d="M{place:.1f} {_TOP:g}V{_HEIGHT - _BOTTOM:g}" stroke="{mark.color}"/>'
+            place, word = x(mark.time), None
             if place > free:
                 inside = place + 8.0 * len(mark.word) < _WIDTH
                 where, anchor = (place + 3, "start") if inside else (place - 3, "end")
-                yield _text(mark.word, where, _TOP + 11, anchor, mark.color)
+                word = (mark.word, where, _TOP + 11, anchor, mark.color)
                 free = place + 8.0 * len(mark.word)
+            yield {"path": f"M{place:.1f} {_TOP:g}V{_HEIGHT - _BOTTOM:g}", "color": mark.color, "word": word}
 
-    def _drawn(self, line: ChartLine, x: _Scale, y: _Scale) -> Iterator[str]:
-        known = [(time, value) for time, value in zip(self.time, line.values, strict=True) if value is not None]
-        if line.dots:
-            yield from (
-                f'<circle cx="{x(time):.1f}" cy="{y(value):.1f}" r="2.6" fill="{line.color}"/>' for time, value in known
-            )
-        elif known:
-            path = "L".join(f"{x(time):.1f} {y(value):.1f}" for time, value in known)
-            dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
-            yield f'<path d="M{path}" stroke="{line.color}" stroke-width="1.6"{dash}/>'
+    def _drawn(self, line: ChartLine, x: _Scale, y: _Scale) -> dict[str, Any]:
+        known = [(x(time), y(value)) for time, value in zip(self.time, line.values, strict=True) if value is not None]
+        path = "" if line.dots or not known else "M" + "L".join(f"{across:.1f} {up:.1f}" for across, up in known)
+        return {"color": line.color, "dots": known if line.dots else [], "path": path, "dash": line.dash}
 
-    def _legend(self) -> Iterator[str]:
-        names = [(line.name, line.color) for line in self.lines if line.name]
-        names += [("95 % interval", "#99C7E0")] if self.band is not None else []
+    def _legend(self) -> Iterator[dict[str, Any]]:
+        names = [(line.name, line.color, 1.0) for line in self.lines if line.name]
+        names += [("95 % interval", BLUE, 0.4)] if self.band is not None else []
         place = _LEFT
-        for name, color in names:
-            yield f'<path d="M{place:g} 11h14" stroke="{color}" stroke-width="4"/>'
-            yield _text(name, place + 19, 15, "start")
+        for name, color, opacity in names:
+            yield {"x": place, "name": name, "color": color, "opacity": opacity}
             place += 34 + 7.0 * len(name)
 
 
@@ -172,6 +162,18 @@ def _time_text(time: float, span: float) -> str:
     return datetime.fromtimestamp(time, UTC).strftime(form)
 
 
-def _text(words: str, x: float, y: float, anchor: str, color: str = "#5B6570") -> str:
-    look = f'text-anchor="{anchor}" fill="{color}" font-family="system-ui, sans-serif"'
-    return f'<text x="{x:.1f}" y="{y:.1f}" {look}>{escape(words)}</text>'
+def _grid(x: _Scale, y: _Scale) -> Iterator[str]:
+    for value in _ticks(y.low, y.high):
+        yield f"M{_LEFT:g} {y(value):.1f}H{_WIDTH - _RIGHT:g}"
+    for time in _time_ticks(x.low, x.high):
+        yield f"M{x(time):.1f} {_TOP:g}V{_HEIGHT - _BOTTOM:g}"
+
+
+def _labels(x: _Scale, y: _Scale) -> Iterator[tuple[str, float, float, str]]:
+    """Words at the axes: text, place, and which end of it is there."""
+    for value in _ticks(y.low, y.high):
+        yield f"{value:.6g}", _LEFT - 6, y(value) + 4, "end"
+    for time in _time_ticks(x.low, x.high):
+        yield _time_text(time, x.high - x.low), x(time), _HEIGHT - _BOTTOM + 16, "middle"
+    begin = datetime.fromtimestamp(x.low, UTC).strftime("%Y-%m-%d %H:%M")
+    yield f"Time, UTC (from {begin})", (_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 8, "middle"

@@ -22,10 +22,12 @@ from servotwin.estimation.gap import default_method, estimate_gap, options_for
 from servotwin.estimation.learning.machine import nameplate
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
+from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import CHANNELS, Window
 from servotwin.messages import Setting
 from servotwin.plant.actuator import DcMotor
+from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
@@ -96,6 +98,16 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         return replace(of_model(window, expected), model_version=servo.version)
 
     return of_model if model is servo else estimate
+
+
+def own_fit(window: Window, servo: Axis, settings: TwinSettings, expected: Expectation) -> Search:
+    """Fit a window as the estimator of an axis does that has no servo as its model; raises InvalidInput."""
+    settings = settings.on(servo)
+    if servo.at_motor:
+        motor = motor_side.MotorSideSettings(gap_rate=expected.gap_rate(settings.trend))
+        return motor_side.fit(window, servo, expected.prior, motor)
+    own = output_error.OutputErrorSettings(gap_rate=expected.gap_rate(settings.trend))
+    return output_error.fit(window, servo, expected.prior, own)
 
 
 def _worn(

@@ -8,16 +8,15 @@ import re
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Collection
 from contextlib import suppress
-from functools import partial
 
 import msgspec
 
 from servotwin.messages import Refusal
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.overview import StorePosition
-from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
+from servotwin.twin_service.fleet_process import ChangeReader, ChangesQuestion
+from servotwin.twin_service.fleet_reader import EdgePresence
 from servotwin.twin_service.limits import RequestRejected
-from servotwin.twin_service.store_executor import StoreExecutor
 
 log = logging.getLogger(__name__)
 
@@ -27,8 +26,10 @@ _ROWS, _MOST = 1000, 8000
 """Rows of one event, and of one look; where more changed, watchers are told to read the fleet anew."""
 _WAITING = 16
 """Events that wait for a slow watcher; then its stream ends, and it resumes."""
-_AT_ONCE, _BREATH_S = 4, 0.002
-"""Watchers that get an event at once; s until the next ones do."""
+_PAUSE_S, _SPREAD_S = 0.002, 0.5
+"""s between two watchers that get an event; s within which all of them have it."""
+_IDLE_S = 60.0
+"""s without a watcher after which the process that reads for them ends."""
 _TICKS_BACK = 3
 """On a shared database a row with a lower id may be committed later: its servo is sent again for so many ticks."""
 _POSITION = re.compile(r"(\d{1,18})-(\d{1,18})")
@@ -39,8 +40,7 @@ class FleetFeed:
 
     Parameters
     ----------
-    reader : FleetReader
-    executor : StoreExecutor
+    changes : ChangeReader
     presence : EdgePresence
     limit : int
         Watchers at once.
@@ -54,10 +54,8 @@ class FleetFeed:
     watchers : int
     """
 
-    def __init__(
-        self, reader: FleetReader, executor: StoreExecutor, presence: EdgePresence, limit: int, shared: bool
-    ) -> None:
-        self._reader, self._executor, self._presence = reader, executor, presence
+    def __init__(self, changes: ChangeReader, presence: EdgePresence, limit: int, shared: bool) -> None:
+        self._changes, self._presence = changes, presence
         self._limit, self.closing, self._open = limit, asyncio.Event(), 0
         self._queues: set[asyncio.Queue[bytes | None]] = set()
         self._positions: deque[StorePosition] = deque(maxlen=_TICKS_BACK if shared else 1)
@@ -97,7 +95,7 @@ class FleetFeed:
         try:
             yield b"retry: 2000\n\n"
             # A link may have changed between the reader's look at the fleet and this one.
-            yield _event("links", None, self._presence.links())
+            yield _event("links", None, msgspec.json.encode(self._presence.links()))
             if after is not None:
                 await self._begin()  # before the changes are read: those that come meanwhile are the feed's to send
                 for event in await self._since(after):
@@ -106,51 +104,55 @@ class FleetFeed:
                 allowed()
                 yield waited
         except RequestRejected:
-            yield _event("ended", None, "the session has ended")
+            yield _event("ended", None, b'"the session has ended"')
         finally:
             self._queues.discard(queue)
             self._open -= 1
 
     async def run(self) -> None:
         """Look at the store once a second while there are watchers."""
+        idle = 0.0
         while True:
             if self._queues:
+                idle = 0.0
+                self._changes.start()
                 for event in await self._look():
                     await self._send(event)
             else:
                 self._positions.clear()
                 self._presence.refresh()  # for whoever reads the fleet without watching it
+                idle += _TICK_S
+                if idle > _IDLE_S:
+                    await self._changes.stop()
             await asyncio.sleep(_TICK_S)
 
     async def _look(self) -> list[bytes]:
         """Events of one look; where it fails for whatever reason, watchers are told, and the next look repeats it."""
         try:
-            return await self._changes()
+            return await self._changed()
         except Exception as error:
             first, self._unreadable = not self._unreadable, True
             if not first:
                 return []
             if isinstance(error, StoreUnavailable):
-                return [_event("trouble", None, "the twin cannot read its store now")]
+                return [_event("trouble", None, b'"the twin cannot read its store now"')]
             log.exception("the feed of the fleet failed")
-            return [_event("trouble", None, "the twin cannot follow the fleet now")]
+            return [_event("trouble", None, b'"the twin cannot follow the fleet now"')]
 
     async def _begin(self) -> None:
         """Begin at the present position, unless the feed has one."""
         if not self._positions:
             with suppress(StoreUnavailable):
-                present = await self._executor.run(self._reader.position)
+                present = await self._changes.position()
                 if not self._positions:
                     self._positions.append(present)
 
-    async def _changes(self) -> list[bytes]:
+    async def _changed(self) -> list[bytes]:
         """Events with the rows that changed since the last look."""
         connected, since = self._presence.refresh(), self._positions[0] if self._positions else None
         if since is None:
-            since = await self._executor.run(self._reader.position)
-        found, position = await self._executor.run(partial(self._reader.changed, since, _MOST + 1))
-        names = {*found, *(self._connected ^ connected)}
-        events = await self._rows(names, position) if names or self._unreadable else []
+            since = await self._changes.position()
+        events, position = await self._events(since, self._connected ^ connected, self._unreadable)
         # Only now: what fails is repeated from the same place.
         if not self._positions:
             self._positions.append(since)
@@ -159,34 +161,39 @@ class FleetFeed:
         return events
 
     async def _since(self, after: StorePosition) -> list[bytes]:
-        """Events with the rows that changed after a position."""
+        """Events with the rows that changed after a position, at least one."""
         try:
-            names, position = await self._executor.run(partial(self._reader.changed, after, _MOST + 1))
-            return await self._rows(names, position)
+            return (await self._events(after, (), True))[0]
         except StoreUnavailable:
-            return [_event("trouble", None, "the twin cannot read its store now")]
+            return [_event("trouble", None, b'"the twin cannot read its store now"')]
 
-    async def _rows(self, names: Collection[str], position: StorePosition) -> list[bytes]:
-        """Events with these rows; only the last one has the position, from which a broken stream resumes."""
-        if len(names) > _MOST:
-            return [_event("reload", position, "")]
-        ordered = sorted(names)
-        parts = [ordered[first : first + _ROWS] for first in range(0, len(ordered), _ROWS)] or [[]]
-        rows = [await self._executor.run(partial(self._reader.rows, part)) for part in parts]
-        last = len(parts) - 1
-        return [_event("rows", position if i == last else None, part) for i, part in enumerate(rows)]
+    async def _events(
+        self, since: StorePosition, names: Collection[str], empty: bool
+    ) -> tuple[list[bytes], StorePosition]:
+        """Events, and the position after them; only the last one has it, from which a broken stream resumes.
+
+        `empty`: send an event of no rows where nothing changed.
+        """
+        connected, sole = self._presence.connected()
+        found = await self._changes.read(ChangesQuestion(since, tuple(names), connected, sole, _ROWS, _MOST))
+        if found.many:
+            return [_event("reload", found.position, b'""')], found.position
+        parts = found.parts or ((b"[]",) if empty else ())
+        places = [None] * (len(parts) - 1) + [found.position]
+        return [_event("rows", place, part) for place, part in zip(places, parts, strict=False)], found.position
 
     async def _send(self, event: bytes) -> None:
-        """Give an event to a few watchers at a time: an acknowledgement must not wait until all of them have it."""
-        for number, queue in enumerate(tuple(self._queues), 1):
+        """Give an event to one watcher after the other: acknowledgements have the loop to themselves in between."""
+        queues = tuple(self._queues)
+        pause = min(_PAUSE_S, _SPREAD_S / max(1, len(queues)))
+        for queue in queues:
             if queue.qsize() < _WAITING:
                 queue.put_nowait(event)
             else:
                 # It gets what waits, but not this: so it resumes from the last event that it got.
                 queue.put_nowait(None)
                 self._queues.discard(queue)
-            if number % _AT_ONCE == 0:
-                await asyncio.sleep(_BREATH_S)
+            await asyncio.sleep(pause)
 
 
 def position_of(text: str | None) -> StorePosition | None:
@@ -203,7 +210,7 @@ async def _next(queue: asyncio.Queue[bytes | None]) -> bytes | None:
         return b"event: alive\ndata: {}\n\n"
 
 
-def _event(kind: str, position: StorePosition | None, data: object) -> bytes:
-    """Encode an event; its data is JSON on one line."""
+def _event(kind: str, position: StorePosition | None, data: bytes) -> bytes:
+    """Compose an event; its data is JSON on one line."""
     name = b"" if position is None else f"id: {position.text}\n".encode()
-    return name + f"event: {kind}\n".encode() + b"data: " + msgspec.json.encode(data) + b"\n\n"
+    return name + f"event: {kind}\n".encode() + b"data: " + data + b"\n\n"

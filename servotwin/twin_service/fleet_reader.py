@@ -52,9 +52,14 @@ class EdgePresence:
         self._seen.update(dict.fromkeys(self._waiting(), now))
         return frozenset(self._seen)
 
+    def connected(self) -> tuple[tuple[str, ...], bool]:
+        """Servos whose edges are connected, and True where all others are not."""
+        return tuple(sorted(self.refresh())), self._only_here
+
     def links(self) -> dict[str, object]:
-        """Servos whose edges are connected, and `sole`: all others are not."""
-        return {"connected": sorted(self.refresh()), "sole": self._only_here}
+        """The same, for an event."""
+        connected, sole = self.connected()
+        return {"connected": connected, "sole": sole}
 
     def __call__(self, servo: str) -> bool | None:
         """True, False, or None where it cannot be known."""

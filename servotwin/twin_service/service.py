@@ -15,7 +15,7 @@ from uuid import uuid4
 from servotwin import __version__
 from servotwin.messages import NAME_PATTERN
 from servotwin.store.clock_gaps import old_messages
-from servotwin.store.engine import StoreUnavailable
+from servotwin.store.engine import POSTGRESQL, StoreUnavailable, sqlite_file
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
@@ -27,6 +27,7 @@ from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
 from servotwin.twin_service.fleet_feed import FleetFeed
+from servotwin.twin_service.fleet_process import ChangeReader
 from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
 from servotwin.twin_service.http_acts import ActsApi
 from servotwin.twin_service.http_app import HttpApp
@@ -153,7 +154,8 @@ class TwinService:
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
         self._reader = FleetReader(store, presence, self.clocks.wall)
-        self.feed = FleetFeed(self._reader, self._readers, presence, config.watchers, self._shared)
+        self._changes = ChangeReader(self._reader, self._readers, _readable_elsewhere(store))
+        self.feed = FleetFeed(self._changes, presence, config.watchers, self._shared)
         self.live_views = LiveViews(self.clocks.monotonic, presence, config.watchers, config.long_polls)
         self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
         self._mqtt: MqttServer | None = None
@@ -235,6 +237,7 @@ class TwinService:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await self.what_if.stop()
+        await self._changes.stop()
         await self.pool.stop()
         await asyncio.to_thread(self.commits.close)
         with suppress(StoreUnavailable):
@@ -372,6 +375,13 @@ def _log_failure(task: asyncio.Task[None]) -> None:
     """Log the exception of a background task at once: the task is awaited only when the service stops."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.error("a task of the service ended", exc_info=error)
+
+
+def _readable_elsewhere(store: Store) -> str | None:
+    """URL with which another process reads the store, password included; None: it is in this one's memory."""
+    url = store.engines.reader.url
+    inside = url.get_backend_name() != POSTGRESQL and sqlite_file(url) is None
+    return None if inside else url.render_as_string(hide_password=False)
 
 
 def _disk_limiter(megabytes_per_day: float, monotonic: Callable[[], float]) -> RateLimiter | None:

@@ -31,6 +31,8 @@ _ANSWER_S, _IDLE_S, _LOOK_S = 10.0, 300.0, 15.0
 _WAITING = 8
 """Questions that may wait, beside the one that is answered."""
 _NICENESS = 5
+_SWITCH_S = 1e-3
+"""s after which the thread of the maps lets the one that answers go on."""
 
 
 class QuestionKind(StrEnum):
@@ -153,6 +155,7 @@ def main(descriptor: int) -> None:
         signal.signal(number, signal.SIG_IGN)  # the service ends this process
     with suppress(OSError):
         os.nice(_NICENESS)
+    sys.setswitchinterval(_SWITCH_S)
     with socket.socket(fileno=descriptor) as line, line.makefile("rb") as stream:
         start = read_frame(stream)
         if start is None:

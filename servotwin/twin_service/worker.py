@@ -50,6 +50,12 @@ class WorkerStart(NamedTuple):
     folder: str
 
 
+class StoreAddress(NamedTuple):
+    """First message to a process that only reads the store; `url` may hold a password."""
+
+    url: str
+
+
 WorkerUrgency = tuple[float, float, bool]
 """Fields of `twin.work.Urgency`."""
 
@@ -95,7 +101,7 @@ decode_result = msgspec.msgpack.Decoder(LeaseResult).decode
 Work = Callable[[Lease, float, WorkerUrgency | None], WorkResult]
 
 
-def encode_frame(message: WorkerStart | WorkerJob | LeaseResult) -> bytes:
+def encode_frame(message: WorkerStart | StoreAddress | WorkerJob | LeaseResult) -> bytes:
     """Frame of a message."""
     return frame(_encoder.encode(message))
 
@@ -109,7 +115,7 @@ class WorkerProcess:
 
     Parameters
     ----------
-    start : WorkerStart
+    start : WorkerStart or StoreAddress
     timeout : float
         s that it may take for one lease.
     command : sequence of str
@@ -119,7 +125,11 @@ class WorkerProcess:
     """
 
     def __init__(
-        self, start: WorkerStart, timeout: float, command: Sequence[str] = COMMAND, memory: float = math.inf
+        self,
+        start: WorkerStart | StoreAddress,
+        timeout: float,
+        command: Sequence[str] = COMMAND,
+        memory: float = math.inf,
     ) -> None:
         self._start, self._timeout, self._command, self._memory = start, timeout, tuple(command), memory
         self._process: ChildProcess | None = None

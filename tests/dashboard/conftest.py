@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from browser_pages import OTHERS, WAIT_MS, Twin
+from browser_pages import LARGEST_SHIFT, OTHERS, WAIT_MS, WATCH_SHIFTS, Twin, layout_shift
 from dashboard_fleet import wearing_fleet
 from servers import needed
 from service_system import OPERATOR
@@ -29,13 +29,17 @@ def browser():
 
 @pytest.fixture
 def open_page(browser, twin):
-    """Opens pages; in the end no script may have failed, and nothing may have been executed that came as a name."""
-    contexts, faults = [], []
+    """Opens pages; in the end no script failed, nothing moved, and nothing was executed that came as a name."""
+    contexts, faults, shifts = [], [], []
 
     def opened(login=OPERATOR, width=1280, height=900, theme="light", expected=()):
         context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
         context.set_default_timeout(WAIT_MS)
         contexts.append(context)
+        moved = []
+        shifts.append(moved)
+        context.expose_function("noteShift", lambda shift: moved.append(shift))
+        context.add_init_script(WATCH_SHIFTS)
         page = context.new_page()
         page.on("pageerror", lambda error: faults.append(str(error)))
 
@@ -57,3 +61,5 @@ def open_page(browser, twin):
             assert page.evaluate("window.hacked") is None
         context.close()
     assert faults == []
+    for moved in shifts:
+        assert layout_shift(moved) < LARGEST_SHIFT, moved

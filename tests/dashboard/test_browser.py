@@ -72,8 +72,8 @@ def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
     has_text(page, ".fact", "± 0.039")  # of the estimate that the co-simulation gives
     has_text(page, ".fact", "limit 20.0 deg")
     page.wait_for_selector(".hysteresis svg")
-    has_text(page, "[aria-label=Live] p", "The edge is not connected")  # its plots are hidden until then
-    assert page.locator(".uplot:visible").count() == 6
+    has_text(page, "[aria-label=Live] p", "The edge is not connected")  # its plots are empty until then
+    assert page.locator(".uplot:visible").count() == 9
     page.locator("[aria-label=Window] p.mark", has_text=re.compile("imit cycle|still swings")).wait_for()
     page.click("[aria-label=Residual] button")
     has_text(page, "[aria-label=Residual] p", "autocorrelations lie outside the 95 % band")

@@ -3,15 +3,18 @@
 import itertools
 import json
 import re
+import time
+from functools import partial
 
 import httpx
 import pytest
-from browser_pages import MARKUP, has_text, open_machine, reaches, watchers
-from dashboard_fleet import SILENT, WEARING
-from service_system import OPERATOR, OTHER, TOKEN, bearer, place, window
+from browser_pages import MARKUP, PICTURES, has_text, open_machine, reaches, serious_faults, watchers
+from dashboard_fleet import SILENT, WEARING, say_hello
+from service_system import ENGINEER, OPERATOR, OTHER, TOKEN, bearer, place, window
 
 from servotwin.link.seal import verifier_of
 from servotwin.messages import encode
+from servotwin.store.store import open_store
 from servotwin.twin_service.auth import Verifiers, write_tokens
 
 pytestmark = pytest.mark.slow
@@ -145,6 +148,67 @@ def test_a_session_that_has_ended_asks_for_the_token_and_keeps_what_is_shown(ope
     page.locator("#login").wait_for(state="hidden")
 
 
+def test_nothing_moves_while_alarms_and_updates_come_and_the_twin_goes(open_page, twin):
+    page = open_page(login=ENGINEER, expected=("ERR_", "Failed to load", "status of 503"))
+    open_machine(page, WEARING)
+    page.wait_for_selector(".hysteresis svg")
+    store = open_store(f"sqlite:///{twin.path.parent}/twin.db")
+    try:
+        for place in (".alarms", "[aria-label=Updates]", "[aria-label=Oversight]", "[aria-label=Events]"):
+            page.locator(place).first.evaluate("place => place.scrollIntoView({ block: 'start' })")
+            store.add_alarm(WEARING, f"the alarm at {place} {MARKUP}", time.time())
+            has_text(page, ".alarms li", f"the alarm at {place}")
+            has_text(page, "[aria-label=Events] td", f"the alarm at {place}")
+    finally:
+        store.close()
+    twin.kill()
+    has_text(page, "#state", "What is shown is of")
+    twin.restart()
+    page.wait_for_selector("[data-live=live]", state="attached")
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_states_are_photographed_and_accessible(open_page, twin, theme):
+    page = open_page(theme=theme, expected=("status of", "ERR_", "Failed to load"))
+    page.add_init_script("delete globalThis.SharedWorker")
+    page.reload()
+    take = partial(photographed, page, theme)
+    store = open_store(f"sqlite:///{twin.path.parent}/twin.db")
+    say_hello(store, f"ax-{theme}", time.time())
+    store.close()
+    open_machine(page, f"ax-{theme}")
+    has_text(page, ".empty", "No window of this machine has come yet")
+    take("without-data")
+    open_machine(page, "nobody")
+    has_text(page, ".empty", "The twin knows no machine of this name")
+    take("unknown")
+    open_machine(page, WEARING)
+    page.wait_for_selector(".hysteresis svg")
+    twin.kill()
+    has_text(page, "#state", "What is shown is of")
+    take("twin-away")
+    twin.restart()
+    page.wait_for_selector("[data-live=live]", state="attached")
+    page.context.clear_cookies()
+    page.select_option("[aria-label=Window] select", index=1)
+    page.wait_for_selector("#token")
+    take("session-ended")
+
+
+def photographed(page, theme, name):
+    """Take a picture of a state at three widths; it is accessible and fits."""
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    assert serious_faults(page) == []
+    for kind, width, height in (("desk", 1280, 900), ("phone", 360, 740), ("wall", 3840, 2160)):
+        page.set_viewport_size({"width": width, "height": height})
+        page.evaluate("scrollTo(0, 0)")
+        page.wait_for_timeout(250)  # plots follow the width
+        (PICTURES / f"{name}-{theme}-{kind}.png").write_bytes(page.screenshot())
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+    page.set_viewport_size({"width": 1280, "height": 900})
+
+
+# Last: the file of tokens that it leaves names another fleet, so that this twin could not be started again.
 def test_a_revoked_token_ends_the_session(open_page, twin):
     page = open_page(expected=("status of 401", "status of 403"))
     known = {"ax-1": verifier_of(TOKEN), "ax-2": verifier_of(OTHER)}
@@ -159,4 +223,7 @@ def test_a_revoked_token_ends_the_session(open_page, twin):
         page.press("#token", "Enter")
         page.wait_for_selector(".hysteresis svg")
     finally:
-        write_tokens(twin.path.parent / "tokens.toml", Verifiers(known, {"me": verifier_of(OPERATOR)}))
+        write_tokens(
+            twin.path.parent / "tokens.toml",
+            Verifiers(known, {"me": verifier_of(OPERATOR)}, {"eva": verifier_of(ENGINEER)}),
+        )

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from servotwin.plant import linear
 from servotwin.plant import loop as loops
 from servotwin.plant.linear import LinearSystem
-from servotwin.plant.margins import Margins, bandwidth, gain_crossovers, margins, peak
+from servotwin.plant.margins import Margins, bandwidth, gain_crossovers, margins, peak, sensitivity_peak
 from servotwin.plant.servo import Servo
 
 
@@ -221,3 +221,11 @@ def test_a_stiff_screw_differs_from_the_rigid_one_by_the_load_on_the_motor() -> 
     assert 0.01 < abs(stiffest / rigid - 1.0) < 0.02
     slowest = np.max(servo.replace(k_d=1e9).plant().poles().real)
     assert slowest == pytest.approx(-(servo.p**2) * servo.k * servo.R / (servo.k_T * servo.k_B), rel=0.01)
+
+
+@pytest.mark.parametrize("preset", ["paper", "table1", "paper-gain2"])
+def test_the_sensitivity_peak_alone_is_that_of_all_margins(preset):
+    servo = Servo.preset(preset)
+    assert sensitivity_peak(servo.loop(), servo.closed_loop()) == servo.margins().Ms
+    unstable = servo.replace(Kp=1e3 * servo.controller.Kp)
+    assert sensitivity_peak(unstable.loop(), unstable.closed_loop()) == math.inf

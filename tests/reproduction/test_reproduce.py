@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from markupsafe import escape
 from rich.console import Console
 
 from servotwin.errors import InvalidInput
-from servotwin.report import page, style
+from servotwin.report import style
 from servotwin.reproduction import claims, figures, report, reproduce
 from servotwin.reproduction.claims import ClaimResult, Finding, Verdict
 from servotwin.reproduction.figures import DrawnFigure, backlash, observer
@@ -126,7 +127,7 @@ def test_the_report_holds_every_erratum():
     listed = report.errata()
     assert [erratum["id"] for erratum in listed] == [f"E{i}" for i in range(1, 22)]
     text = report.report([], [], "paper")
-    assert all(page.escape(erratum["decision"]) in text for erratum in listed)
+    assert all(str(escape(erratum["decision"])) in text for erratum in listed)
 
 
 def test_the_report_shows_verdicts_first_and_escapes_texts():

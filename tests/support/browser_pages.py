@@ -12,6 +12,8 @@ PICTURES = Path(__file__).parents[2] / "build" / "screenshots"
 AXE = (Path(__file__).parents[1] / "data" / "axe" / "axe.min.js").read_text(encoding="utf-8")
 OTHERS = 1000
 WAIT_MS = 30_000
+LARGEST_SHIFT = 0.01
+"""Cumulative layout shift that nobody notices; 0.1 counts as good on the web."""
 MARKUP = '<img src=x onerror="window.hacked=1"><script>window.hacked=1</script>'
 
 
@@ -32,6 +34,26 @@ class Twin:
 
     def restart(self) -> None:
         self.start(self.url.rpartition(":")[2])
+
+
+WATCH_SHIFTS = """new PerformanceObserver((list) => {
+    const part = (node) => `${node?.nodeName}.${node?.getAttribute?.("class") ?? ""}`;
+    const place = (rect) => [rect.x, rect.y, rect.width, rect.height].map(Math.round);
+    for (const entry of list.getEntries()) if (!entry.hadRecentInput) noteShift([
+        performance.timeOrigin, entry.startTime, entry.value,
+        entry.sources.map((each) => [part(each.node), place(each.previousRect), place(each.currentRect)])]);
+}).observe({ type: "layout-shift", buffered: true })"""
+"""Tells each shift without an input: load of the page (ms), time since then (ms), size, what moved from where."""
+
+
+def layout_shift(shifts):
+    """Largest cumulative layout shift of a page: that of the bursts with pauses under 1 s and of 5 s at most."""
+    largest, burst = 0.0, []
+    for origin, time_, size, _ in sorted(shifts, key=lambda each: each[:2]):
+        alone = not burst or origin != burst[0][0] or time_ - burst[-1][1] > 1000.0 or time_ - burst[0][1] > 5000.0
+        burst = [*([] if alone else burst), (origin, time_, size)]
+        largest = max(largest, sum(each[2] for each in burst))
+    return largest
 
 
 def has_text(page, selector, text):

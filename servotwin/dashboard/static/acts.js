@@ -9,8 +9,8 @@ const SAID = { hold: "held", release: "released", "roll back": "rolled back", "a
 export class ActsPanel {
   constructor(name, done) {
     Object.assign(this, { name, done, oversight: null });
-    this.state = element("p", { role: "status" });
-    this.waiting = element("p");
+    this.state = element("p", { class: "oversight", role: "status" });
+    this.waiting = element("p", { class: "waiting" });
     this.why = element("input", { type: "text", maxlength: 256, "aria-label": "Reason", placeholder: "Reason (kept with the act)" });
     this.version = element("select", { "aria-label": "Version to roll back to" });
     const button = (word, act, named) => element("button", { type: "button", on: { click: () => this.act(act(), named?.()) } }, word);
@@ -19,9 +19,9 @@ export class ActsPanel {
     this.approving = button("Approve", () => "approve", () => ({ window: this.oversight.proposal.window }));
     this.back = button("Roll back to", () => "roll back", () => ({ version: this.version.value === "fallback" ? null : Number(this.version.value) }));
     this.error = element("p", { class: "error", role: "alert" });
-    this.sent = element("p", { role: "status" });
+    this.sent = element("p", { class: "sent", role: "status" });
     this.form = element("div", { class: "acts", hidden: true }, this.why, this.holding, this.asking, this.approving, element("span", { class: "together" }, this.back, this.version));
-    this.list = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Acts" });
+    this.list = element("div", { class: "scroll list low", tabindex: "0", role: "region", "aria-label": "Acts" });
     this.content = [this.state, this.waiting, this.form, this.error, this.sent, this.list];
   }
 

@@ -18,6 +18,7 @@ const live = new Live(
   },
   (why) => {
     showState();
+    page?.update([]); // marks it stale
     askToken(why);
   },
 );
@@ -30,7 +31,7 @@ function showState() {
     away: live.why,
     ended: live.why,
   };
-  const kept = live.since === null ? "" : ` What is shown is of ${clock(live.since)}; trying again.`;
+  const kept = live.since === null ? "" : ` What is shown is of ${clock(live.since)}${live.state === "ended" ? "" : "; trying again"}.`;
   byId("state").textContent = words[live.state] + (live.state === "live" ? "" : kept);
 }
 
@@ -40,6 +41,7 @@ function askToken(why) {
   byId("login-why").textContent = why;
   form.hidden = false;
   byId("view").hidden = live.rows.size === 0;
+  form.classList.toggle("over", !byId("view").hidden); // what is shown stays where it is
   byId("logout").hidden = true;
   showState();
   byId("token").focus();

@@ -13,6 +13,7 @@ const WORDS = {
   live: ["Live", "Least and greatest sample of each column. The edge streams while a page like this one is looked at."],
   stale: ["Stale", "Nothing has come for a while: what is shown is old."],
   failed: ["Unknown", ""],
+  asking: ["Waiting", "The twin is being asked."],
 };
 
 export class LiveViewPanel {
@@ -28,7 +29,8 @@ export class LiveViewPanel {
     this.content = [element("p", { class: "live" }, this.word, " ", this.note), this.body];
     this.seen = () => this.schedule(0);
     document.addEventListener("visibilitychange", this.seen);
-    this.say("waiting", "Asking the twin …");
+    this.say("asking");
+    this.answered = new Promise((resolve) => { this.hasAnswered = resolve; });
     this.schedule(0);
   }
 
@@ -58,6 +60,7 @@ export class LiveViewPanel {
       this.say("failed", error.message);
     }
     this.asking = false;
+    this.hasAnswered();
     this.schedule(wait);
   }
 
@@ -65,7 +68,8 @@ export class LiveViewPanel {
     setText(this.word, WORDS[state][0]);
     setText(this.note, note ?? WORDS[state][1]);
     this.word.className = `mark ${{ live: "good", stale: "bad", failed: "bad" }[state] ?? "none"}`;
-    this.body.hidden = !["waiting", "live", "stale"].includes(state) && !this.columns.length;
+    // Once there it stays, so that nothing below moves when an edge comes and goes.
+    this.body.hidden &&= ["asking", "off"].includes(state);
     this.body.classList.toggle("stale", state !== "live" && this.columns.length > 0);
     if (!this.body.hidden && !this.columns.length) this.show(); // the place of what will come
   }

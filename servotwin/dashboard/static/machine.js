@@ -56,18 +56,18 @@ export class MachinePage {
       this.tiles[key] = [element("dd"), element("dd")];
       return element("div", { class: "fact" }, element("dt", {}, label), ...this.tiles[key]);
     };
-    this.alarms = element("ul", { class: "alarms", hidden: true, "aria-label": "Alarms of the last day" });
+    this.alarms = element("div", { class: "alarms", tabindex: "0", role: "region", "aria-label": "Alarms of the last day" }, "Reading …");
     this.trouble = element("p", { class: "error", role: "status" });
-    this.fileWords = element("p", { class: "error brief", role: "alert" });
+    this.fileWords = element("p", { class: "error", role: "alert" });
     this.choice = element("select", { "aria-label": "Window", on: { change: () => this.pick(this.choice.value) } });
     this.rate = element("button", { type: "button", on: { click: () => this.loadWindow(EVERY) } }, "Every sample");
     this.windowFile = element("a", { download: true }, "CSV");
-    this.windowNote = element("p", { class: "soft" });
-    this.rest = element("p", { role: "status" });
+    this.windowNote = element("p", { class: "soft window-note" });
+    this.rest = element("p", { class: "rest", role: "status" });
     this.loop = element("div", { class: "hysteresis" });
-    this.chain = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Updates" });
-    this.proof = element("div");
-    this.events = element("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Events" });
+    this.chain = element("div", { class: "scroll list", tabindex: "0", role: "region", "aria-label": "Updates" });
+    this.proof = element("div", { class: "list", tabindex: "0", role: "region", "aria-label": "Verification" });
+    this.events = element("div", { class: "scroll list low", tabindex: "0", role: "region", "aria-label": "Events" });
     this.blank = element("p", { class: "empty", hidden: true });
     const plot = (place, options) => {
       this.plots.push(new TimePlot(place, options));
@@ -80,7 +80,7 @@ export class MachinePage {
     this.acts = new ActsPanel(name, () => this.later());
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
-    this.content = element("div", {},
+    this.content = element("div", { class: "unread" },
       panel("Gap over time", [element("a", { href: api.gapsFile(name), download: true }, "CSV"), this.saver(() => api.gapsFile(name, "parquet"))],
         legend(["blue", "estimate"], ["blue band", "95 % interval"], ["green", "wear (trend)"], ["red dash", "limit"], ["orange", "version applied"], ["red dots", "version refused, or fallback"]),
         places.gap),
@@ -106,7 +106,7 @@ export class MachinePage {
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
     this.tilesList = element("dl", { class: "facts" },
       tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
-    this.view.replaceChildren(this.head, this.tilesList, this.alarms, this.trouble, this.fileWords, this.blank, this.content);
+    this.view.replaceChildren(this.head, this.tilesList, this.alarms, element("div", { class: "words" }, this.trouble, this.fileWords), this.blank, this.content);
     this.makePlots(plot, places);
     this.plots.push(...this.whatIf.plots, ...this.liveView.plots, ...this.residualPanel.plots);
   }
@@ -149,6 +149,9 @@ export class MachinePage {
     }
     this.facts();
     if (this.gaps) await this.show();
+    if (!this.content.classList.contains("unread")) return;
+    await Promise.race([this.liveView.answered, new Promise((resolve) => setTimeout(resolve, REFRESH_MS))]);
+    this.content.classList.remove("unread"); // as a whole: nothing moves while the parts come
   }
 
   // What the rows of the fleet tell: shown at once, and again with every event.
@@ -172,10 +175,10 @@ export class MachinePage {
     this.tile("link", link.word, [link.note ?? "", row.last_message === null ? "" : `last message ${ago(row.last_message, now)}`]);
     this.tiles.link[0].className = `mark ${link.kind}`;
     const lines = row.alarms.map((alarm) => `${stamp(alarm.time)}: ${alarm.sentence}`);
-    this.alarms.hidden = lines.length === 0;
+    this.alarms.classList.toggle("some", lines.length > 0);
     if (this.alarms.dataset.lines !== lines.join("\n")) {
       this.alarms.dataset.lines = lines.join("\n");
-      this.alarms.replaceChildren(...lines.map((line) => element("li", {}, line)));
+      this.alarms.replaceChildren(lines.length ? element("ul", {}, lines.map((line) => element("li", {}, line))) : "No alarm in the last day.");
     }
   }
 

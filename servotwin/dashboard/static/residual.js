@@ -22,8 +22,10 @@ export class ResidualPanel {
       ],
     });
     this.plots = [this.residual, this.correlation];
+    this.legend = legend(["blue", "position less the model's"]);
+    this.kind = this.legend.querySelector("span");
     this.body = element("div", { class: "two", hidden: true },
-      element("div", {}, legend(["blue", "position less the model's"]), places[0]),
+      element("div", {}, this.legend, places[0]),
       element("div", {}, legend(["orange", "of the residual"], ["blue", "after the noise model"], ["green dash", "95 % of white noise"]), places[1]));
     this.tools = [this.button];
     this.content = [
@@ -38,6 +40,8 @@ export class ResidualPanel {
     this.button.disabled = true;
     setText(this.error, "");
     setText(this.words, "Fitting the window …");
+    this.words.classList.add("begun");
+    this.body.hidden = false; // the place of what comes
     try {
       this.show(await api.residual(this.name, ...chosen), chosen);
     } catch (error) {
@@ -52,6 +56,7 @@ export class ResidualPanel {
     this.body.hidden = false;
     const [unit, factor] = smallUnit(found.rms, this.angular());
     setText(this.words, `Window number ${sequence}: ${told(found)} Root mean square ${brief(found.rms * factor)} ${unit}.`);
+    setText(this.kind, found.of === "motor" ? "motor's angle, at the load, less the model's" : "position less the model's");
     this.residual.options.yLabel = `Residual (${unit})`;
     this.residual.show([found.time, found.residual.map((value) => value * factor)], `Residual of the fit in ${unit}`);
     const lags = found.autocorrelation.map((_, i) => i + 1), band = (sign) => lags.map(() => sign * found.band);

@@ -42,6 +42,8 @@ export class WhatIfPanel {
     const { gap, setting } = this.known();
     setText(this.words, "");
     setText(this.note, "Starting the simulator …");
+    this.note.classList.add("begun");
+    this.body.hidden = false; // the place of what comes
     const { type: _type, ...gains } = setting?.gains ?? setting?.law ?? {};
     this.first = null;
     this.asked = { gap: gap ?? 0, tolerance: setting?.tolerance ?? 0, gains };

@@ -5,7 +5,8 @@ from servotwin.estimation.motor_side.estimator import (
     MotorSideSettings,
     check_reaction,
     estimate,
+    fit,
     shortest_window,
 )
 
-__all__ = ["METHOD", "MotorSideSettings", "check_reaction", "estimate", "shortest_window"]
+__all__ = ["METHOD", "MotorSideSettings", "check_reaction", "estimate", "fit", "shortest_window"]

@@ -16,7 +16,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, n
 from servotwin.estimation.motor_side.problem import MotorModel, MotorProblem
 from servotwin.estimation.motor_side.settings import MotorSideSettings
 from servotwin.estimation.motor_side.verdict import judge
-from servotwin.estimation.output_error.fit import search
+from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import Priors, ShaftModel
 from servotwin.estimation.output_error.verdict import JudgedFit
 from servotwin.estimation.window import Window
@@ -26,7 +26,7 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "MotorSideSettings", "check_reaction", "estimate", "shortest_window"]
+__all__ = ["METHOD", "MotorSideSettings", "check_reaction", "estimate", "fit", "shortest_window"]
 
 METHOD = "motor_side"
 SHORTEST = 400  # samples
@@ -103,17 +103,22 @@ def estimate(
     settings = settings or MotorSideSettings()
     check_reaction(axis)
     assert isinstance(axis, Axis)
-    theta_m, command = _checked(window.driven(axis.command_limit))
+    theta_m, _ = _checked(window.driven(axis.command_limit))
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     if float(np.ptp(theta_m)) == 0.0:
         return replace(blank, reasons=("theta_m is constant: nothing moved, or the sensor is dead",))
-    problem = _problem(window, theta_m, command, axis, settings)
-    expected = prior.gap if isinstance(prior, GapEstimate) else prior
     unit = 2.0 / axis.p
-    found = search(problem, (expected or 0.0) / unit)
+    found = fit(window, axis, prior, settings)
     verdict = judge(found, settings, unit)
     rms = float(np.sqrt(np.mean(found.best.raw**2)))
     return _stated(replace(blank, rms=rms, evaluations=found.best.evaluations), verdict, unit)
+
+
+def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: MotorSideSettings) -> Search:
+    """Fit a window as `estimate` does; raises InvalidInput as it does."""
+    theta_m, command = _checked(window.driven(axis.command_limit))
+    expected = prior.gap if isinstance(prior, GapEstimate) else prior
+    return search(_problem(window, theta_m, command, axis, settings), 0.5 * axis.p * (expected or 0.0))
 
 
 def _checked(window: Window) -> tuple[Array, Array]:

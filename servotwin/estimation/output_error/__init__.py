@@ -1,5 +1,5 @@
 """Output-error estimator of the gap of axes whose shaft is free in the gap, and of one mass behind a rigid screw."""
 
-from servotwin.estimation.output_error.estimator import METHOD, OutputErrorSettings, estimate, shortest_window
+from servotwin.estimation.output_error.estimator import METHOD, OutputErrorSettings, estimate, fit, shortest_window
 
-__all__ = ["METHOD", "OutputErrorSettings", "estimate", "shortest_window"]
+__all__ = ["METHOD", "OutputErrorSettings", "estimate", "fit", "shortest_window"]

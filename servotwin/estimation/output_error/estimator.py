@@ -18,8 +18,8 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
-from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.possible import possible_half
+from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
@@ -29,7 +29,7 @@ from servotwin.plant.basis import Play
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "OutputErrorSettings", "estimate", "shortest_window"]
+__all__ = ["METHOD", "OutputErrorSettings", "estimate", "fit", "shortest_window"]
 
 METHOD = "output_error"
 SHORTEST = 400  # samples
@@ -69,13 +69,26 @@ def estimate(
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
-    expected = prior.gap if isinstance(prior, GapEstimate) else prior
+    found, noise = _fit(window, theta_m, axis, prior, settings)
     at_motor, at_load, unit = _count_of_motor(axis, theta_m), _count_of_load(axis, window), 2.0 / axis.p
-    motor = MotorAngle(theta_m, 0.0) if axis.play is Play.FREE else without_noise(theta_m, at_motor)
-    problem = _problem(window, motor.angle, axis, settings)
-    found = search(problem, 0.5 * axis.p * (expected or 0.0))
     possible = possible_half(found, 0.5 * (axis.p * at_motor + at_load))
-    return _stated(blank, found, judge(found, settings, unit, possible, axis.p * motor.noise), unit)
+    return _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
+
+
+def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings) -> Search:
+    """Fit a window as `estimate` does; raises InvalidInput as it does."""
+    return _fit(window, _checked(window, axis), axis, prior, settings)[0]
+
+
+def _fit(
+    window: Window, theta_m: Array, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings
+) -> tuple[Search, float]:
+    """The fit of a window, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
+    free = axis.play is Play.FREE
+    motor = MotorAngle(theta_m, 0.0) if free else without_noise(theta_m, _count_of_motor(axis, theta_m))
+    expected = prior.gap if isinstance(prior, GapEstimate) else prior
+    problem = _problem(window, motor.angle, axis, settings)
+    return search(problem, 0.5 * axis.p * (expected or 0.0)), motor.noise
 
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
