@@ -286,7 +286,8 @@ def test_the_gaps_that_rounding_leaves_possible() -> None:
     assert abs(found.best.values[0] - half) > 10.0 * found.best.std(0, found.free)
     assert abs(possible.mean - half) < 2.0 * possible.std < 0.1 * half
     # A load with dynamics has no such profile.
-    assert possible_half(search(_problem(_short(), _angle(_short()), TWO_MASS, OutputErrorSettings()), 0.0), bound) is None
+    two_mass = _problem(_short(), _angle(_short()), TWO_MASS, OutputErrorSettings())
+    assert possible_half(search(two_mass, 0.0), bound) is None
 
 
 def _short() -> Window:

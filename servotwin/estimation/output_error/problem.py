@@ -114,7 +114,7 @@ class Problem:
             return np.zeros(size, dtype=bool)
         between = np.abs(np.diff(self.drive, 2)) / 8.0
         sharp = between > max(noise_of(self.position), self.count / math.sqrt(12.0))
-        near = np.convolve(sharp, np.ones(2 * reach - 1), "valid")[: size] > 0.5
+        near = np.convolve(sharp, np.ones(2 * reach - 1), "valid")[:size] > 0.5
         return near if float(np.mean(near)) < _SHARPEST else np.zeros(size, dtype=bool)
 
     def first(self) -> tuple[float, float]:
