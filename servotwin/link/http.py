@@ -78,7 +78,12 @@ class _PersistentConnection:
     def request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> _Response:
         """Send one request and return its response, of `limit` bytes at most; raises Unreachable."""
         with self._busy:
-            return self._request(method, path, body, headers, limit)
+            try:
+                return self._request(method, path, body, headers, limit)
+            finally:
+                # Where the socket was still being connected, `close` found none to shut down.
+                if self._closed:
+                    self.drop()
 
     def _request(self, method: str, path: str, body: bytes | None, headers: dict[str, str], limit: int) -> _Response:
         fresh = self._connection is None

@@ -139,7 +139,7 @@ def _encoding(path: Path) -> str:
     for mark, name in _BYTE_ORDER_MARKS.items():
         if begin.startswith(mark):
             return name
-    if begin[1::2].count(0) > len(begin) // 4 > 0:
+    if begin[1::2].count(0) > len(begin) // 4 > begin[::2].count(0):
         return "utf-16-le"
     if any(byte < 9 or 13 < byte < 32 for byte in begin):
         place = next(i for i, byte in enumerate(begin) if byte < 9 or 13 < byte < 32)

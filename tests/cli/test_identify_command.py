@@ -210,7 +210,7 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
     [
         (("missing.csv",), "is not there"),
         (("FOLDER",), "the suffix '' is not known"),
-        (("FOLDER/scenario.toml",), "allowed are .csv, .npz, .parquet"),
+        (("FOLDER/scenario.toml",), "allowed are .csv, .npz, .npy, .parquet"),
         (("FOLDER/run.npz", "--servo", "papre"), "papre"),
         (("FOLDER/run.npz", "--start", "-3"), "-3"),
         (("FOLDER/run.npz", "--start", "15.9", "--duration", "3"), "run.npz"),

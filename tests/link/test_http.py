@@ -193,6 +193,28 @@ def test_closing_ends_a_poll_under_way(twin: FakeTwin) -> None:
     release(link)
 
 
+def test_a_connection_made_while_the_link_closes_is_closed(twin: FakeTwin, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The socket does not exist yet when `close` looks for it."""
+    connecting, closed, made = threading.Event(), threading.Event(), []
+    connect = socket.create_connection
+
+    def slowly(*args: object, **options: object) -> socket.socket:
+        connecting.set()
+        assert closed.wait(10.0)
+        made.append(connect(*args, **options))  # type: ignore[arg-type]
+        return made[-1]
+
+    monkeypatch.setattr(socket, "create_connection", slowly)
+    link = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
+    thread = threading.Thread(target=link.deliver, args=(parcel(0),))
+    thread.start()
+    assert connecting.wait(10.0)
+    link.close()
+    closed.set()
+    thread.join(10.0)
+    assert made[0].fileno() == -1
+
+
 def test_deflate_is_used_where_it_helps() -> None:
     body = encode(window(0))
     small, encoding = deflated(body)

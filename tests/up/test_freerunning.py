@@ -155,7 +155,7 @@ def ask(file: Path, text: str, *values: str) -> list[tuple]:
         return database.execute(text, values).fetchall()
 
 
-def wait(until: object, patience: float = 120.0) -> None:
+def wait(until: object, patience: float = 400.0) -> None:
     assert callable(until)
     end = time.monotonic() + patience
     while not until():
