@@ -113,10 +113,15 @@ def _end_last_line(path: Path) -> None:
 
 
 def _batches() -> dict[str, Batch]:
-    from benchmarks import logs, shelf
+    from benchmarks import axis_presets, logs
     from benchmarks.policies import loops
 
-    return {loops.NAME: loops.BATCH, logs.NAME: logs.BATCH, f"{logs.NAME}-dynamics": logs.DYNAMICS, **shelf.BATCHES}
+    return {
+        loops.NAME: loops.BATCH,
+        logs.NAME: logs.BATCH,
+        f"{logs.NAME}-dynamics": logs.DYNAMICS,
+        **axis_presets.BATCHES,
+    }
 
 
 def main(arguments: Sequence[str]) -> None:

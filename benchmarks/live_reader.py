@@ -8,14 +8,14 @@ from threading import Event
 
 from servotwin.edge_process.live_view import LiveView
 from servotwin.edge_process.shared_samples import SampleReader
-from servotwin.link.claim import Held
+from servotwin.link.claim import HeldClaim
 from servotwin.messages.live import LiveColumns, encode_live
 
 
 class AlwaysWatched:
     """A twin at which somebody always watches."""
 
-    def send(self, columns: LiveColumns, claim: Held) -> bool:  # noqa: ARG002
+    def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:  # noqa: ARG002
         """Encode the columns, as for the wire."""
         encode_live(columns)
         return True
@@ -27,4 +27,4 @@ class AlwaysWatched:
 if __name__ == "__main__":
     os.nice(10)
     reader = SampleReader(int(sys.argv[1]))
-    LiveView(AlwaysWatched(), reader, "axis-1", float(sys.argv[2]), lambda: Held("bench", 1), Event()).run()
+    LiveView(AlwaysWatched(), reader, "axis-1", float(sys.argv[2]), lambda: HeldClaim("bench", 1), Event()).run()

@@ -20,9 +20,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.axis_presets import DUTIES
 from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
-from benchmarks.shelf import SHELF
 from servotwin.errors import InvalidInput
 from servotwin.estimation.driven_load.estimate import with_dynamics
 from servotwin.estimation.estimate import GapStatus
@@ -128,12 +128,12 @@ def _counted(values: Array, count: float) -> Array:
 
 def log_cases(name: str, count: int, seed: int) -> list[LogCase]:
     """Draw machines of a preset: gaps from two counts to a turn of the motor, slow motions and fast ones."""
-    place = list(SHELF).index(name)
+    place = list(DUTIES).index(name)
     return [_drawn(name, (seed, place, index)) for index in range(count)]
 
 
 def _drawn(name: str, seed: tuple[int, ...]) -> LogCase:
-    random, model, duty = np.random.default_rng([*seed, 0]), Axis.preset(name), SHELF[name]
+    random, model, duty = np.random.default_rng([*seed, 0]), Axis.preset(name), DUTIES[name]
     plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
     if random.random() < 0.5:
         plant = plant.replace(sensors=replace(plant.sensors, feedback="motor"))
@@ -251,7 +251,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
         *("doubtful", "lost\nmotion in", "gap in", "refused", "ok without\nan axis", "with an\naxis", "gap in"),
     ):
         result.add_column(heading, justify="right")
-    for name in (*SHELF, ""):
+    for name in (*DUTIES, ""):
         rows = [numbers for key, numbers in found.items() if not name or key.split("/")[1] == name]
         if rows:
             result.add_row(name or "all", *map(str, _line(rows)))
@@ -283,7 +283,7 @@ def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     )
 
 
-BATCH = Batch(_units, measured, _show, tuple(SHELF))
+BATCH = Batch(_units, measured, _show, tuple(DUTIES))
 """For `benchmarks.batch`."""
-DYNAMICS = Batch(_units, measured_with_dynamics, _show, tuple(SHELF))
+DYNAMICS = Batch(_units, measured_with_dynamics, _show, tuple(DUTIES))
 """The same with the dynamics of loads that swing, which take half a minute each."""

@@ -1,4 +1,4 @@
-"""Gaps from the motor's encoder and the command alone, on machines of presets that are drawn like those of the shelf.
+"""Gaps from the motor's encoder and the command alone, on machines of presets that are drawn like the axis presets.
 
 ``python -m benchmarks.motor_windows SEED COUNT [PRESET,...]`` prints a line for each window, and one for each preset.
 """
@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from benchmarks.shelf import SHELF, WORN, ShelfMachine, shelf_machines
+from benchmarks.axis_presets import DUTIES, WORN, PresetMachine, preset_machines
 from servotwin.estimation import motor_side
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.gap import estimate_gap
@@ -19,12 +19,12 @@ from servotwin.simulation import simulate
 
 PRESETS = ("two-mass-drive", "robot-joint", "gantry")
 _LEAST = 1.0
-"""Smallest gap over the healthy one; the largest is that of the shelf."""
+"""Smallest gap over the healthy one; the largest is that of the axis presets."""
 
 
-def motor_window(machine: ShelfMachine, worn: float) -> tuple[Window, float]:
+def motor_window(machine: PresetMachine, worn: float) -> tuple[Window, float]:
     """A window without the load's position of a machine under its own controller, and its total gap, rad."""
-    duty, rate = SHELF[machine.name], machine.rate
+    duty, rate = DUTIES[machine.name], machine.rate
     gap = worn * duty.gap / machine.model.p
     half = round(duty.half_period * rate) / rate
     run = simulate(machine.plant, 2.0 * half, reference=machine.reference, gap=gap, sample_rate=rate)
@@ -45,9 +45,9 @@ def judged(estimate: GapEstimate, gap: float, count: float) -> str:
 def main(seed: int, count: int, names: tuple[str, ...]) -> None:
     """Print windows and sums."""
     for name in names:
-        random = np.random.default_rng([seed, 77, list(SHELF).index(name)])
+        random = np.random.default_rng([seed, 77, list(DUTIES).index(name)])
         verdicts, errors, begun = list[str](), list[float](), time.process_time()
-        for machine in shelf_machines(name, count, seed):
+        for machine in preset_machines(name, count, seed):
             window, gap = motor_window(machine, float(random.uniform(_LEAST, WORN)))
             estimate = estimate_gap(window, machine.model, motor_side.METHOD)
             verdicts.append(judged(estimate, gap, machine.model.encoder_resolution))
@@ -55,7 +55,7 @@ def main(seed: int, count: int, names: tuple[str, ...]) -> None:
             errors += [abs(off)] if estimate.ok else []
             width = 0.5 * (estimate.interval[1] - estimate.interval[0]) / gap
             print(
-                f"{name} {gap * machine.model.p / SHELF[name].gap:.2f} x healthy: {verdicts[-1]} "
+                f"{name} {gap * machine.model.p / DUTIES[name].gap:.2f} x healthy: {verdicts[-1]} "
                 f"off {100.0 * off:+.2f} %, half-width {100.0 * width:.2g} % {'; '.join(estimate.reasons)}",
                 flush=True,
             )

@@ -367,7 +367,7 @@ def run_alone(config: EdgeConfig, end: socket.socket, run: str, samples: SampleR
 
 def _enter(lock: ExitStack, path: Path) -> None:
     """Wait for the lock and hold it; BlockingIOError after `_PREDECESSOR_S`."""
-    until, told = time.monotonic() + _PREDECESSOR_S, False
+    until, logged = time.monotonic() + _PREDECESSOR_S, False
     while True:
         try:
             lock.enter_context(locked(path))
@@ -375,9 +375,9 @@ def _enter(lock: ExitStack, path: Path) -> None:
         except BlockingIOError:
             if time.monotonic() >= until:
                 raise BlockingIOError(f"the link process before has not ended within {_PREDECESSOR_S:g} s") from None
-            if not told:
+            if not logged:
                 log("not locked", error="the link process before still runs; waiting for its end")
-                told = True
+                logged = True
         time.sleep(_LOCK_S)
 
 

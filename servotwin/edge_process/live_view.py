@@ -16,7 +16,7 @@ from typing import Protocol
 
 from servotwin.edge.outlet import CHANNELS
 from servotwin.edge_process.shared_samples import SampleReader
-from servotwin.link.claim import Held
+from servotwin.link.claim import HeldClaim
 from servotwin.link.transport import Refused, Unreachable
 from servotwin.messages import Refusal
 from servotwin.messages.checks import all_finite
@@ -32,7 +32,7 @@ _UNCLAIMED_S, _OLDER_TWIN_S = 0.5, 600.0
 class LiveLink(Protocol):
     """Connection to the twin, as `servotwin.link.http.LiveHttp`."""
 
-    def send(self, columns: LiveColumns, claim: Held) -> bool:
+    def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:
         """Send columns; without any, wait until somebody watches. Raises Refused or Unreachable."""
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class LiveView:
         samples: SampleReader,
         servo: str,
         rate: float,
-        claim: Callable[[], Held],
+        claim: Callable[[], HeldClaim],
         stopping: Event,
     ) -> None:
         self._link, self._samples, self._servo, self._rate = link, samples, servo, rate

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from servotwin import __version__
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.live_view import LiveLink
-from servotwin.link.claim import ClaimingTransport, ExclusiveTransport, Held, held_of
+from servotwin.link.claim import ClaimingTransport, ExclusiveTransport, HeldClaim
 from servotwin.link.sqlite_outbox import SqliteOutbox
 
 _CLAIM = "claim"
@@ -21,8 +21,8 @@ def exclusive_transport(config: EdgeConfig, outbox: SqliteOutbox, run: str) -> E
         return None
     make = _TRANSPORTS["mqtt" if twin.over_mqtt else "http"]
     # A link process that was restarted in the same run has the run's claim; one in a copied folder is another run.
-    stored = held_of((outbox.value(_CLAIM) or b"").decode())
-    held = stored if stored is not None and stored.run == run else Held(run)
+    stored = HeldClaim.from_text((outbox.value(_CLAIM) or b"").decode())
+    held = stored if stored is not None and stored.run == run else HeldClaim(run)
     return ExclusiveTransport(
         make(config, twin, run),
         config.agent.servo,

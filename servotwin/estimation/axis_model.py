@@ -8,7 +8,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 
@@ -17,7 +17,7 @@ _LEAST_MASSES = 2
 
 def has_servo(axis: Axis) -> bool:
     """True where a `Servo` can stand for the axis: its driven end is held in the gap and drives two masses or more."""
-    return axis.play is not Play.FREE and axis.n >= _LEAST_MASSES
+    return axis.backlash_kind is not BacklashKind.FREE and axis.n >= _LEAST_MASSES
 
 
 def servo_for(plant: Plant) -> Servo | None:
@@ -40,7 +40,7 @@ def servo_of(axis: Axis) -> Servo:
         No servo stands for the axis.
     """
     if not has_servo(axis):
-        what = "a shaft that is free in the gap" if axis.play is Play.FREE else "one mass"
+        what = "a shaft that is free in the gap" if axis.backlash_kind is BacklashKind.FREE else "one mass"
         raise InvalidInput(
             f'axis with {what}: methods "whitened" and "paper" need a transmission that is held in the gap and at '
             'least 2 masses; leave the method out, or give method = "output_error"'

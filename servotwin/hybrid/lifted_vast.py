@@ -54,8 +54,8 @@ def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -
 
 
 @subroutine
-def _settle(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
-    """A high power of the map, from those of the vast scale in `w`, and what it leaves uneven."""
+def _find_settling(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> None:
+    """Find a high power of the map, from those of the vast scale in `w`, and the deviations that it leaves."""
     n, d, new = t.states, w.product, w.powers
     moving = w.moving[: w.movers[0]]
     part = w.half[: moving.size]
@@ -101,4 +101,4 @@ def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) ->
                 w.sums[(i * watches + watch) * n + j] = t.coarse[at + 3 * COARSE + 1 + i]
         add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
     fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
-    _settle(t, slot, watches, w)
+    _find_settling(t, slot, watches, w)

@@ -13,7 +13,7 @@ from threading import Lock
 from typing import Protocol
 
 from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
-from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
+from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
 _TRIES = 8
@@ -25,13 +25,13 @@ class ClaimingTransport(Transport, Protocol):
 
     Attributes
     ----------
-    claim : Held
+    claim : HeldClaim
         Named by every request from now on.
     """
 
-    claim: Held
+    claim: HeldClaim
 
-    def ask(self, claim: EdgeClaim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         """Send a question or a claim; None: the twin is of a version without claims.
 
         Raises
@@ -42,7 +42,7 @@ class ClaimingTransport(Transport, Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Held:
+class HeldClaim:
     """Claim that an edge holds.
 
     Parameters
@@ -61,13 +61,13 @@ class Held:
         """Text that a request carries; empty: no claim is held."""
         return f"{self.number} {self.run}" if self.number else ""
 
-
-def held_of(text: str) -> Held | None:
-    """Read a claim as `Held.text` writes it; None: it is none."""
-    number, _, run = text.partition(" ")
-    if not (number.isascii() and number.isdecimal() and len(number) <= 16 and run):
-        return None
-    return Held(run, int(number))
+    @staticmethod
+    def from_text(text: str) -> HeldClaim | None:
+        """Read a claim as `text` writes it; None: it is none."""
+        number, _, run = text.partition(" ")
+        if not (number.isascii() and number.isdecimal() and len(number) <= 16 and run):
+            return None
+        return HeldClaim(run, int(number))
 
 
 class ExclusiveTransport:
@@ -77,7 +77,7 @@ class ExclusiveTransport:
     ----------
     transport : ClaimingTransport
     servo : str
-    held : Held
+    held : HeldClaim
         Name of this run; with a number where an earlier link process of the same run has claimed.
     store : callable
         Called with a new claim, to be stored before it is used.
@@ -88,7 +88,7 @@ class ExclusiveTransport:
     ----------
     superseded : bool
         Another edge has taken over.
-    twin : Standing or None
+    twin : ClaimStatus or None
         The twin's last answer; None: there was none, or the twin is of a version without claims.
     """
 
@@ -96,18 +96,18 @@ class ExclusiveTransport:
         self,
         transport: ClaimingTransport,
         servo: str,
-        held: Held,
-        store: Callable[[Held], None] = lambda _: None,
+        held: HeldClaim,
+        store: Callable[[HeldClaim], None] = lambda _: None,
         software: str = "",
     ) -> None:
         self._transport, self._servo, self._store, self._software = transport, servo, store, software
-        self._held, self._settled, self._lock = held, False, Lock()
+        self._held, self._confirmed, self._lock = held, False, Lock()
         self.superseded = False
-        self.twin: Standing | None = None
+        self.twin: ClaimStatus | None = None
 
     def deliver(self, parcel: Parcel) -> None:
         """Send a message; raises Refused (SUPERSEDED) where another edge has taken over."""
-        self._settle()
+        self._confirm()
         try:
             self._transport.deliver(parcel)
         except (Refused, Unreachable) as error:
@@ -119,7 +119,7 @@ class ExclusiveTransport:
 
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages; raises Refused (SUPERSEDED) where another edge has taken over."""
-        self._settle()
+        self._confirm()
         try:
             return self._transport.listen(after)
         except (Refused, Unreachable) as error:
@@ -127,7 +127,7 @@ class ExclusiveTransport:
             raise
 
     @property
-    def claim(self) -> Held:
+    def claim(self) -> HeldClaim:
         """The claim that requests name; without number: the servo is not claimed, or the twin knows no claims."""
         return self._transport.claim
 
@@ -143,43 +143,43 @@ class ExclusiveTransport:
         """Ask again: the claim may not count any more, or the twin may be of another version when it is back."""
         superseded = isinstance(error, Refused) and error.reason is Refusal.SUPERSEDED
         if superseded or isinstance(error, Unreachable):
-            self._settled = False
+            self._confirmed = False
         if superseded:
-            self._settle()
+            self._confirm()
 
-    def _settle(self) -> None:
+    def _confirm(self) -> None:
         with self._lock:
-            if self._settled:
+            if self._confirmed:
                 return
             if self.superseded:  # for ever: an edge that took over again by itself would do so in turns with the other
                 self._ask(0)
                 raise Refused(Refusal.SUPERSEDED, SUPERSEDED)
             self._claim()
-            self._settled = True
+            self._confirmed = True
 
     def _claim(self) -> None:
-        standing = self._ask(0)
+        status = self._ask(0)
         for _ in range(_TRIES):
-            if standing is None:
-                self._transport.claim = Held()
+            if status is None:
+                self._transport.claim = HeldClaim()
                 return
-            if self._held.number and standing.run != self._held.run and standing.number >= self._held.number:
+            if self._held.number and status.run != self._held.run and status.number >= self._held.number:
                 self.superseded = True
                 raise Refused(Refusal.SUPERSEDED, SUPERSEDED)
-            if self._held.number or standing.run == self._held.run:
+            if self._held.number or status.run == self._held.run:
                 # A number below ours: the twin was restored from a backup, and takes ours over from our next request.
-                self._hold(max(standing.number, self._held.number))
+                self._hold(max(status.number, self._held.number))
                 return
-            standing = self._ask(standing.number + 1)
+            status = self._ask(status.number + 1)
         raise Unreachable("others claim this servo all the time")
 
     def _hold(self, number: int) -> None:
-        held = Held(self._held.run, number)
+        held = HeldClaim(self._held.run, number)
         if held != self._held:
             self._store(held)
         self._held = self._transport.claim = held
 
-    def _ask(self, takes: int) -> Standing | None:
+    def _ask(self, takes: int) -> ClaimStatus | None:
         question = EdgeClaim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software)
         self.twin = self._transport.ask(question)
         return self.twin

@@ -12,10 +12,10 @@ from urllib.parse import quote, urlsplit
 
 import msgspec
 
-from servotwin.link.claim import Held
+from servotwin.link.claim import HeldClaim
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
-from servotwin.messages import MAX_BYTES, Acknowledge, EdgeClaim, InvalidMessage, Refusal, Standing, decode, encode
+from servotwin.messages import MAX_BYTES, Acknowledge, ClaimStatus, EdgeClaim, InvalidMessage, Refusal, decode, encode
 from servotwin.messages.live import LiveColumns, decode_watched, encode_live
 
 if TYPE_CHECKING:
@@ -168,7 +168,7 @@ class LiveHttp:
         self._path, self._wait = f"/v1/servos/{quote(servo, safe='')}/live", wait_s
         self._connection = _PersistentConnection(url, token, timeout_s + wait_s, context)
 
-    def send(self, columns: LiveColumns, claim: Held) -> bool:
+    def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:
         """Send columns; without any, wait until somebody watches. Return True while somebody does.
 
         Raises
@@ -218,7 +218,7 @@ class HttpTransport:
     ) -> None:
         context = tls_context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
-        self.claim = Held()
+        self.claim = HeldClaim()
         self._up = _PersistentConnection(url, token, timeout_s, context)
         self._down = _PersistentConnection(url, token, timeout_s + wait_s, context)
 
@@ -245,19 +245,19 @@ class HttpTransport:
             _checked(self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES), (200,)).body
         )
 
-    def ask(self, claim: EdgeClaim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         """Send a question or a claim; see `ClaimingTransport`."""
         headers = {"Content-Type": BODY}
         response = self._up.request("POST", f"{self._base}/claim", encode(claim), headers, _LONGEST_RESPONSE)
         if response.status == 404 and _refusal_of(response) is Refusal.NOT_UNDERSTOOD:
             return None  # a twin of a version without claims has no such path
         try:
-            standing = decode(_checked(response, (200,)).body)
+            status = decode(_checked(response, (200,)).body)
         except InvalidMessage:
-            standing = None
-        if not isinstance(standing, Standing):
+            status = None
+        if not isinstance(status, ClaimStatus):
             raise Unreachable("the answer to a claim is none: whoever answers is not the twin")
-        return standing
+        return status
 
     def close(self) -> None:
         """Close both connections."""
@@ -265,7 +265,7 @@ class HttpTransport:
         self._down.close()
 
 
-def _claimed(claim: Held) -> dict[str, str]:
+def _claimed(claim: HeldClaim) -> dict[str, str]:
     return {CLAIM: claim.text} if claim.number else {}
 
 

@@ -14,7 +14,7 @@ from itertools import count
 from threading import Event, Lock
 
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
-from servotwin.link.claim import Held
+from servotwin.link.claim import HeldClaim
 from servotwin.link.mqtt_messages import (
     TWIN_GONE,
     MqttRequest,
@@ -32,7 +32,7 @@ from servotwin.link.mqtt_messages import (
 )
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import MAX_BYTES, EdgeClaim, InvalidMessage, Refusal, Standing
+from servotwin.messages import MAX_BYTES, ClaimStatus, EdgeClaim, InvalidMessage, Refusal
 
 _SESSION_S = 3600
 _NO_MESSAGE = 2**53
@@ -66,7 +66,7 @@ class MqttTransport:
         wait_s: float = 25.0,
         run: str = "",
     ) -> None:
-        self._servo, self._key, self.claim = servo, key_of(verifier_of(token)), Held()
+        self._servo, self._key, self.claim = servo, key_of(verifier_of(token)), HeldClaim()
         self._timeout, self._wait = timeout_s, wait_s
         # Serials begin at random, so that a response to an earlier process does not match a request of this one.
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
@@ -95,13 +95,13 @@ class MqttTransport:
             raise Unreachable("the answer to a poll holds no messages")
         return response.messages
 
-    def ask(self, claim: EdgeClaim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         """Send a question or a claim; see `ClaimingTransport`."""
         # In a poll for messages that there cannot be: a twin without claims answers it like any other.
         response = self._request(PollRequest(_NO_MESSAGE, 0.0, question=claim), self._timeout)
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a claim is none")
-        return response.standing
+        return response.claim_status
 
     def close(self) -> None:
         """Close the connection; requests under way raise `Unreachable`."""

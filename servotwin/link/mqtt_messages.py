@@ -10,10 +10,10 @@ import re
 from typing import Annotated, NamedTuple
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, field
 
 from servotwin.link.seal import OVERHEAD, TO_TWIN, Sealed, opened, seal
-from servotwin.messages import MAX_BYTES, EdgeClaim, InvalidMessage, Refusal, Standing
+from servotwin.messages import MAX_BYTES, ClaimStatus, EdgeClaim, InvalidMessage, Refusal
 from servotwin.messages.checks import Count
 
 ROOT = "servotwin"
@@ -72,10 +72,10 @@ class PutResponse(Struct, frozen=True, tag="taken/1"):
 
 
 class PollResponse(Struct, frozen=True, omit_defaults=True, tag="heard/1"):
-    """Response: messages, each sealed, with rising serials; `standing` is the answer to a question."""
+    """Response: messages, each sealed, with rising serials; `claim_status` is the answer to a question."""
 
     messages: list[bytes]
-    standing: Standing | None = None
+    claim_status: ClaimStatus | None = field(default=None, name="standing")
 
 
 class RefusedResponse(Struct, frozen=True, tag="refused/1"):

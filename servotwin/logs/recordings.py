@@ -81,10 +81,10 @@ class RecordedLog:
     found: Mapping[str, int]
 
 
-def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], object] = int) -> RecordedLog:
+def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int], object] = int) -> RecordedLog:
     """Read, find the columns and clean; a log of millions of samples is thinned while it is read.
 
-    `told` is called with the number of samples read so far.
+    `progress` is called with the number of samples read so far.
 
     Raises
     ------
@@ -112,7 +112,7 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
                 gathering.add(table.time[begin : begin + _BLOCK], part)
             except InvalidInput as error:
                 raise InvalidInput(f"log {path}: {error}") from None
-            told(gathering.samples)
+            progress(gathering.samples)
     clean = gathering.cleaned()
     _check_left(path, clean, gathering.samples, damaged)
     thinned = THINNED in clean.found

@@ -7,7 +7,7 @@ SI units throughout. Values that are not known, or bounds that do not exist, are
 """
 
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
-from servotwin.messages.claims import PROTOCOL, EdgeClaim, Standing
+from servotwin.messages.claims import PROTOCOL, ClaimStatus, EdgeClaim
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, encode
 from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
 from servotwin.messages.responses import LearntResponse
@@ -49,6 +49,7 @@ __all__ = [
     "CascadeGains",
     "Cause",
     "Channel",
+    "ClaimStatus",
     "EdgeClaim",
     "Fallback",
     "Gains",
@@ -68,7 +69,6 @@ __all__ = [
     "RequestOutcome",
     "Resend",
     "Setting",
-    "Standing",
     "Update",
     "Verification",
     "WindowMessage",

@@ -38,7 +38,7 @@ class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
     software: Text = ""
 
 
-class Standing(Struct, frozen=True, omit_defaults=True, tag="standing/1"):
+class ClaimStatus(Struct, frozen=True, omit_defaults=True, tag="standing/1"):
     """The newest claim of a servo that the twin knows.
 
     Attributes

@@ -9,7 +9,7 @@ from typing import cast, get_args
 import msgspec
 
 from servotwin.messages.checks import InvalidMessage, Refusal, require
-from servotwin.messages.claims import EdgeClaim, Standing
+from servotwin.messages.claims import ClaimStatus, EdgeClaim
 from servotwin.messages.legacy import LEGACY_TAGS, MAX_LEGACY_BYTES, upgrade
 from servotwin.messages.requests import Answer, Request, Resend
 from servotwin.messages.responses import LearntResponse
@@ -38,7 +38,7 @@ ParameterMessage = (
     | LearntResponse
     | Resend
     | EdgeClaim
-    | Standing
+    | ClaimStatus
 )
 Message = WindowMessage | ParameterMessage
 

@@ -28,11 +28,11 @@ from servotwin.plant.backlash import (
     screw_rate,
 )
 from servotwin.plant.basis import (
+    BacklashKind,
     Basis,
     GuardRow,
     LawNumbers,
     PlantNumbers,
-    Play,
     input_names,
     plant_names,
 )
@@ -363,7 +363,7 @@ class LoopModes(Generic[Piece]):
         torque[..., : shaft.torque.shape[-1]] = shaft.torque
         if np.any(shaft.direct):
             torque = torque + shaft.direct * zone.command
-        if self.servo.play is Play.FREE and contact.side:
+        if self.servo.backlash_kind is BacklashKind.FREE and contact.side:
             torque = torque - self.servo.p * screw_force(self.servo, basis, screw_rate(self.servo, basis, contact))
         return np.asarray(torque)
 

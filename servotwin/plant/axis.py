@@ -24,7 +24,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, ShaftMatrices, static_torque
 from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
-from servotwin.plant.basis import Guide, Play, Stribeck
+from servotwin.plant.basis import BacklashKind, Guide, Stribeck
 from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
 from servotwin.plant.law_loop import LawLoop, check_encoders
 from servotwin.plant.linear import LinearSystem
@@ -91,7 +91,7 @@ class Axis:
 
     @classmethod
     def preset(cls, name: str) -> Axis:
-        """An axis of the shelf; each file names the source of every number.
+        """An axis that is packaged; its file names the source of every number.
 
         Raises
         ------
@@ -101,7 +101,7 @@ class Axis:
         if name not in AXES:
             hint = did_you_mean(name, AXES)
             raise InvalidInput(f"preset {name!r} does not exist{hint}; give one of {', '.join(AXES)}")
-        text = resources.files("servotwin.plant").joinpath("shelf", f"{name}.toml").read_text(encoding="utf-8")
+        text = resources.files("servotwin.plant").joinpath("presets", f"{name}.toml").read_text(encoding="utf-8")
         return cls.loads(text, f"{name}.toml")
 
     @classmethod
@@ -144,9 +144,9 @@ class Axis:
         return self.transmission.p
 
     @property
-    def play(self) -> Play:
+    def backlash_kind(self) -> BacklashKind:
         """Kind of the backlash."""
-        return self.transmission.play
+        return self.transmission.backlash_kind
 
     @property
     def rigid(self) -> bool:
@@ -211,7 +211,7 @@ class Axis:
     def __repr__(self) -> str:
         """Parts in one line."""
         kind, masses = type(self.actuator).__name__, f"{self.n} mass{'es' if self.n > 1 else ''}"
-        return f"<Axis, model {self.version}: {kind}, {self.play.value} screw, {masses}, {self.controller!r}>"
+        return f"<Axis, model {self.version}: {kind}, {self.backlash_kind.value} screw, {masses}, {self.controller!r}>"
 
     def chain(self) -> Chain:
         """Matrices of the load."""
@@ -222,7 +222,7 @@ class Axis:
 
         What is free in the gap rests where no force acts: a load on the ground at zero, a free one anywhere.
         """
-        if self.play is not Play.FREE:
+        if self.backlash_kind is not BacklashKind.FREE:
             return screw, self.chain().equilibrium(self.p * screw)
         screw = screw if self.load.free else 0.0
         return screw, np.concatenate([np.full(self.n, self.p * screw), np.zeros(self.n)])
@@ -316,7 +316,7 @@ class Axis:
     @property
     def takes_friction(self) -> bool:
         """True where Coulomb friction on the motor can be simulated."""
-        return self.play is not Play.HELD and bool(np.any(self.shaft().E))
+        return self.backlash_kind is not BacklashKind.HELD and bool(np.any(self.shaft().E))
 
     def with_position_resolution(self, resolution: float) -> Axis:
         """A copy whose measured position has another resolution, m (rotary: rad)."""

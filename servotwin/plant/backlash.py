@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled
-from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Play, outer, rows_times, scaled
+from servotwin.plant.basis import BacklashKind, Basis, GuardRow, PlantNumbers, outer, rows_times, scaled
 from servotwin.plant.signals import Array
 
 
@@ -98,13 +98,13 @@ OPEN = 1
 
 def contact_modes(servo: PlantNumbers) -> tuple[ContactMode, ...]:
     """All modes of the backlash."""
-    return _ELASTIC if servo.play is Play.HELD else _PLAIN
+    return _ELASTIC if servo.backlash_kind is BacklashKind.HELD else _PLAIN
 
 
 def screw_rate(servo: PlantNumbers, basis: Basis, contact: ContactMode) -> Array:
     """theta_d' of the play operator: in contact with the motor, less the half gap's own rate; zero in the gap and at
     rest on a flank (errata E3, E4). A free shaft relaxes in the gap: there its spring and damper balance."""
-    if contact.side == 0 and servo.play is Play.FREE:
+    if contact.side == 0 and servo.backlash_kind is BacklashKind.FREE:
         return _relaxing(servo, basis)
     if contact.side == 0 or contact.resting:
         return np.zeros(len(basis.names))
@@ -170,11 +170,11 @@ def contact_guards(
         free, pressed = (side * row - 0.5 * basis.row("gap''") for row in accelerations)
         return [GuardRow(pressed, flank, None, "contact", side), GuardRow(-free, "open", None, "release", side)]
     rate = screw_rate(servo, basis, contact)
-    if servo.play is Play.FREE:
+    if servo.backlash_kind is BacklashKind.FREE:
         # A flank pushes and never pulls.
         return [GuardRow(-side * screw_force(servo, basis, rate), "open", None, "release", side)]
     release = -side * rate - stopping
-    if servo.play is Play.RIGID:
+    if servo.backlash_kind is BacklashKind.RIGID:
         return [GuardRow(release, "open", resets[side], "release", side)]
     reset = resets[side].copy()
     # The motor stands on the flank and moves with it, at the rate of the half gap.

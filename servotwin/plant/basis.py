@@ -12,7 +12,7 @@ from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain
 
 
-class Play(Enum):
+class BacklashKind(Enum):
     """Kinds of backlash: what the driven side does inside the gap, and whether the load acts back on the motor."""
 
     RIGID = "rigid"
@@ -82,7 +82,7 @@ class PlantNumbers(Protocol):
         ...
 
     @property
-    def play(self) -> Play:
+    def backlash_kind(self) -> BacklashKind:
         """Kind of the backlash."""
         ...
 

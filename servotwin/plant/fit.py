@@ -12,7 +12,7 @@ from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import Actuator, DcMotor, Stepper, TorqueDrive, VelocityDrive, static_torque
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.load import Load
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.structure import Chain
@@ -87,7 +87,7 @@ def check_fit(actuator: Actuator, transmission: Transmission, load: Load, contro
 
 def _check_holding(actuator: Actuator, transmission: Transmission, load: Load) -> None:
     """Refuse a drive whose limit cannot hold the load."""
-    if actuator.limit is None or transmission.play is not Play.FREE:
+    if actuator.limit is None or transmission.backlash_kind is not BacklashKind.FREE:
         return
     if not static_torque(actuator):
         return

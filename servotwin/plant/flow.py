@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from servotwin.plant.backlash import ContactMode, screw_force, screw_rate
-from servotwin.plant.basis import Basis, PlantNumbers, Play, outer, rows_times, scaled
+from servotwin.plant.basis import BacklashKind, Basis, PlantNumbers, outer, rows_times, scaled
 from servotwin.plant.friction import StickSlipMode, resistance
 from servotwin.plant.signals import Array
 
@@ -29,7 +29,7 @@ def mechanical_flow(
     resisting = resistance(basis, stick_slip.motor, "friction", basis["speed"], servo.motor_stribeck)
     flow[..., motor, :] -= outer(shaft.E, resisting)
     flow[..., screw, :] = screw_rate(servo, basis, contact)
-    if contact.side == 0 and servo.play is Play.FREE:
+    if contact.side == 0 and servo.backlash_kind is BacklashKind.FREE:
         flow[..., states, states] = chain.A_open
     else:
         flow[..., states, states] = chain.A
@@ -38,7 +38,7 @@ def mechanical_flow(
     if contact.resting:
         # The motor moves with its flank, whose half gap changes at its own rate.
         flow[..., basis["speed"], :] = 0.5 * contact.side * basis.row("gap''")
-    elif contact.side and servo.play is not Play.RIGID:
+    elif contact.side and servo.backlash_kind is not BacklashKind.RIGID:
         force = screw_force(servo, basis, flow[..., screw, :])
         flow[..., motor, :] -= scaled(servo.p, outer(shaft.E, force))
     if stick_slip.motor.stuck:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Play, Stribeck
+from servotwin.plant.basis import BacklashKind, Basis, GuardRow, PlantNumbers, Stribeck
 from servotwin.plant.signals import Array
 
 # A motor has stopped at this part of the speed that its friction takes off (at which a DC motor's back EMF takes as
@@ -21,7 +21,7 @@ _STOPPED = 1e-9
 
 
 @dataclass(frozen=True)
-class Grip:
+class FrictionState:
     """State of one friction: stuck, sliding in a direction, or none (side 0); slow: where it falls with the speed."""
 
     name: str
@@ -34,8 +34,8 @@ class Grip:
 class StickSlipMode:
     """A mode of the frictions of motor and last mass."""
 
-    motor: Grip
-    load: Grip
+    motor: FrictionState
+    load: FrictionState
 
     @property
     def name(self) -> str:
@@ -43,11 +43,11 @@ class StickSlipMode:
         return ", ".join(filter(None, (self.motor.name, self.load.name)))
 
 
-SMOOTH = Grip("")
-_COULOMB = (Grip("stick", stuck=True), Grip("slip -", -1), Grip("slip +", 1))
-_LOAD = (Grip("load stick", stuck=True), Grip("load slip -", -1), Grip("load slip +", 1))
-_SLOW = (Grip("slow -", -1, slow=True), Grip("slow +", 1, slow=True))
-_LOAD_SLOW = (Grip("load slow -", -1, slow=True), Grip("load slow +", 1, slow=True))
+SMOOTH = FrictionState("")
+_COULOMB = (FrictionState("stick", stuck=True), FrictionState("slip -", -1), FrictionState("slip +", 1))
+_LOAD = (FrictionState("load stick", stuck=True), FrictionState("load slip -", -1), FrictionState("load slip +", 1))
+_SLOW = (FrictionState("slow -", -1, slow=True), FrictionState("slow +", 1, slow=True))
+_LOAD_SLOW = (FrictionState("load slow -", -1, slow=True), FrictionState("load slow +", 1, slow=True))
 FRICTIONLESS = StickSlipMode(SMOOTH, SMOOTH)
 
 
@@ -60,7 +60,7 @@ def stick_slip_modes(servo: PlantNumbers, friction: bool) -> tuple[StickSlipMode
         There is friction on an elastic screw that is held in the gap, on the motor of a drive that follows its command
         whatever the load, or on a single mass that follows a rigid transmission.
     """
-    if friction and servo.play is Play.HELD:
+    if friction and servo.backlash_kind is BacklashKind.HELD:
         raise InvalidInput("friction with an elastic screw that is held in the gap: needs a rigid screw (k_d = inf)")
     if friction and not np.any(servo.shaft().E):
         raise InvalidInput("friction on the motor of a drive that follows its command whatever the load: must be 0 N m")
@@ -69,16 +69,18 @@ def stick_slip_modes(servo: PlantNumbers, friction: bool) -> tuple[StickSlipMode
             "friction of a load that is one mass behind a rigid transmission acts on nothing: must be 0; "
             "give the friction at the motor instead"
         )
-    motors = _grips(_COULOMB, _SLOW, servo.motor_stribeck) if friction else (SMOOTH,)
-    loads = _grips(_LOAD, _LOAD_SLOW, servo.guide.stribeck) if servo.guide.friction else (SMOOTH,)
+    motors = _states(_COULOMB, _SLOW, servo.motor_stribeck) if friction else (SMOOTH,)
+    loads = _states(_LOAD, _LOAD_SLOW, servo.guide.stribeck) if servo.guide.friction else (SMOOTH,)
     return tuple(StickSlipMode(motor, load) for motor in motors for load in loads)
 
 
-def _grips(grips: tuple[Grip, ...], slow: tuple[Grip, ...], stribeck: Stribeck) -> tuple[Grip, ...]:
-    return grips + slow if np.any(stribeck.slope) else grips
+def _states(
+    states: tuple[FrictionState, ...], slow: tuple[FrictionState, ...], stribeck: Stribeck
+) -> tuple[FrictionState, ...]:
+    return states + slow if np.any(stribeck.slope) else states
 
 
-def resistance(basis: Basis, grip: Grip, friction: str, speed: int, stribeck: Stribeck) -> Array:
+def resistance(basis: Basis, state: FrictionState, friction: str, speed: int, stribeck: Stribeck) -> Array:
     """Row of the friction (N m or N) against the motion of what slides.
 
     Parameters
@@ -88,11 +90,11 @@ def resistance(basis: Basis, grip: Grip, friction: str, speed: int, stribeck: St
     speed : int
         Place of the speed among the states.
     """
-    sliding = grip.side * basis.row(friction)
-    if not grip.slow:
+    sliding = state.side * basis.row(friction)
+    if not state.slow:
         return sliding
     return np.asarray(
-        sliding + grip.side * basis.row(f"{friction} drop") - stribeck.slope * np.eye(len(basis.names))[speed]
+        sliding + state.side * basis.row(f"{friction} drop") - stribeck.slope * np.eye(len(basis.names))[speed]
     )
 
 
@@ -108,13 +110,13 @@ def stick_slip_guards(
     """
     motor, load = mode.motor, mode.load
     shaft = _sliding(basis, basis["speed"], "friction", stopping_speed(servo, basis, mode))
-    motors = _grips(_COULOMB, _SLOW, servo.motor_stribeck)
+    motors = _states(_COULOMB, _SLOW, servo.motor_stribeck)
     ends = [_ended(mode, "motor", guard) for guard in _guards(basis, motor, motors, shaft, torque)]
     if load is SMOOTH:
         return ends
     threshold = _STOPPED * servo.guide.yielding * basis.row("load friction")
     mass = _sliding(basis, basis.last_speed(servo), "load friction", threshold)
-    loads = _grips(_LOAD, _LOAD_SLOW, servo.guide.stribeck)
+    loads = _states(_LOAD, _LOAD_SLOW, servo.guide.stribeck)
     return ends + [_ended(mode, "load", guard) for guard in _guards(basis, load, loads, mass, force)]
 
 
@@ -134,35 +136,37 @@ def _sliding(basis: Basis, speed: int, friction: str, stopping: Array | float) -
     return _Sliding(speed, static, stopping, basis.row(f"{friction} stribeck"))
 
 
-def _guards(basis: Basis, grip: Grip, grips: tuple[Grip, ...], body: _Sliding, drive: Array) -> list[GuardRow]:
-    stick = grips[0]
-    # What begins to slide is slow at first; without a drop there is one grip of each side.
-    backwards, forwards = grips[-2:]
-    if grip.stuck:
+def _guards(
+    basis: Basis, state: FrictionState, states: tuple[FrictionState, ...], body: _Sliding, drive: Array
+) -> list[GuardRow]:
+    stick = states[0]
+    # What begins to slide is slow at first; without a drop there is one state of each side.
+    backwards, forwards = states[-2:]
+    if state.stuck:
         return [
             GuardRow(s * drive - body.friction, (forwards if s > 0 else backwards).name, None, "slip", s)
             for s in (1, -1)
         ]
-    if grip.side == 0:
+    if state.side == 0:
         return []
     size = len(basis.names)
-    faster = grip.side * np.eye(size)[body.speed] - body.stribeck
-    if not grip.slow and len(grips) > len(_COULOMB):
-        return [GuardRow(-faster, (backwards if grip.side < 0 else forwards).name, None, "stribeck", 0)]
+    faster = state.side * np.eye(size)[body.speed] - body.stribeck
+    if not state.slow and len(states) > len(_COULOMB):
+        return [GuardRow(-faster, (backwards if state.side < 0 else forwards).name, None, "stribeck", 0)]
     # A reversal goes through the stuck mode within the instant.
     still = np.eye(size)
     still[body.speed] = 0.0
-    stopped = -grip.side * np.eye(size)[body.speed] - body.stopping
-    ends = [GuardRow(stopped, stick.name, still, "stick", grip.side)]
-    if grip.slow:
-        ends.append(GuardRow(faster, grips[1 if grip.side < 0 else 2].name, None, "stribeck", grip.side))
+    stopped = -state.side * np.eye(size)[body.speed] - body.stopping
+    ends = [GuardRow(stopped, stick.name, still, "stick", state.side)]
+    if state.slow:
+        ends.append(GuardRow(faster, states[1 if state.side < 0 else 2].name, None, "stribeck", state.side))
     return ends
 
 
 def _ended(mode: StickSlipMode, body: str, guard: GuardRow) -> GuardRow:
     """A guard of one body, to the mode of both."""
-    grip = next(each for each in (*_COULOMB, *_LOAD, *_SLOW, *_LOAD_SLOW) if each.name == guard.target)
-    return guard._replace(target=replace(mode, **{body: grip}).name)
+    state = next(each for each in (*_COULOMB, *_LOAD, *_SLOW, *_LOAD_SLOW) if each.name == guard.target)
+    return guard._replace(target=replace(mode, **{body: state}).name)
 
 
 def stopping_speed(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) -> Array | float:

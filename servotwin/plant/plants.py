@@ -49,12 +49,22 @@ def structure_of(plant: Plant) -> tuple[object, ...]:
     """Make the key that plants share whose automata have the same states and modes."""
     if isinstance(plant, Servo):
         # Machines are drawn by the hundred: their matrices are not made for this.
-        return type(plant), plant.n, plant.play
+        return type(plant), plant.n, plant.backlash_kind
     guide, damped = plant.guide, bool(np.any(plant.chain().reaction_velocity))
     forces = bool(guide.friction), bool(guide.force), bool(plant.motor_friction), plant.command_limit is not None
     falling = bool(plant.motor_stribeck.slope), bool(guide.stribeck.slope)
     hangs = math.copysign(1.0, guide.force) if abs(guide.force) > guide.friction + guide.stribeck.drop else 0.0
-    return type(plant), hangs, plant.n, plant.play, damped, plant.shaft().names, plant.at_motor, *forces, *falling
+    return (
+        type(plant),
+        hangs,
+        plant.n,
+        plant.backlash_kind,
+        damped,
+        plant.shaft().names,
+        plant.at_motor,
+        *forces,
+        *falling,
+    )
 
 
 def check_homogeneous(plant: Plant, described: str) -> None:

@@ -6,7 +6,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from servotwin.plant.basis import PlantNumbers, Play
+from servotwin.plant.basis import BacklashKind, PlantNumbers
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain
 
@@ -61,7 +61,7 @@ def rest_under_force(plant: Resting, gap: float, screw: float) -> Rest | None:
     guide = plant.guide
     if abs(guide.force) <= guide.friction + guide.stribeck.drop:
         return None
-    if plant.play is not Play.FREE:
+    if plant.backlash_kind is not BacklashKind.FREE:
         load, end = _chain_at_rest(plant, screw if plant.at_motor else None)
         return _held(plant, Rest(np.zeros(0), end, load, 0.0, 0), end - screw, 0.0)
     if plant.at_motor:

@@ -23,7 +23,7 @@ from servotwin.control.laws import AnyController, filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import ShaftMatrices
-from servotwin.plant.basis import Guide, Play, Stribeck
+from servotwin.plant.basis import BacklashKind, Guide, Stribeck
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
@@ -301,9 +301,9 @@ class Servo:
     motor_stribeck, command_limit = Stribeck(), None
 
     @property
-    def play(self) -> Play:
+    def backlash_kind(self) -> BacklashKind:
         """Kind of the backlash: the screw is held in the gap."""
-        return Play.RIGID if self.rigid else Play.HELD
+        return BacklashKind.RIGID if self.rigid else BacklashKind.HELD
 
     @cached_property
     def version(self) -> str:

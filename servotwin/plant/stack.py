@@ -17,7 +17,7 @@ from servotwin.hybrid.automaton import AutomatonStack
 from servotwin.plant.actuator import ShaftMatrices, stacked
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
 from servotwin.plant.axis import Axis
-from servotwin.plant.basis import Play, Stribeck
+from servotwin.plant.basis import BacklashKind, Stribeck
 from servotwin.plant.motor import Motor
 from servotwin.plant.plants import Plant
 from servotwin.plant.rest import Rest
@@ -49,7 +49,7 @@ class PlantStack:
     """Numbers of servos that have one structure: the number of masses, and a rigid or an elastic screw."""
 
     def __init__(self, servos: Sequence[Plant]) -> None:
-        self.count, self.n, self.play = len(servos), servos[0].n, servos[0].play
+        self.count, self.n, self.backlash_kind = len(servos), servos[0].n, servos[0].backlash_kind
         self.at_motor, self.guide = servos[0].at_motor, servos[0].guide
         self.command_limit = servos[0].command_limit
         self.motor_stribeck = _stacked_stribeck([each.motor_stribeck for each in servos])
@@ -65,14 +65,14 @@ class PlantStack:
             np.array([_spread(getattr(servo, name), self.n) for servo in servos], dtype=float)
             for name in ("m", "k", "c")
         )
-        rigid = self.play is Play.RIGID
+        rigid = self.backlash_kind is BacklashKind.RIGID
         self._chain = chain(m, k, c, math.inf if rigid else np.array([servo.k_d for servo in servos]))
         self._shaft = Motor(*(np.array([getattr(servo, name) for servo in servos]) for name in Motor._fields)).shaft()
 
     def _stack_axes(self, axes: Sequence[Axis]) -> None:
         m, k, c = (np.array([getattr(axis.load, name) for axis in axes]) for name in ("m", "k", "c"))
         k_d, c_d = (np.array([getattr(axis.transmission, name) for axis in axes]) for name in ("k_d", "c_d"))
-        rigid = self.play is Play.RIGID
+        rigid = self.backlash_kind is BacklashKind.RIGID
         self._chain = chain(m, k, c, math.inf if rigid else k_d, 0.0 if rigid or not c_d.any() else c_d)
         self._shaft = stacked([axis.shaft() for axis in axes])
         if axes[0].guide.friction or axes[0].guide.force:

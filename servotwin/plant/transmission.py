@@ -6,10 +6,10 @@ import math
 from dataclasses import dataclass
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.numbers import a_number
 
-HELD, FREE = Play.HELD.value, Play.FREE.value
+HELD, FREE = BacklashKind.HELD.value, BacklashKind.FREE.value
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Transmission:
             raise InvalidInput(
                 'transmission in_gap = "free": needs a finite stiffness k_d; a rigid transmission is held in the gap'
             )
-        if self.c_d > 0.0 and self.play is not Play.FREE:
+        if self.c_d > 0.0 and self.backlash_kind is not BacklashKind.FREE:
             raise InvalidInput(
                 f'transmission damping (c_d) = {self.c_d!r}: only a transmission that is "free" in the gap has it'
             )
@@ -66,8 +66,8 @@ class Transmission:
         return math.isinf(self.k_d)
 
     @property
-    def play(self) -> Play:
+    def backlash_kind(self) -> BacklashKind:
         """Kind of the backlash."""
         if self.in_gap == FREE:
-            return Play.FREE
-        return Play.RIGID if self.rigid else Play.HELD
+            return BacklashKind.FREE
+        return BacklashKind.RIGID if self.rigid else BacklashKind.HELD

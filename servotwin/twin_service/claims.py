@@ -8,8 +8,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
-from servotwin.link.claim import held_of
-from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
+from servotwin.link.claim import HeldClaim
+from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
 from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import Store
@@ -80,7 +80,7 @@ class EdgeClaims:
         """
         if not text:
             return
-        held = held_of(text)
+        held = HeldClaim.from_text(text)
         if held is None:
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the claim is none: a number and the name of a run")
         newest = await self._newest(servo)
@@ -91,7 +91,7 @@ class EdgeClaims:
         if (held.run, held.number) != newest:
             raise RequestRejected(Refusal.SUPERSEDED, _SUPERSEDED)
 
-    async def answer(self, servo: str, claim: EdgeClaim) -> Standing:
+    async def answer(self, servo: str, claim: EdgeClaim) -> ClaimStatus:
         """Answer a question or a claim; raises RequestRejected as `check` does."""
         if claim.servo != servo:
             raise RequestRejected(Refusal.OTHER_NAME, f"the claim is of servo {claim.servo!r}, not of {servo!r}")
@@ -104,7 +104,7 @@ class EdgeClaims:
         elif claim.held and claim.run != newest.run and claim.held <= newest.number:
             await self._report(servo, claim, newest)
         limits = self._samples_per_window, self._bytes_per_day
-        return Standing(servo, newest.run, newest.number, PROTOCOL, self._software, *limits)
+        return ClaimStatus(servo, newest.run, newest.number, PROTOCOL, self._software, *limits)
 
     async def _take(self, servo: str, new: StoredClaim, before: StoredClaim) -> StoredClaim:
         newest = await self._write(servo, partial(self._store.raise_claim, servo, new, new.number))

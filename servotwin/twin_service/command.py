@@ -56,7 +56,7 @@ def serve(twin: TwinFile, store: Store, listener: socket.socket, pool: WorkerPoo
     raise_descriptor_limit()
     service = TwinService(twin, store, pool=pool)
     server = HttpServer(
-        twin.service, service.http_app(), service.end_streams, service.strangers, lambda: service.dispatching
+        twin.service, service.http_app(), service.end_streams, service.unauthenticated, lambda: service.dispatching
     )
     asyncio.run(server.serve([listener]))
 

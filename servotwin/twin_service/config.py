@@ -176,7 +176,7 @@ class ServiceConfig:
             "above it the edge keeps what is too much, and sends it later.",
         ),
     ] = 10_000.0
-    strangers: Annotated[
+    unauthenticated_connections: Annotated[
         int,
         key(
             minimum=1,
@@ -184,7 +184,7 @@ class ServiceConfig:
             help="Largest number of connections open at once that have shown no token and no dashboard's session.",
         ),
     ] = 8192
-    strangers_per_address: Annotated[
+    unauthenticated_per_address: Annotated[
         int,
         key(
             minimum=1,

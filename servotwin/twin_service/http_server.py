@@ -22,14 +22,14 @@ from servotwin.runtime.service_manager import ServiceManager
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import ABORT, HttpApp
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
-from servotwin.twin_service.strangers import Stranger, StrangerLimit
 from servotwin.twin_service.tls_handshakes import TlsHandshakes, address_of
+from servotwin.twin_service.unauthenticated import UnauthenticatedConnection, UnauthenticatedLimit
 
 _HEAD_BYTES, _HEAD_S = 32 * 1024, 20.0
 """Largest request line with headers, and s from its first byte (or the connection) to its last."""
 _DRAIN_BYTES, _DRAIN_S = 256 * 1024, 2.0
 """Rest of a body that is still received, and discarded, after its request was answered; then the connection ends. An
-edge whose token is no longer valid can so read its answer, and a stranger holds nothing."""
+edge whose token is no longer valid can so read its answer, and a client without one holds nothing."""
 _BACKLOG = 2048
 """Connections that wait to be accepted: after an outage all edges connect at once."""
 _BODY_MEMORY = 256 * 1024 * 1024
@@ -52,23 +52,23 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     _head = _unreported = _drained = 0
     _timer: asyncio.TimerHandle | None = None
     _drain_timer: asyncio.TimerHandle | None = None
-    _stranger: Stranger | None = None
+    _connection: UnauthenticatedConnection | None = None
 
-    def __init__(self, *, strangers: StrangerLimit | None, **options: Any) -> None:
+    def __init__(self, *, unauthenticated: UnauthenticatedLimit | None, **options: Any) -> None:
         super().__init__(**options)
-        self._strangers = strangers
+        self._unauthenticated = unauthenticated
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self._start_timer()
-        if self._strangers is not None:
-            self._stranger = self._strangers.enter(address_of(transport), transport.abort)
-            if self._stranger is None:
+        if self._unauthenticated is not None:
+            self._connection = self._unauthenticated.enter(address_of(transport), transport.abort)
+            if self._connection is None:
                 transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        if self._stranger is not None:
-            self._stranger.leave()
+        if self._connection is not None:
+            self._connection.leave()
         self._stop_timer()
         self._stop_drain()
         super().connection_lost(exc)
@@ -106,9 +106,9 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         self._unreported = 0
         self._stop_timer()
-        if self._stranger is not None:
+        if self._connection is not None:
             headers = dict(self.headers)
-            self._stranger.show(headers.get(b"authorization"), headers.get(b"cookie"))
+            self._connection.show(headers.get(b"authorization"), headers.get(b"cookie"))
         super().on_headers_complete()
 
     def on_message_complete(self) -> None:
@@ -228,7 +228,7 @@ class HttpServer(uvicorn.Server):
     app : HttpApp
     close_polls : callable
         Ends all long polls.
-    strangers : StrangerLimit or None
+    unauthenticated : UnauthenticatedLimit or None
         Limit of the connections that have shown no token.
     works : callable
         Test whether the service still does its work; where it does not, the service manager's watchdog restarts it.
@@ -239,12 +239,12 @@ class HttpServer(uvicorn.Server):
         config: ServiceConfig,
         app: HttpApp,
         close_polls: Callable[[], None],
-        strangers: StrangerLimit | None,
+        unauthenticated: UnauthenticatedLimit | None,
         works: Callable[[], bool],
     ) -> None:
-        super().__init__(_server_config(config, app, strangers))
+        super().__init__(_server_config(config, app, unauthenticated))
         self._handshakes: TlsHandshakes | None = None
-        self._most_handshakes = config.strangers
+        self._most_handshakes = config.unauthenticated_connections
         self._close_polls, self._works, self._manager = close_polls, works, ServiceManager()
 
     @contextmanager
@@ -263,7 +263,7 @@ class HttpServer(uvicorn.Server):
         return 0 if self._handshakes is None else self._handshakes.open
 
     def _limit_handshakes(self) -> None:
-        """Do TLS here: uvicorn leaves it to asyncio, without a limit that suits strangers."""
+        """Do TLS here: uvicorn leaves it to asyncio, without a limit that suits clients without a token."""
         context, make = self.config.ssl, self.config.http_protocol_class
         if context is not None:
             self._handshakes = TlsHandshakes(context, make, self._most_handshakes)
@@ -290,11 +290,11 @@ class HttpServer(uvicorn.Server):
         await super().shutdown(sockets)
 
 
-def _server_config(config: ServiceConfig, app: HttpApp, strangers: StrangerLimit | None) -> uvicorn.Config:
+def _server_config(config: ServiceConfig, app: HttpApp, unauthenticated: UnauthenticatedLimit | None) -> uvicorn.Config:
     """Configure uvicorn."""
     return uvicorn.Config(
         app,
-        http=partial(_LimitedHttpProtocol, strangers=strangers),  # type: ignore[arg-type]
+        http=partial(_LimitedHttpProtocol, unauthenticated=unauthenticated),  # type: ignore[arg-type]
         ws="none",
         lifespan="on",
         log_config=None,

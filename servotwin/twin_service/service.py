@@ -49,8 +49,8 @@ from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
-from servotwin.twin_service.strangers import StrangerLimit
 from servotwin.twin_service.twin_file import TwinFile
+from servotwin.twin_service.unauthenticated import UnauthenticatedLimit
 from servotwin.twin_service.what_if_process import WhatIfProcess
 from servotwin.twin_service.worker_pool import WorkerPool, pool_of
 
@@ -93,7 +93,7 @@ class TwinService:
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
         self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
-        self.strangers = StrangerLimit.of(config, self.access, self.operators)
+        self.unauthenticated = UnauthenticatedLimit.of(config, self.access, self.operators)
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
@@ -344,9 +344,13 @@ class TwinService:
         add = self.metrics.add_gauge
         waiting = "Messages and results that wait for their commit."
         add("servotwin_commit_waiting", waiting, lambda: self.commits.waiting)
-        strangers = self.strangers
-        if strangers is not None:
-            add("servotwin_strangers", "Connections that have shown no token.", lambda: strangers.open)
+        unauthenticated = self.unauthenticated
+        if unauthenticated is not None:
+            add(
+                "servotwin_unauthenticated_connections",
+                "Connections that have shown no token.",
+                lambda: unauthenticated.open,
+            )
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
         add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.feed.watchers)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)

@@ -25,7 +25,9 @@ def test_a_crowd_sends_every_window_until_it_is_acknowledged_and_notes_that(tmp_
             plan = CrowdPlan(port, tokens, 0.1, 2, tuple(encode(window(n)) for n in range(2)))
             crowd = asyncio.create_task(Crowd(plan, tmp_path, "c-1").run())
             await asyncio.sleep(0.2)
-            server = HttpServer(system.config, system.http_app(), system.polls.close, system.strangers, lambda: True)
+            server = HttpServer(
+                system.config, system.http_app(), system.polls.close, system.unauthenticated, lambda: True
+            )
             server.config.lifespan = "off"
             serving = asyncio.create_task(server.serve([listener]))
             async with asyncio.timeout(60.0):

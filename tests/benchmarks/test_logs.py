@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.axis_presets import DUTIES
 from benchmarks.log_files import WRITERS, damaged
 from benchmarks.logs import inside, log_cases, measured
-from benchmarks.shelf import SHELF
 from servotwin.logs.recordings import read_recording
 
 _TIME = np.arange(400) * 0.01
@@ -37,7 +37,7 @@ def test_every_defect_is_put_in_sooner_or_later() -> None:
 def test_a_case_is_the_same_however_many_are_drawn_and_is_answered() -> None:
     two, three = ([each.gap for each in log_cases("telescope", count, 7)] for count in (2, 3))
     assert two == three[:2]
-    assert all(each.gap > 0.0 and each.speed > 0.0 for name in SHELF for each in log_cases(name, 3, 7))
+    assert all(each.gap > 0.0 and each.speed > 0.0 for name in DUTIES for each in log_cases(name, 3, 7))
     case = replace(log_cases("stepper-stage", 1, 101)[0], file="arrays.npz")
     numbers = measured(case)
     assert numbers["status"] == "lost motion"

@@ -20,7 +20,7 @@ from servotwin.edge_process.config_file import load
 from servotwin.edge_process.link_process import LinkProcess, run_alone
 from servotwin.edge_process.monitoring import read_status, write_status
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.messages import Cause, Fallback, Resend, Setting, Standing
+from servotwin.messages import Cause, ClaimStatus, Fallback, Resend, Setting
 from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
 
@@ -43,7 +43,7 @@ def send(pipe: FrameSocket, sequence: int) -> None:
 @pytest.fixture
 def twin() -> Iterator[FakeTwin]:
     with FakeTwin("ax-1", "first") as twin:
-        twin.standing = Standing("ax-1")
+        twin.claim_status = ClaimStatus("ax-1")
         yield twin
 
 
@@ -60,8 +60,8 @@ def test_an_edge_that_was_superseded_keeps_its_windows_and_tells_the_control_pro
     try:
         send(pipe, 0)
         until(lambda: ("b1-aa", 0) in twin.windows)
-        assert twin.standing == Standing("ax-1", "b1-aa", 1)
-        twin.standing = Standing("ax-1", "b1-bb", 2)
+        assert twin.claim_status == ClaimStatus("ax-1", "b1-aa", 1)
+        twin.claim_status = ClaimStatus("ax-1", "b1-bb", 2)
         send(pipe, 1)
         found: list[frames.ToControl] = []
 
@@ -200,7 +200,7 @@ def test_an_edge_says_which_window_is_longer_than_its_twin_takes(
     process = LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-aa")
     assert process._transport is not None
     for samples in (0, 300, 299, 99):
-        process._transport.twin = Standing("ax-1", samples_per_window=samples, bytes_per_day=5)
+        process._transport.twin = ClaimStatus("ax-1", samples_per_window=samples, bytes_per_day=5)
         process._check()
     assert (read_status(tmp_path / "status.json") or {})["limits"] == {"samples_per_window": 99, "bytes_per_day": 5}
     process._end_all([])

@@ -16,7 +16,7 @@ from servotwin.edge_process.config import TwinLink
 from servotwin.edge_process.live_view import LiveView, live_column
 from servotwin.edge_process.shared_samples import SampleMemory, SampleReader
 from servotwin.errors import InvalidInput
-from servotwin.link.claim import Held
+from servotwin.link.claim import HeldClaim
 from servotwin.link.transport import Refused, Unreachable
 from servotwin.messages import Refusal
 from servotwin.messages.live import MAX_LIVE_COLUMNS, LiveColumns
@@ -44,7 +44,7 @@ class Link:
     def __init__(self, *answers: bool | Exception) -> None:
         self.answers, self.sent = list(answers), list[LiveColumns]()
 
-    def send(self, columns: LiveColumns, claim: Held) -> bool:
+    def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:
         assert claim.number
         self.sent.append(columns)
         answer = self.answers.pop(0)
@@ -56,7 +56,7 @@ class Link:
         pass
 
 
-def view(link: Link, memory: Memory, claim: Held = Held("b1", 1)) -> LiveView:  # noqa: B008
+def view(link: Link, memory: Memory, claim: HeldClaim = HeldClaim("b1", 1)) -> LiveView:  # noqa: B008
     return LiveView(link, memory.reader, "axis-1", RATE, lambda: claim, Event())
 
 
@@ -174,7 +174,7 @@ def test_a_twin_that_fails_ends_the_stream_and_is_asked_later(failure: Exception
 def test_without_a_claim_nothing_is_sent() -> None:
     with Memory() as memory:
         link = Link()
-        assert view(link, memory, Held("b1")).step() > 0.0
+        assert view(link, memory, HeldClaim("b1")).step() > 0.0
         assert link.sent == []
 
 

@@ -2,36 +2,36 @@
 
 import pytest
 
-from servotwin.link.claim import ExclusiveTransport, Held, held_of
+from servotwin.link.claim import ExclusiveTransport, HeldClaim
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.session import Sender, Session
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, Standing
+from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
 
 
 class Twin:
     """What the twin does with claims, in memory."""
 
     def __init__(self) -> None:
-        self.newest = Standing("axis")
+        self.newest = ClaimStatus("axis")
         self.claims: list[EdgeClaim] = []
         self.has_claims = self.there = True
 
-    def ask(self, claim: EdgeClaim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         self.claims.append(claim)
         if not self.there:
             raise Unreachable("away")
         if not self.has_claims:
             return None
         if claim.takes == self.newest.number + 1:
-            self.newest = Standing("axis", claim.run, claim.takes, self.newest.protocol)
+            self.newest = ClaimStatus("axis", claim.run, claim.takes, self.newest.protocol)
         return self.newest
 
-    def admit(self, held: Held) -> None:
+    def admit(self, held: HeldClaim) -> None:
         if not self.there:
             raise Unreachable("away")
         if held.number > self.newest.number:
-            self.newest = Standing("axis", held.run, held.number)
+            self.newest = ClaimStatus("axis", held.run, held.number)
         if held.number and (held.run, held.number) != (self.newest.run, self.newest.number):
             raise Refused(Refusal.SUPERSEDED, "superseded")
 
@@ -40,10 +40,10 @@ class Line:
     """A transport of one edge to that twin."""
 
     def __init__(self, twin: Twin) -> None:
-        self.twin, self.claim, self.sent = twin, Held(), 0
+        self.twin, self.claim, self.sent = twin, HeldClaim(), 0
         self.refusal: Refused | None = None
 
-    def ask(self, claim: EdgeClaim) -> Standing | None:
+    def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         return self.twin.ask(claim)
 
     def deliver(self, _parcel: Parcel) -> None:
@@ -63,9 +63,9 @@ class Line:
 PARCEL = Parcel("axis", b"body")
 
 
-def edge(twin: Twin, run: str, number: int = 0) -> tuple[ExclusiveTransport, list[Held]]:
-    stored: list[Held] = []
-    return ExclusiveTransport(Line(twin), "axis", Held(run, number), stored.append, "1.2"), stored
+def edge(twin: Twin, run: str, number: int = 0) -> tuple[ExclusiveTransport, list[HeldClaim]]:
+    stored: list[HeldClaim] = []
+    return ExclusiveTransport(Line(twin), "axis", HeldClaim(run, number), stored.append, "1.2"), stored
 
 
 def test_an_edge_claims_before_its_first_message_and_once() -> None:
@@ -74,7 +74,7 @@ def test_an_edge_claims_before_its_first_message_and_once() -> None:
     for _ in range(3):
         one.deliver(PARCEL)
         one.listen(0)
-    assert stored == [Held("b1-aa", 1)]
+    assert stored == [HeldClaim("b1-aa", 1)]
     assert [claim.takes for claim in twin.claims] == [0, 1]
     assert (twin.claims[0].protocol, twin.claims[0].software) == (PROTOCOL, "1.2")
 
@@ -122,7 +122,7 @@ def test_a_restarted_edge_takes_over_from_its_former_run() -> None:
     edge(twin, "b1-aa")[0].deliver(PARCEL)
     after, stored = edge(twin, "b2-cc")
     after.deliver(PARCEL)
-    assert stored == [Held("b2-cc", 2)]
+    assert stored == [HeldClaim("b2-cc", 2)]
 
 
 def test_a_claim_that_is_repeated_later_changes_nothing() -> None:
@@ -142,9 +142,9 @@ def test_a_twin_restored_from_a_backup_takes_the_claim_over_from_the_edge() -> N
     for run in ("b1-aa", "b2-bb", "b3-cc"):
         one, _ = edge(twin, run)
         one.deliver(PARCEL)
-    twin.newest = Standing("axis", "b1-aa", 1)
+    twin.newest = ClaimStatus("axis", "b1-aa", 1)
     one.deliver(PARCEL)
-    assert twin.newest == Standing("axis", "b3-cc", 3)
+    assert twin.newest == ClaimStatus("axis", "b3-cc", 3)
 
 
 def test_a_twin_without_claims_gets_messages_and_is_asked_again_after_it_was_away() -> None:
@@ -158,14 +158,14 @@ def test_a_twin_without_claims_gets_messages_and_is_asked_again_after_it_was_awa
         one.deliver(PARCEL)
     twin.there = twin.has_claims = True
     one.deliver(PARCEL)
-    assert stored == [Held("b1-aa", 1)]
+    assert stored == [HeldClaim("b1-aa", 1)]
 
 
 @pytest.mark.parametrize(("protocol", "kept"), [(None, True), (1, True), (PROTOCOL, False)])
 def test_what_an_older_twin_does_not_understand_is_kept(protocol: int | None, kept: bool) -> None:
     twin = Twin()
     twin.has_claims = protocol is not None
-    twin.newest = Standing("axis", protocol=protocol or 1)
+    twin.newest = ClaimStatus("axis", protocol=protocol or 1)
     outbox = MemoryOutbox()
     outbox.put_letter(b"letter")
     session = Session(outbox)
@@ -183,5 +183,5 @@ def test_what_an_older_twin_does_not_understand_is_kept(protocol: int | None, ke
 
 @pytest.mark.parametrize("text", ["", "7", "x b1", "-1 b1", "1 ", "99999999999999999999 b1"])
 def test_a_text_that_is_no_claim_is_none(text: str) -> None:
-    assert held_of(text) is None
-    assert held_of(Held("b1-aa", 7).text) == Held("b1-aa", 7)
+    assert HeldClaim.from_text(text) is None
+    assert HeldClaim.from_text(HeldClaim("b1-aa", 7).text) == HeldClaim("b1-aa", 7)

@@ -11,7 +11,7 @@ import pytest
 from faketwin import FakeTwin, Handler
 
 from servotwin.errors import InvalidInput
-from servotwin.link.claim import Held
+from servotwin.link.claim import HeldClaim
 from servotwin.link.http import HttpTransport, LiveHttp
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import Acknowledge, Hello, Refusal, Setting, WindowMessage, checksum, encode, pack_channel
@@ -291,16 +291,16 @@ def test_a_live_view_says_what_it_is_asked_and_that_an_older_twin_has_none(twin:
 
     try:
         twin.fault = answer
-        assert link.send(LiveColumns("axis-1"), Held("b1", 3))
-        assert not link.send(columns, Held("b1", 3))
+        assert link.send(LiveColumns("axis-1"), HeldClaim("b1", 3))
+        assert not link.send(columns, HeldClaim("b1", 3))
         path = "/v1/servos/axis-1/live"
         assert asked == [(f"{path}?wait=0.2", "3 b1", LiveColumns("axis-1")), (path, "3 b1", columns)]
         twin.fault = older
         with pytest.raises(Refused, match="without the live view") as refused:
-            link.send(columns, Held("b1", 3))
+            link.send(columns, HeldClaim("b1", 3))
         assert refused.value.reason is Refusal.UNKNOWN_SCHEMA
         twin.fault = proxy
         with pytest.raises(Unreachable, match="not the twin"):
-            link.send(columns, Held("b1", 3))
+            link.send(columns, HeldClaim("b1", 3))
     finally:
         link.close()

@@ -17,7 +17,7 @@ from relay import Relay, State, Weather
 
 from servotwin.link import mqtt_messages as wire
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
-from servotwin.link.claim import ExclusiveTransport, Held
+from servotwin.link.claim import ExclusiveTransport, HeldClaim
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Setting, encode
@@ -300,8 +300,8 @@ def test_without_a_broker_the_twin_is_unreachable() -> None:
 def test_a_second_edge_of_a_servo_takes_over_over_a_broker_too(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with twin(at, store) as there, edge(at, run="b1-aa") as first, edge(at, run="b1-bb") as second:
-        older = ExclusiveTransport(first, "axis-1", Held("b1-aa"))
-        newer = ExclusiveTransport(second, "axis-1", Held("b1-bb"))
+        older = ExclusiveTransport(first, "axis-1", HeldClaim("b1-aa"))
+        newer = ExclusiveTransport(second, "axis-1", HeldClaim("b1-bb"))
         older.deliver(parcel(0))
         newer.deliver(parcel(1))
         for _ in range(2):

@@ -27,7 +27,7 @@ def test_a_preset_is_stable_and_reads_back_as_it_was_written(name: str) -> None:
 @pytest.mark.parametrize("name", AXES)
 def test_every_number_of_a_preset_has_a_source_or_is_called_assumed(name: str) -> None:
     """The head of the file says where its numbers are from."""
-    folder = Path(st.__path__[0]) / "plant" / "shelf"
+    folder = Path(st.__path__[0]) / "plant" / "presets"
     head = (folder / f"{name}.toml").read_text(encoding="utf-8").split("[actuator]")[0]
     assert head.startswith(f"# {name}: ")
     assert "assumed" in head

@@ -148,7 +148,7 @@ def test_an_axis_agrees_with_an_independent_integrator(name: str) -> None:
 
 
 # Half period (s), amplitude (m or rad) and gap (rad) of each preset: about a healthy gap.
-SHELF = {
+MOTIONS = {
     "two-mass-drive": (1.0, 0.2, 0.02),
     "ball-screw": (0.1, 1e-3, 6.3e-3),
     "robot-joint": (0.4, 0.02, 0.092),
@@ -160,10 +160,10 @@ SHELF = {
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", SHELF)
+@pytest.mark.parametrize("name", MOTIONS)
 def test_a_preset_agrees_with_an_independent_integrator(name: str) -> None:
     """With a continuous law without limit, and ideal encoders: the oracle has neither."""
-    half_period, amplitude, gap = SHELF[name]
+    half_period, amplitude, gap = MOTIONS[name]
     axis = Axis.preset(name).replace(sample_rate=None, voltage_limit=None, sensors=Sensors())
     reference = SquareWave(amplitude, 2.0 * half_period)
     run = simulate(axis, 2.0 * half_period, reference=reference, gap=gap, sample_rate=100.0)
@@ -173,7 +173,7 @@ def test_a_preset_agrees_with_an_independent_integrator(name: str) -> None:
 
 
 def test_every_preset_is_measured_against_something() -> None:
-    assert {*SHELF, "emps"} == set(PRESETS)
+    assert {*MOTIONS, "emps"} == set(PRESETS)
 
 
 def test_the_published_axis_follows_a_ramp_as_its_published_numbers_say() -> None:

@@ -170,16 +170,16 @@ def options_of(degrees: float, volts: float, ki: float, zone: float | None, rate
 @given(**FRICTION_CASES)
 def test_stuck_is_stuck_and_slip_has_its_direction(**case: object) -> None:
     run = simulate(PAPER, 6.0, **options_of(**case))
-    grips = run.events[np.isin(run.events.kind, ["stick", "slip"])]
-    assert grips.kind[::2].tolist() == ["slip"] * len(grips[::2])
-    assert grips.kind[1::2].tolist() == ["stick"] * len(grips[1::2])
-    assert np.array_equal(grips.side[0::2][: len(grips) // 2], grips.side[1::2])
-    times = np.concatenate([[0.0], grips.time, [np.inf]])
+    changes = run.events[np.isin(run.events.kind, ["stick", "slip"])]
+    assert changes.kind[::2].tolist() == ["slip"] * len(changes[::2])
+    assert changes.kind[1::2].tolist() == ["stick"] * len(changes[1::2])
+    assert np.array_equal(changes.side[0::2][: len(changes) // 2], changes.side[1::2])
+    times = np.concatenate([[0.0], changes.time, [np.inf]])
     slack = 1e-12 * np.abs(run.theta_m).max()
     for k, (begin, end) in enumerate(itertools.pairwise(times)):
         moved = np.diff(run.theta_m[(run.time >= begin) & (run.time < end)])
         if k % 2:
-            assert np.all(grips.side[k - 1] * moved >= -slack)
+            assert np.all(changes.side[k - 1] * moved >= -slack)
         else:
             assert np.all(moved == 0.0)
     assert np.all(np.abs(run.theta_m - run.theta_d) <= 0.5 * run.gap + slack)

@@ -200,10 +200,10 @@ def test_many_swaps_in_one_run(rate: float | None) -> None:
     assert run.tolerance[[99, 100, 399, 400]] == pytest.approx(
         [PAPER.tolerance_for(math.radians(2.4)), 1e-5, 3e-5, 0.0]
     )
-    grips = run.events[np.isin(run.events.kind, ["stick", "slip"])]
-    assert len(grips) > 4
-    assert set(grips.kind[::2]) == {"slip"}
-    assert set(grips.kind[1::2]) == {"stick"}
+    changes = run.events[np.isin(run.events.kind, ["stick", "slip"])]
+    assert len(changes) > 4
+    assert set(changes.kind[::2]) == {"slip"}
+    assert set(changes.kind[1::2]) == {"stick"}
 
 
 @pytest.mark.parametrize("rate", RATES)

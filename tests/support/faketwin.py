@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import msgspec
 
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
-from servotwin.messages import Acknowledge, EdgeClaim, Message, Refusal, Standing, WindowMessage, decode, encode
+from servotwin.messages import Acknowledge, ClaimStatus, EdgeClaim, Message, Refusal, WindowMessage, decode, encode
 
 Fault = Callable[["Handler", bytes], bool]
 """Looks at a request; whether it has answered it (badly) itself."""
@@ -28,7 +28,7 @@ class FakeTwin:
         self.requests: Counter[str] = Counter()
         self.sealed: list[tuple[int, bytes]] = []
         self.fault: Fault | None = None
-        self.standing: Standing | None = None  # None: of a version without claims
+        self.claim_status: ClaimStatus | None = None  # None: of a version without claims
         self.on_window: Callable[[WindowMessage], None] = lambda _: None
         self.news, self.closed = threading.Condition(), False
         self.sockets: set[socket.socket] = set()
@@ -123,12 +123,12 @@ class Handler(BaseHTTPRequestHandler):
         self.answer(status, msgspec.msgpack.encode([encode(Acknowledge(message.servo, *key))]))
 
     def _answer_claim(self, claim: EdgeClaim) -> None:
-        newest = self.twin.standing
+        newest = self.twin.claim_status
         if newest is None:
             self.refuse(404, Refusal.NOT_UNDERSTOOD)
             return
         if claim.takes == newest.number + 1:
-            newest = self.twin.standing = Standing(claim.servo, claim.run, claim.takes)
+            newest = self.twin.claim_status = ClaimStatus(claim.servo, claim.run, claim.takes)
         self.answer(200, encode(newest))
 
     def _stopped(self, body: bytes) -> bool:
@@ -138,7 +138,7 @@ class Handler(BaseHTTPRequestHandler):
         if self.headers.get("Authorization") != f"Bearer {self.twin.token}":
             self.refuse(401, Refusal.BAD_TOKEN)
             return True
-        newest, claim = self.twin.standing, self.headers.get("Servotwin-Claim")
+        newest, claim = self.twin.claim_status, self.headers.get("Servotwin-Claim")
         if newest is not None and claim is not None and claim != f"{newest.number} {newest.run}":
             self.refuse(409, Refusal.SUPERSEDED)
             return True

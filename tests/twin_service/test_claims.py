@@ -9,29 +9,29 @@ import pytest
 from service_system import MSGPACK, OTHER, bearer, place, served, twin_file, window
 
 from servotwin import __version__
-from servotwin.link.claim import Held
-from servotwin.messages import PROTOCOL, EdgeClaim, Standing, decode, encode
+from servotwin.link.claim import HeldClaim
+from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, decode, encode
 
 PATH = "/v1/servos/ax-1/claim"
 
 
-async def ask(client: httpx.AsyncClient, claim: EdgeClaim) -> Standing:
+async def ask(client: httpx.AsyncClient, claim: EdgeClaim) -> ClaimStatus:
     response = await client.post(PATH, content=encode(claim), headers={**bearer(), **MSGPACK})
     assert response.status_code == 200, response.text
-    standing = decode(response.content)
-    assert isinstance(standing, Standing)
-    return standing
+    status = decode(response.content)
+    assert isinstance(status, ClaimStatus)
+    return status
 
 
 async def put(client: httpx.AsyncClient, sequence: int, boot: str, number: int, run: str | None = None) -> int:
     headers = {**bearer(), **MSGPACK}
     if number:
-        headers["servotwin-claim"] = Held(run or boot, number).text
+        headers["servotwin-claim"] = HeldClaim(run or boot, number).text
     message = window(sequence, boot=boot, start=0.0)
     return (await client.put(place(message), content=encode(message), headers=headers)).status_code
 
 
-async def listen(client: httpx.AsyncClient, held: Held, wait: float) -> int:
+async def listen(client: httpx.AsyncClient, held: HeldClaim, wait: float) -> int:
     headers = {**bearer(), "servotwin-claim": held.text}
     return (await client.get(f"/v1/servos/ax-1/outgoing?after=0&wait={wait}", headers=headers)).status_code
 
@@ -41,10 +41,10 @@ def test_a_copied_folder_is_refused_and_an_alarm_is_stored(tmp_path: Path, caplo
         async with served(twin_file(tmp_path)) as (system, client):
             limits = system.config.samples_per_window, round(1e6 * system.config.megabytes_per_day)
             told = await ask(client, EdgeClaim("ax-1", "one"))
-            assert told == Standing("ax-1", "", 0, PROTOCOL, __version__, *limits)
+            assert told == ClaimStatus("ax-1", "", 0, PROTOCOL, __version__, *limits)
             assert (await ask(client, EdgeClaim("ax-1", "one", 0, 1))).run == "one"
             assert await put(client, 0, "one", 1) == 201
-            poll = asyncio.create_task(listen(client, Held("one", 1), 20.0))
+            poll = asyncio.create_task(listen(client, HeldClaim("one", 1), 20.0))
             while not system.polls.open:
                 await asyncio.sleep(0.01)
             assert (await ask(client, EdgeClaim("ax-1", "two", 0, 2))).run == "two"

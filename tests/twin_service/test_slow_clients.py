@@ -24,7 +24,9 @@ def serving(folder: Path, service: str, body: Body) -> None:
     async def run() -> None:
         async with served(twin_file(folder, service)) as (system, _):
             listener = listening_socket(system.config)
-            server = HttpServer(system.config, system.http_app(), system.polls.close, system.strangers, lambda: True)
+            server = HttpServer(
+                system.config, system.http_app(), system.polls.close, system.unauthenticated, lambda: True
+            )
             server.config.lifespan = "off"
             task = asyncio.create_task(server.serve([listener]))
             try:
@@ -149,4 +151,4 @@ def test_handshakes_in_progress_are_bounded_and_leave_room_for_other_addresses(t
             writer.close()
         await asyncio.gather(*closed)
 
-    serving(tmp_path, f"{service}\nstrangers = 8", body)
+    serving(tmp_path, f"{service}\nunauthenticated_connections = 8", body)

@@ -19,7 +19,7 @@ from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.law_loop import check_encoders
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
@@ -62,7 +62,7 @@ def predictions(servo: Plant, gap: float, controller: AnyController | None = Non
     """
     law = law_of(servo.controller if controller is None else controller)
     _check(servo, law, gap)
-    if servo.play is Play.FREE:
+    if servo.backlash_kind is BacklashKind.FREE:
         return shaft_predictions(servo, gap, law)
     law = filtered_pid(law)
     loop = servo.loop(law)
@@ -85,7 +85,7 @@ def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
 
 def _check(servo: Plant, law: Law, gap: float) -> None:
     check_encoders(servo, law)
-    if servo.play is Play.HELD:
+    if servo.backlash_kind is BacklashKind.HELD:
         raise InvalidInput(
             "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), or a shaft that is free in "
             "the gap, since a held load that acts back only in contact is no function of the screw's angle"
@@ -196,7 +196,7 @@ def limit_cycle_near(
         Status CYCLE or, when the prediction leads to no orbit, IRREGULAR with the reason.
     """
     given = servo.controller if controller is None else controller
-    if servo.play is Play.FREE:
+    if servo.backlash_kind is BacklashKind.FREE:
         # What follows a contact of a shaft is no harmonic: the run from a larger swing leads to the orbit.
         return limit_cycle(servo, gap, None, controller=given, step=2.0 * prediction.amplitude)
     law = filtered_pid(given)

@@ -21,7 +21,7 @@ from servotwin.estimation.output_error.models import Priors, ShaftModel
 from servotwin.estimation.output_error.verdict import JudgedFit
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -51,7 +51,7 @@ def check_reaction(plant: Plant) -> None:
         load that is light beside the motor, or friction that falls with the speed.
     """
     needs = "the motor's encoder and the command do not show the gap"
-    if isinstance(plant, Servo) or plant.play is not Play.FREE:
+    if isinstance(plant, Servo) or plant.backlash_kind is not BacklashKind.FREE:
         why = (
             "rigid, so that in the model no load acts back on the motor, inside and outside of the gap alike"
             if plant.rigid

@@ -25,7 +25,7 @@ from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -84,7 +84,7 @@ def _fit(
     window: Window, theta_m: Array, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings
 ) -> tuple[Search, float]:
     """The fit of a window, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
-    free = axis.play is Play.FREE
+    free = axis.backlash_kind is BacklashKind.FREE
     motor = MotorAngle(theta_m, 0.0) if free else without_noise(theta_m, _count_of_motor(axis, theta_m))
     expected = prior.gap if isinstance(prior, GapEstimate) else prior
     problem = _problem(window, motor.angle, axis, settings)
@@ -103,7 +103,7 @@ def _checked(window: Window, axis: Axis | Servo) -> Array:
             f"method {METHOD!r} is for a shaft that is free in the gap, or one mass behind a rigid transmission: "
             'give method = "whitened"'
         )
-    if axis.play is Play.HELD:
+    if axis.backlash_kind is BacklashKind.HELD:
         raise InvalidInput(
             'transmission in_gap = "held" with a finite k_d and one mass: no method estimates this gap; describe the '
             'transmission as "free", or as rigid'
@@ -131,7 +131,7 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
     interval = 1.0 / window.sample_rate
     measured = theta_m if window.theta_m is None else window.theta_m
     at_motor, at_load = _count_of_motor(axis, measured), _count_of_load(axis, window)
-    free, late = axis.play is Play.FREE, _SAMPLES_LATE * interval
+    free, late = axis.backlash_kind is BacklashKind.FREE, _SAMPLES_LATE * interval
     if free:
         own = math.sqrt(axis.transmission.k_d / axis.load.m[0])
         late = max(late, _LATE / own)

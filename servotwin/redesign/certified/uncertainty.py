@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.basis import Play
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.sobol import sobol
@@ -310,7 +310,7 @@ def _factors(uncertainty: Uncertainty, places: Array) -> Array:
 def _machines(plants: tuple[Plant, ...], uncertainty: Uncertainty, places: Array) -> SimulatedMachines:
     """Machines of plants for (P, C, conditions) places in 0 .. 1."""
     low, high = uncertainty.gap
-    if plants[0].play is Play.FREE:
+    if plants[0].backlash_kind is BacklashKind.FREE:
         # A shaft without any gap changes its flank without end wherever its torque changes sign.
         least = _LEAST_GAP * uncertainty.step[0] / plants[0].p
         low, high = max(low, least), max(high, least)

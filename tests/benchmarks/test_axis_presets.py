@@ -8,20 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.shelf import SHELF, certified_machines, judged, measured, shelf_machines
+from benchmarks.axis_presets import DUTIES, certified_machines, judged, measured, preset_machines
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.axis import AXES
 
-ESTIMATED = tuple(name for name in SHELF if name != "emps")
+ESTIMATED = tuple(name for name in DUTIES if name != "emps")
 
 
 def test_every_preset_has_a_duty_and_machines_near_it() -> None:
-    assert tuple(SHELF) == AXES
-    for name in SHELF:
-        machines = shelf_machines(name, 3, 5)
-        assert machines == shelf_machines(name, 4, 5)[:3]
+    assert tuple(DUTIES) == AXES
+    for name in DUTIES:
+        machines = preset_machines(name, 3, 5)
+        assert machines == preset_machines(name, 4, 5)[:3]
         assert machines[0].gap.value(machines[0].duration) == pytest.approx(
-            10.0 * SHELF[name].gap / machines[0].model.p
+            10.0 * DUTIES[name].gap / machines[0].model.p
         )
         worn = certified_machines(name, 3, 5)
         assert [each.plant for each in worn] == [each.plant for each in machines]
@@ -30,10 +30,10 @@ def test_every_preset_has_a_duty_and_machines_near_it() -> None:
         assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
 
 
-@pytest.mark.parametrize("name", SHELF)
+@pytest.mark.parametrize("name", DUTIES)
 def test_no_window_between_two_levels_sees_the_gap_move(name: str) -> None:
     """Windows longer than a half period overlap; one in `hold` of them may see a move."""
-    (machine,), duty = shelf_machines(name, 1, 5), SHELF[name]
+    (machine,), duty = preset_machines(name, 1, 5), DUTIES[name]
     starts = np.maximum(np.arange(duty.hold > 1, machine.steps) - duty.before, 0.0) * duty.half_period
     moving = [machine.gap.constant_between(start, start + duty.window * duty.half_period) is None for start in starts]
     assert sum(moving) <= (0 if duty.hold == 1 else machine.steps / duty.hold)
@@ -48,7 +48,7 @@ def test_no_window_between_two_levels_sees_the_gap_move(name: str) -> None:
 )
 def test_a_preset_s_twin_finds_its_gap(name: str, steps: int) -> None:
     """Steps of a machine that is not quite its model, worn to five times its healthy gap."""
-    (machine,) = shelf_machines(name, 1, 20261123)
+    (machine,) = preset_machines(name, 1, 20261123)
     found = measured(replace(machine, worn=(5.0, 5.0), steps=steps))
     accepted = found["estimates"]
     assert "ok" in found["statuses"], found["reasons"]
@@ -56,7 +56,7 @@ def test_a_preset_s_twin_finds_its_gap(name: str, steps: int) -> None:
 
 
 def test_a_preset_without_a_load_encoder_is_refused() -> None:
-    (machine,) = shelf_machines("emps", 1, 20261123)
+    (machine,) = preset_machines("emps", 1, 20261123)
     for certified in (False, True):
         found = measured(replace(machine, steps=2, certified=certified))
         assert "twin" not in found

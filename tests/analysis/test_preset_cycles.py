@@ -1,4 +1,4 @@
-"""Limit cycles and margins of every preset of the shelf: exact map, describing function, long runs, and the tick."""
+"""Limit cycles and margins of Every axis preset: exact map, describing function, long runs, and the tick."""
 
 import math
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""Connections of strangers, which have shown no valid token and no session: bounded in all, and from each address."""
+"""Connections that have shown no valid token and no session: bounded in all, and from each address."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _GRACE_S = 2.0
 """s in which a client shows its token: after an outage all edges of a network connect at once, from one address."""
 
 
-class StrangerLimit:
+class UnauthenticatedLimit:
     """Limit of the connections that have shown neither a valid token nor the cookie of a session.
 
     Parameters
@@ -32,24 +32,24 @@ class StrangerLimit:
         self._of = Counter[str]()
 
     @classmethod
-    def of(cls, config: ServiceConfig, access: AccessControl, operators: OperatorAccess) -> StrangerLimit | None:
+    def of(cls, config: ServiceConfig, access: AccessControl, operators: OperatorAccess) -> UnauthenticatedLimit | None:
         """Limit of a service; None where nobody has a token, or where a proxy shares connections among clients."""
         if config.tokens is None or config.behind_proxy:
             return None
-        return cls(access, operators, config.strangers, config.strangers_per_address)
+        return cls(access, operators, config.unauthenticated_connections, config.unauthenticated_per_address)
 
     @property
     def open(self) -> int:
-        """Connections of strangers."""
+        """Number of these connections."""
         return self._of.total()
 
-    def enter(self, address: str, close: Callable[[], None]) -> Stranger | None:
+    def enter(self, address: str, close: Callable[[], None]) -> UnauthenticatedConnection | None:
         """Count a new connection; None: there are too many, in all or from its address, and it has to be closed."""
         # Half of the places at most, also within the grace period: one address must not shut all others out.
         if self.open >= self._most or self._of[address] >= max(1, self._most // 2):
             return None
         self._of[address] += 1
-        return Stranger(self, address, close)
+        return UnauthenticatedConnection(self, address, close)
 
     def leave(self, address: str) -> None:
         """Count a connection no longer."""
@@ -69,18 +69,18 @@ class StrangerLimit:
         return session is not None and self._operators.session_name(session) is not None
 
 
-class Stranger:
+class UnauthenticatedConnection:
     """One connection, until it shows a token or a session, or ends.
 
     Parameters
     ----------
-    limit : StrangerLimit
+    limit : UnauthenticatedLimit
     address : str
     close : callable
         Closes the connection.
     """
 
-    def __init__(self, limit: StrangerLimit, address: str, close: Callable[[], None]) -> None:
+    def __init__(self, limit: UnauthenticatedLimit, address: str, close: Callable[[], None]) -> None:
         self._limit, self._address, self._close = limit, address, close
         self._counted = True
         self._timer = asyncio.get_running_loop().call_later(_GRACE_S, self._check)

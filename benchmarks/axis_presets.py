@@ -1,9 +1,9 @@
-"""Every preset of the shelf with its twin in the loop, while its gap grows from nothing to ten times the healthy one.
+"""Every axis preset with its twin in the loop, while its gap grows from nothing to ten times the healthy one.
 
 The gap grows in levels, between windows where they leave room: a machine that wears in years has one gap in a window.
 
-``python -m benchmarks.batch shelf --seed 5 --count 45 FILE`` measures the twin's estimates while the preset's own
-controller runs; ``shelf-certified`` instead of ``shelf`` lets the twin send verified settings to machines worn
+``python -m benchmarks.batch axes --seed 5 --count 45 FILE`` measures the twin's estimates while the preset's own
+controller runs; ``axes-certified`` instead of ``axes`` lets the twin send verified settings to machines worn
 by any amount. The blocks are the presets.
 """
 
@@ -33,7 +33,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.simulation import Run, Simulation
 from servotwin.twin.settings import TwinSettings
 
-NAME, CERTIFIED = "shelf", "shelf-certified"
+NAME, CERTIFIED = "axes", "axes-certified"
 WORN = 10.0
 """Largest gap over the healthy one."""
 LEVELS, CERTIFIED_STEPS = 12, 4
@@ -65,7 +65,7 @@ class Duty(NamedTuple):
 
 
 _ARC_SECOND = math.radians(1.0 / 3600.0)
-SHELF: Mapping[str, Duty] = {
+DUTIES: Mapping[str, Duty] = {
     "two-mass-drive": Duty(2e-3, 10.0),
     "ball-screw": Duty(5e-6, 0.4),
     "robot-joint": Duty(math.radians(0.05), 4.0),
@@ -86,7 +86,7 @@ _EXACT = 0.01
 
 
 @dataclass(frozen=True)
-class ShelfMachine:
+class PresetMachine:
     """One machine of a preset.
 
     Attributes
@@ -114,7 +114,7 @@ class ShelfMachine:
 
     def __post_init__(self) -> None:
         if not self.steps:
-            object.__setattr__(self, "steps", LEVELS * SHELF[self.name].hold)
+            object.__setattr__(self, "steps", LEVELS * DUTIES[self.name].hold)
 
     @property
     def model(self) -> Axis:
@@ -124,12 +124,12 @@ class ShelfMachine:
     @property
     def duration(self) -> float:
         """Length of the run, s."""
-        return self.steps * SHELF[self.name].half_period
+        return self.steps * DUTIES[self.name].half_period
 
     @property
     def gap(self) -> PiecewiseCubic:
         """Total gap, rad at the motor, level after level."""
-        duty, healthy = SHELF[self.name], SHELF[self.name].gap / self.model.p
+        duty, healthy = DUTIES[self.name], DUTIES[self.name].gap / self.model.p
         count = -(-self.steps // duty.hold)
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
@@ -144,7 +144,7 @@ class ShelfMachine:
     @property
     def reference(self) -> SquareWave:
         """To and fro."""
-        return SquareWave(self.amplitude, 2.0 * SHELF[self.name].half_period)
+        return SquareWave(self.amplitude, 2.0 * DUTIES[self.name].half_period)
 
     @property
     def count(self) -> float:
@@ -167,7 +167,7 @@ class ShelfMachine:
         InvalidInput
             A twin cannot be had.
         """
-        model, duty = self.model, SHELF[self.name]
+        model, duty = self.model, DUTIES[self.name]
         most = _AMPLITUDES[1] * duty.gap
         ranges = Uncertainty(gap=(0.0, 1.5 * WORN * duty.gap / model.p), step=(_AMPLITUDES[0] * duty.gap, 2.0 * most))
         rate = self.rate
@@ -201,28 +201,28 @@ def _whole(seconds: float, rate: float) -> float:
     return round(seconds * rate) / rate
 
 
-def shelf_machines(name: str, count: int, seed: int) -> list[ShelfMachine]:
+def preset_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset whose gap grows."""
-    random, model = np.random.default_rng([seed, list(SHELF).index(name)]), Axis.preset(name)
+    random, model = np.random.default_rng([seed, list(DUTIES).index(name)]), Axis.preset(name)
     return [_drawn(name, model, random) for _ in range(count)]
 
 
-def certified_machines(name: str, count: int, seed: int) -> list[ShelfMachine]:
+def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset with any gap up to the largest, to which the twin sends verified settings."""
-    random = np.random.default_rng([seed, list(SHELF).index(name), 1])
+    random = np.random.default_rng([seed, list(DUTIES).index(name), 1])
     worn = [float(random.uniform(0.0, WORN)) for _ in range(count)]
     return [
         replace(machine, worn=(gap, gap), steps=CERTIFIED_STEPS, certified=True)
-        for machine, gap in zip(shelf_machines(name, count, seed), worn, strict=True)
+        for machine, gap in zip(preset_machines(name, count, seed), worn, strict=True)
     ]
 
 
-def _drawn(name: str, model: Axis, random: np.random.Generator) -> ShelfMachine:
+def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
     plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
-    return ShelfMachine(name, plant, SHELF[name].gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
+    return PresetMachine(name, plant, DUTIES[name].gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
 
 
-def with_twin(machine: ShelfMachine) -> Loop:
+def with_twin(machine: PresetMachine) -> Loop:
     """Run a machine with edge, link and twin.
 
     Raises
@@ -239,7 +239,7 @@ def with_twin(machine: ShelfMachine) -> Loop:
     return cosimulation.loop(simulation.run())
 
 
-def measured(machine: ShelfMachine) -> dict[str, Any]:
+def measured(machine: PresetMachine) -> dict[str, Any]:
     """Numbers of a machine with its twin, and under the preset's own controller."""
     found: dict[str, Any] = {"own": steps_of(machine, machine.alone())}
     try:
@@ -282,7 +282,7 @@ def judged(estimate: GapEstimate, gaps: tuple[float, float, float], count: float
     }
 
 
-def steps_of(machine: ShelfMachine, run: Run) -> dict[str, list[float]]:
+def steps_of(machine: PresetMachine, run: Run) -> dict[str, list[float]]:
     """Of each step: 1.0 where it has settled, its cost (s), and the largest error in the end (of the step)."""
     error = (run.reference - run.position)[:-1].reshape(machine.steps, -1)
     sizes = np.full(machine.steps, 2.0 * machine.amplitude)
@@ -291,14 +291,14 @@ def steps_of(machine: ShelfMachine, run: Run) -> dict[str, list[float]]:
     still = _STILL * sizes + _COUNTS * machine.model.position_resolution
     return {
         "settled": (0.5 * np.ptp(last, axis=1) <= still).astype(float).tolist(),
-        "cost": (np.abs(error).mean(axis=1) * SHELF[machine.name].half_period / sizes).tolist(),
+        "cost": (np.abs(error).mean(axis=1) * DUTIES[machine.name].half_period / sizes).tolist(),
         "tail": (np.abs(last).max(axis=1) / sizes).tolist(),
     }
 
 
 def _units(
-    draw: Callable[[str, int, int], list[ShelfMachine]], names: Sequence[str], count: int, seed: int
-) -> Iterator[tuple[str, ShelfMachine]]:
+    draw: Callable[[str, int, int], list[PresetMachine]], names: Sequence[str], count: int, seed: int
+) -> Iterator[tuple[str, PresetMachine]]:
     """Machines of all presets by turns."""
     drawn = {name: draw(name, count, seed) for name in names}
     for place in range(count):
@@ -307,7 +307,7 @@ def _units(
 
 def _show(found: Mapping[str, Any], console: Console) -> None:
     """A line for each preset, of all its machines of whatever seed, and what was refused."""
-    result = Table(title="shelf: gap from 0 to ten times the healthy one", title_justify="left", box=None)
+    result = Table(title="axes: gap from 0 to ten times the healthy one", title_justify="left", box=None)
     result.add_column("preset")
     for heading in (
         *("machines", "windows", "accepted", "inside\n%", "near\n%", "false", "worst\n% of gap"),
@@ -315,7 +315,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     ):
         result.add_column(heading, justify="right")
     notes = []
-    for name in SHELF:
+    for name in DUTIES:
         machines = [numbers for key, numbers in found.items() if key.split("/")[1] == name]
         refused = sorted({each["refused"] for each in machines if "refused" in each})
         ran = [each for each in machines if "twin" in each]
@@ -375,7 +375,7 @@ def _doubts(ran: Sequence[Mapping[str, Any]]) -> Counter[str]:
 
 
 BATCHES = {
-    NAME: Batch(partial(_units, shelf_machines), measured, _show, tuple(SHELF)),
-    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, tuple(SHELF)),
+    NAME: Batch(partial(_units, preset_machines), measured, _show, tuple(DUTIES)),
+    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, tuple(DUTIES)),
 }
 """For `benchmarks.batch`."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from service_system import OPERATOR, TOKEN, served, twin_file
 
-from servotwin.twin_service import strangers
+from servotwin.twin_service import unauthenticated
 from servotwin.twin_service.http_server import HttpServer, listening_socket
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -23,7 +23,9 @@ def serving(folder: Path, service: str, body: Callable[[Connect], Awaitable[None
     async def run() -> None:
         async with served(twin_file(folder, service)) as (system, _):
             listener = listening_socket(system.config)
-            server = HttpServer(system.config, system.http_app(), system.polls.close, system.strangers, lambda: True)
+            server = HttpServer(
+                system.config, system.http_app(), system.polls.close, system.unauthenticated, lambda: True
+            )
             server.config.lifespan = "off"
             task = asyncio.create_task(server.serve([listener]))
             opened: list[asyncio.StreamWriter] = []
@@ -69,8 +71,10 @@ async def is_closed(reader: asyncio.StreamReader) -> bool:
     return True
 
 
-def test_strangers_of_an_address_are_bounded_and_edges_are_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strangers, "_GRACE_S", 0.05)
+def test_connections_of_an_address_without_a_token_are_bounded_and_edges_are_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unauthenticated, "_GRACE_S", 0.05)
 
     async def body(connect: Connect) -> None:
         edges = [await connect(TOKEN) for _ in range(8)]
@@ -84,11 +88,13 @@ def test_strangers_of_an_address_are_bounded_and_edges_are_not(tmp_path: Path, m
             assert not writer.is_closing()
             assert not reader.at_eof()
 
-    serving(tmp_path, "strangers_per_address = 3", body)
+    serving(tmp_path, "unauthenticated_per_address = 3", body)
 
 
-def test_a_session_is_no_stranger_and_a_forged_one_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(strangers, "_GRACE_S", 0.05)
+def test_a_session_counts_as_authenticated_and_a_forged_one_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(unauthenticated, "_GRACE_S", 0.05)
 
     async def body(connect: Connect) -> None:
         known, forged = await connect(SESSION), [await connect(f"forged {SESSION}") for _ in range(2)]
@@ -99,10 +105,10 @@ def test_a_session_is_no_stranger_and_a_forged_one_is(tmp_path: Path, monkeypatc
             assert not writer.is_closing()
             assert not reader.at_eof()
 
-    serving(tmp_path, "strangers_per_address = 1", body)
+    serving(tmp_path, "unauthenticated_per_address = 1", body)
 
 
-def test_strangers_are_bounded_in_all_and_one_address_has_half_of_the_places(tmp_path: Path) -> None:
+def test_connections_without_a_token_are_bounded_in_all_and_one_address_has_half_of_the_places(tmp_path: Path) -> None:
     async def body(connect: Connect) -> None:
         first, second = await connect(""), await connect("")
         assert b"401" in await answer(first[0])
@@ -121,13 +127,13 @@ def test_strangers_are_bounded_in_all_and_one_address_has_half_of_the_places(tmp
         for _ in range(5):  # who has shown a token counts no more
             assert b"200" in await answer((await connect(TOKEN))[0])
 
-    serving(tmp_path, "strangers = 4", body)
+    serving(tmp_path, "unauthenticated_connections = 4", body)
 
 
-def test_without_tokens_and_behind_a_proxy_nobody_is_a_stranger(tmp_path: Path) -> None:
+def test_without_tokens_and_behind_a_proxy_no_connection_is_limited(tmp_path: Path) -> None:
     async def limit(service: str, tokens: bool) -> object:
         async with served(twin_file(tmp_path, service, tokens)) as (system, _):
-            return system.strangers
+            return system.unauthenticated
 
     assert asyncio.run(limit("", False)) is None
     assert asyncio.run(limit("behind_proxy = true", True)) is None
