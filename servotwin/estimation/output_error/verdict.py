@@ -27,7 +27,7 @@ _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0  # interval over the computed one
-_RATCHET = 2.0  # of the motor's noise: its extremes push the load, so that the gap seems wider
+_RATCHET = 4.0  # of the noise left in the motor's angle: its extremes push the load, so that the gap seems wider
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
 
@@ -69,7 +69,7 @@ def judge(
     unit : float
         Total gap at the motor (rad) per half gap at the load, for the words.
     possible : PossibleHalf, optional
-        What the encoders' rounding leaves possible.
+        What the window leaves possible.
     jitter : float
         Standard deviation of the noise of the motor's angle beyond its counts, at the load (m or rad), where nothing
         smooths it.
