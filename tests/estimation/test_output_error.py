@@ -276,7 +276,7 @@ def test_errors_of_rounding_that_depend_on_each_other_are_no_reason_for_a_wrong_
 
 @pytest.mark.parametrize(("seed", "noise"), [(430, 0.0), (638, 0.0), (610, 0.4)])
 def test_errors_of_rounding_that_creep_repeats_count_as_few(seed: int, noise: float) -> None:
-    """Taken for thousands of errors within a bound they left gaps that were 14, 20 and 6 % off with narrow intervals."""
+    """Taken for thousands of errors within a bound they left gaps 14, 20 and 6 % off, with narrow intervals."""
     window, gap = _counted(_creep, seed, noise, off=True)
     estimate = estimate_gap(window, Axis.preset("stepper-stage"))
     assert estimate.interval[0] <= gap <= estimate.interval[1]

@@ -124,7 +124,8 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
     """The window with its model."""
     interval = 1.0 / window.sample_rate
     measured = theta_m if window.theta_m is None else window.theta_m
-    at_motor, at_load = _count_of_motor(axis, measured), max(axis.sensors.position_resolution, counted(window.position))
+    at_motor = _count_of_motor(axis, measured)
+    at_load = max(axis.sensors.position_resolution, counted(window.position))
     free, late = axis.play is Play.FREE, _SAMPLES_LATE * interval
     if free:
         own = math.sqrt(axis.transmission.k_d / axis.load.m[0])
