@@ -383,6 +383,19 @@ def test_noise_of_the_motor_that_pushes_the_load_widens_the_interval() -> None:
     assert all(inside)
 
 
+def test_a_gap_that_jumps_within_a_window_of_large_moves_is_a_mismatch() -> None:
+    """Its misfit was small beside the motion: 2.83 +- 0.24 deg for a gap of 4 deg that became 3 deg."""
+    axis, random = Axis.preset("stepper-stage"), np.random.default_rng(7001)
+    angle = _sine(math.radians(4.0 + random.uniform(2.0, 20.0)), np.arange(6000) / 1000.0, random)
+    place = play(angle, math.radians(4.0), angle[0])
+    place = np.concatenate([place[:3000], play(angle[3000:], math.radians(3.0), place[3000])])
+    counts = axis.sensors.position_resolution, axis.sensors.encoder_resolution
+    seen = [step * np.round(v / step) for v, step in zip((axis.p * place, angle), counts, strict=True)]
+    estimate = estimate_gap(Window(*seen, sample_rate=1000.0), axis)
+    assert estimate.status is GapStatus.MODEL_MISMATCH
+    assert "of half the gap unexplained" in " ".join(estimate.reasons)
+
+
 def test_halves_that_differ_by_the_growth_that_is_told_are_no_mismatch() -> None:
     time = np.arange(4000) / 1000.0
     angle, gap = np.sin(6.0 * time), 0.05 * (1.0 + 0.02 * time)

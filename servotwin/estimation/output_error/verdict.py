@@ -20,7 +20,7 @@ _BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's 
 _RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
 _APART = 4.0  # standard deviations between the halves of a window
-_UNEXPLAINED = 0.05  # of the position's variation
+_UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
 _OUTLYING = 7.0  # standard deviations
 _CHANCE = 2.0  # times the usual variance of an average of white noise
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
@@ -123,9 +123,14 @@ def _mismatches(found: Search, rate: float, least: float) -> tuple[str, ...]:
     best, problem = found.best, found.problem
     sentences = []
     variation = float(np.std(problem.position))
-    share = _slow(best.raw) / variation if variation > 0.0 else math.inf
+    slow = _slow(best.raw)
+    share = slow / variation if variation > 0.0 else math.inf
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
+    elif problem.model.speed == 0.0 and slow > max(_UNEXPLAINED * best.values[HALF], problem.count):
+        sentences.append(
+            f"the model leaves motion of {100.0 * slow / best.values[HALF]:.0f} % of half the gap unexplained"
+        )
     sentences += unusual_numbers(found)
     sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
