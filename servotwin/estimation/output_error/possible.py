@@ -26,7 +26,7 @@ _FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next
 _WIDEST = 2.0  # factor between the best gap and the farthest ones
 _STEPS, _DEEPER = 15, 8
 _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
-_INDEPENDENT = 30.0  # errors of rounding: from 10 to 100 make the same of windows that creep
+_INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
 _IMPOSSIBLE = 200.0  # rise of the cost in noise, over its variance; in rounding the cost doubles
 _PATIENCE = 0.1  # logarithm of a ratio of gaps
 
