@@ -238,7 +238,6 @@ def _moves(far: float, time: Array, random: np.random.Generator) -> Array:
 class _Counted(NamedTuple):
     window: Window
     gap: float
-    bound: float
 
 
 def _counted(
@@ -257,7 +256,7 @@ def _counted(
         step * np.round(values / step + noise * random.normal(size=values.size))
         for values, step in zip((position, angle), steps, strict=True)
     ]
-    return _Counted(Window(*seen, sample_rate=1000.0), gap, 0.5 * (steps[0] + axis.p * steps[1]))
+    return _Counted(Window(*seen, sample_rate=1000.0), gap)
 
 
 @pytest.mark.parametrize("motion", [_creep, _sine, _moves])
@@ -267,7 +266,7 @@ def test_errors_of_rounding_that_depend_on_each_other_are_no_reason_for_a_wrong_
     """Least squares bends ratio and delay to fit them: 8 of 19 accepted windows that crept were false."""
     accepted = 0
     for seed in (102, 107, 110, 113, 116, 121):
-        window, gap, _ = _counted(motion, seed)
+        window, gap = _counted(motion, seed)
         estimate = estimate_gap(window, Axis.preset("stepper-stage"))
         accepted += estimate.ok
         assert not estimate.ok or estimate.interval[0] <= gap <= estimate.interval[1], seed
@@ -275,19 +274,27 @@ def test_errors_of_rounding_that_depend_on_each_other_are_no_reason_for_a_wrong_
     assert accepted >= 4
 
 
+@pytest.mark.parametrize(("seed", "noise"), [(430, 0.0), (638, 0.0), (610, 0.4)])
+def test_errors_of_rounding_that_creep_repeats_count_as_few(seed: int, noise: float) -> None:
+    """Taken for thousands of errors within a bound they left gaps 14, 20 and 6 % off, with narrow intervals."""
+    window, gap = _counted(_creep, seed, noise, off=True)
+    estimate = estimate_gap(window, Axis.preset("stepper-stage"))
+    assert estimate.interval[0] <= gap <= estimate.interval[1]
+
+
 def test_the_gaps_that_rounding_leaves_possible() -> None:
     axis = Axis.preset("stepper-stage")
-    window, gap, bound = _counted(_creep, 110)
+    window, gap = _counted(_creep, 110)
     assert window.theta_m is not None
     found = search(_problem(window, window.theta_m, axis, OutputErrorSettings()), 0.0)
-    half, possible = 0.5 * axis.p * gap, possible_half(found, bound)
+    half, possible = 0.5 * axis.p * gap, possible_half(found)
     assert possible is not None
     # The best fit is many of its own standard deviations off.
     assert abs(found.best.values[0] - half) > 10.0 * found.best.std(0, found.free)
     assert abs(possible.mean - half) < 2.0 * possible.std < 0.1 * half
     # A load with dynamics has no such profile.
     two_mass = _problem(_short(), _angle(_short()), TWO_MASS, OutputErrorSettings())
-    assert possible_half(search(two_mass, 0.0), bound) is None
+    assert possible_half(search(two_mass, 0.0)) is None
 
 
 def _short() -> Window:
@@ -304,7 +311,7 @@ def _angle(window: Window) -> Array:
 def test_a_motor_that_creeps_in_noise_tells_its_gap_no_better_than_ratio_and_delay_are_known(seed: int) -> None:
     """One rate of creeping makes the same motion with another gap, ratio and delay: three of these were 2 to 4 % off,
     by 2 to 4 standard deviations."""
-    window, gap, _ = _counted(_creep, seed, noise=2.0, off=True)
+    window, gap = _counted(_creep, seed, noise=2.0, off=True)
     estimate = estimate_gap(window, Axis.preset("stepper-stage"))
     assert estimate.ok, estimate.reasons
     assert estimate.interval[0] <= gap <= estimate.interval[1]
@@ -312,10 +319,10 @@ def test_a_motor_that_creeps_in_noise_tells_its_gap_no_better_than_ratio_and_del
 
 def test_the_best_fit_in_noise_is_one_of_many_gaps() -> None:
     axis = Axis.preset("stepper-stage")
-    window, gap, bound = _counted(_creep, 304, noise=2.0, off=True)
+    window, gap = _counted(_creep, 304, noise=2.0, off=True)
     angle = without_noise(_angle(window), axis.encoder_resolution).angle
     found = search(_problem(window, angle, axis, OutputErrorSettings()), 0.0)
-    half, possible = 0.5 * axis.p * gap, possible_half(found, bound)
+    half, possible = 0.5 * axis.p * gap, possible_half(found)
     assert possible is not None
     assert abs(possible.mean - half) < 2.0 * possible.std < 0.1 * half
 
@@ -369,11 +376,24 @@ def test_noise_of_the_motor_that_pushes_the_load_widens_the_interval() -> None:
     """Play follows the extremes of the motor's noise: a gap of 0.5 to 8 deg seems up to 9 % wider."""
     inside = []
     for seed in range(6):
-        window, gap, _ = _counted(_moves, seed, noise=2.0)
+        window, gap = _counted(_moves, seed, noise=2.0)
         estimate = estimate_gap(window, Axis.preset("stepper-stage"))
         assert estimate.ok, estimate.reasons
         inside.append(estimate.interval[0] <= gap <= estimate.interval[1])
     assert all(inside)
+
+
+def test_a_gap_that_jumps_within_a_window_of_large_moves_is_a_mismatch() -> None:
+    """Its misfit was small beside the motion: 2.83 +- 0.24 deg for a gap of 4 deg that became 3 deg."""
+    axis, random = Axis.preset("stepper-stage"), np.random.default_rng(7001)
+    angle = _sine(math.radians(4.0 + random.uniform(2.0, 20.0)), np.arange(6000) / 1000.0, random)
+    place = play(angle, math.radians(4.0), angle[0])
+    place = np.concatenate([place[:3000], play(angle[3000:], math.radians(3.0), place[3000])])
+    counts = axis.sensors.position_resolution, axis.sensors.encoder_resolution
+    seen = [step * np.round(v / step) for v, step in zip((axis.p * place, angle), counts, strict=True)]
+    estimate = estimate_gap(Window(*seen, sample_rate=1000.0), axis)
+    assert estimate.status is GapStatus.MODEL_MISMATCH
+    assert "of half the gap unexplained" in " ".join(estimate.reasons)
 
 
 def test_halves_that_differ_by_the_growth_that_is_told_are_no_mismatch() -> None:

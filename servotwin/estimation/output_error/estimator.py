@@ -70,9 +70,8 @@ def estimate(
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
     found, noise = _fit(window, theta_m, axis, prior, settings)
-    at_motor, at_load, unit = _count_of_motor(axis, theta_m), _count_of_load(axis, window), 2.0 / axis.p
-    possible = possible_half(found, 0.5 * (axis.p * at_motor + at_load))
-    return _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
+    unit = 2.0 / axis.p
+    return _stated(blank, found, judge(found, settings, unit, possible_half(found), axis.p * noise), unit)
 
 
 def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings) -> Search:
@@ -121,16 +120,12 @@ def _count_of_motor(axis: Axis, theta_m: Array) -> float:
     return max(axis.encoder_resolution, counted(theta_m))
 
 
-def _count_of_load(axis: Axis, window: Window) -> float:
-    """M or rad."""
-    return max(axis.sensors.position_resolution, counted(window.position))
-
-
 def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings) -> Problem:
     """The window with its model."""
     interval = 1.0 / window.sample_rate
     measured = theta_m if window.theta_m is None else window.theta_m
-    at_motor, at_load = _count_of_motor(axis, measured), _count_of_load(axis, window)
+    at_motor = _count_of_motor(axis, measured)
+    at_load = max(axis.sensors.position_resolution, counted(window.position))
     free, late = axis.backlash_kind is BacklashKind.FREE, _SAMPLES_LATE * interval
     if free:
         own = math.sqrt(axis.transmission.k_d / axis.load.m[0])

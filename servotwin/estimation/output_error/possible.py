@@ -4,10 +4,10 @@ The window is fitted at many gaps, and each counts by how well it explains the w
 not do: a motor that creeps to its places with one rate makes the same motion of the load with another gap, ratio and
 delay, so that only what is known of these tells the gaps apart, and noise makes many minima along that valley.
 
-Where rounding is all of the noise, no residual exceeds half a count of each channel together at the true unknowns: play
-turns an error of the motor's angle into one that is no larger. Least squares does not know that. Errors of a motor that
-creeps, or repeats its motion, depend on each other: with ratio and delay free the best fit of one such motion was 27 %
-off, for residuals that were a hundredth smaller. There all gaps count whose residuals keep to the bound.
+Where rounding is all of the noise, its errors depend on each other in a motor that creeps, or repeats its motion: with
+ratio and delay free the best fit of one such motion was 27 % off, for residuals that were a hundredth smaller, and at
+the true numbers the squares of another were an eighth larger than at the best ones. They count as few independent
+errors there, however many samples there are.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next
 _WIDEST = 2.0  # factor between the best gap and the farthest ones
 _STEPS, _DEEPER = 15, 8
 _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
-_SLACK = 1.1  # of the bound: least squares does not make the largest residual small
-_FAR = 10.0  # bounds: no gap beyond is possible
-_IMPOSSIBLE, _PATIENCE = 200.0, 0.1  # rise of the cost in noise, over its variance, and logarithm of a ratio of gaps
+_INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
+_IMPOSSIBLE = 200.0  # rise of the cost in noise, over its variance; in rounding the cost doubles
+_PATIENCE = 0.1  # logarithm of a ratio of gaps
 
 
 class PossibleHalf(NamedTuple):
@@ -38,25 +38,17 @@ class PossibleHalf(NamedTuple):
     std: float
 
 
-def possible_half(found: Search, bound: float) -> PossibleHalf | None:
-    """Weigh the half gaps by how well they explain a window; None for a model with dynamics.
-
-    Parameters
-    ----------
-    found : Search
-    bound : float
-        Largest error that rounding makes, m or rad at the load. Where no fit keeps to it the model errs too, and the
-        least largest residual takes its place.
-    """
+def possible_half(found: Search) -> PossibleHalf | None:
+    """Weigh the half gaps by how well they explain a window; None for a model with dynamics."""
     if found.problem.model.speed > 0.0:
         return None
-    rounding = bound > 0.0 and only_rounding(found.problem, found.best)
-    far = _FAR * bound if rounding else math.inf
-    fits = [*reversed(list(_profile(found, -1.0, far))), found.best, *_profile(found, 1.0, far)]
+    rounding = only_rounding(found.problem, found.best)
+    rise = found.best.cost if rounding else _IMPOSSIBLE * found.best.variance()
+    fits = [*reversed(list(_profile(found, -1.0, rise))), found.best, *_profile(found, 1.0, rise)]
     halves = np.array([fit.values[HALF] for fit in fits])
     widths = np.gradient(halves) if halves.size > 1 else np.ones(1)
     if rounding:
-        weights = widths * _in_rounding(found, fits, bound)
+        weights = widths * _in_rounding(found, fits)
     else:
         fits = [_deepest(found, fit, width) for fit, width in zip(fits, widths, strict=True)]
         halves = np.array([fit.values[HALF] for fit in fits])
@@ -76,11 +68,12 @@ def _deepest(found: Search, fit: Fit, width: float) -> Fit:
     return lower if abs(lower.values[HALF] - fit.values[HALF]) <= width else full
 
 
-def _in_rounding(found: Search, fits: list[Fit], bound: float) -> Array:
-    """(f,) likelihoods of fits, all of whose residuals keep to a bound, or none."""
-    largest = np.array([_largest(fit) for fit in fits])
-    likely = np.exp(-0.5 * np.array([_prior(found, fit) for fit in fits]))
-    return np.asarray(likely * (largest <= _SLACK * max(bound, float(largest.min()))))
+def _in_rounding(found: Search, fits: list[Fit]) -> Array:
+    """(f,) likelihoods of fits in a few independent normal errors of unknown size, over that of the best."""
+    prior = np.array([_prior(found, fit) for fit in fits])
+    misfit = np.array([fit.cost for fit in fits]) - prior
+    likely = -0.5 * (_INDEPENDENT * np.log(misfit) + prior)
+    return np.exp(likely - likely.max())
 
 
 def _in_noise(found: Search, fits: list[Fit]) -> Array:
@@ -89,27 +82,23 @@ def _in_noise(found: Search, fits: list[Fit]) -> Array:
     return np.exp(-0.5 * (costs - costs.min()) / found.best.variance())
 
 
-def _profile(found: Search, side: float, far: float) -> Iterator[Fit]:
-    """Fits at half gaps ever farther from the best one, smaller (-1) or larger (1), each from the one before."""
+def _profile(found: Search, side: float, rise: float) -> Iterator[Fit]:
+    """Fits at half gaps ever farther from the best one, smaller (-1) or larger (1), each from the one before.
+
+    They end where none of the last ones has cost less than `rise` more than the best. Minima a sample of delay apart
+    have walls between them where the motor's speed jumps.
+    """
     free, best = found.free.copy(), float(found.best.values[HALF])
     free[HALF] = False
     fit, share, likely = found.best, 0.0, 0.0
     step = min(_COARSEST, max(_FINEST, found.best.std(HALF, found.free) / best))
-    limit = found.best.cost + _IMPOSSIBLE * found.best.variance()
     while share < min(math.log(_WIDEST), likely + _PATIENCE):
         share, step = share + step, min(_COARSEST, _GROWTH * step)
         start = fit.values.copy()
         start[HALF] = best * math.exp(side * share)
         fit = descend(found.problem, start, found.noise, free, _STEPS)
-        if _largest(fit) > far:
-            return
-        # Minima a sample of delay apart have walls between them where the motor's speed jumps.
-        likely = share if fit.cost < limit or math.isfinite(far) else likely
+        likely = share if fit.cost < found.best.cost + rise else likely
         yield fit
-
-
-def _largest(fit: Fit) -> float:
-    return float(np.max(np.abs(fit.raw)))
 
 
 def _prior(found: Search, fit: Fit) -> float:

@@ -20,14 +20,14 @@ _BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's 
 _RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
 _APART = 4.0  # standard deviations between the halves of a window
-_UNEXPLAINED = 0.05  # of the position's variation
+_UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
 _OUTLYING = 7.0  # standard deviations
 _CHANCE = 2.0  # times the usual variance of an average of white noise
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0  # interval over the computed one
-_RATCHET = 2.0  # of the motor's noise: its extremes push the load, so that the gap seems wider
+_RATCHET = 4.0  # of the noise left in the motor's angle: its extremes push the load, so that the gap seems wider
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
 
@@ -69,7 +69,7 @@ def judge(
     unit : float
         Total gap at the motor (rad) per half gap at the load, for the words.
     possible : PossibleHalf, optional
-        What the encoders' rounding leaves possible.
+        What the window leaves possible.
     jitter : float
         Standard deviation of the noise of the motor's angle beyond its counts, at the load (m or rad), where nothing
         smooths it.
@@ -123,9 +123,14 @@ def _mismatches(found: Search, rate: float, least: float) -> tuple[str, ...]:
     best, problem = found.best, found.problem
     sentences = []
     variation = float(np.std(problem.position))
-    share = _slow(best.raw) / variation if variation > 0.0 else math.inf
+    slow = _slow(best.raw)
+    share = slow / variation if variation > 0.0 else math.inf
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
+    elif problem.model.speed == 0.0 and slow > max(_UNEXPLAINED * best.values[HALF], problem.count):
+        sentences.append(
+            f"the model leaves motion of {100.0 * slow / best.values[HALF]:.0f} % of half the gap unexplained"
+        )
     sentences += unusual_numbers(found)
     sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
