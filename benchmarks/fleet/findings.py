@@ -20,11 +20,15 @@ class ProcessedWork(NamedTuple):
         Windows that came, and those of them without an outcome at the time of the query.
     age : tuple of float
         s from a window's commit to that of its outcome: median, 99 % and largest.
+    glanced, estimated : tuple of float
+        The same of windows for which a glance did while they were the newest, and of those that were estimated.
     """
 
     windows: int
     undone: int
     age: tuple[float, float, float]
+    glanced: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    estimated: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 @contextmanager
@@ -50,10 +54,20 @@ def stored(connection: sqlite3.Connection) -> int:
 
 def done(connection: sqlite3.Connection, since: float, until: float) -> ProcessedWork:
     """Query the work on the windows that came between two times (s since the epoch)."""
-    query = "SELECT received, done FROM messages WHERE kind = 'window' AND received >= ? AND received < ?"
+    query = (
+        "SELECT received, done, EXISTS (SELECT 1 FROM evidence WHERE message = messages.id AND kind = 'estimate'), "
+        "EXISTS (SELECT 1 FROM evidence WHERE message = messages.id AND status = 'nothing moved') "
+        "FROM messages WHERE kind = 'window' AND received >= ? AND received < ?"
+    )
     rows = connection.execute(query, (since, until)).fetchall()
-    ages = [end - begin for begin, end in rows if end is not None]
-    return ProcessedWork(len(rows), len(rows) - len(ages), shares(ages))
+    ages = [(end - begin, estimated, alike) for begin, end, estimated, alike in rows if end is not None]
+    return ProcessedWork(
+        len(rows),
+        len(rows) - len(ages),
+        shares([age for age, _, _ in ages]),
+        shares([age for age, _, alike in ages if alike]),
+        shares([age for age, estimated, _ in ages if estimated]),
+    )
 
 
 def fresh(connection: sqlite3.Connection, start: float, returned: float) -> tuple[int, float]:

@@ -60,7 +60,9 @@ def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
     yield ReportLine("... estimated, the others glanced at", "", f"{100.0 * estimated / glances:.1f} %")
     verifications = whole.made.get("verification", 0)
     yield ReportLine("... updates, verifications by now", "", f"{whole.made.get('update', 0)}, {verifications}")
-    yield ReportLine("... queue age: median, 99 %, most", "", _numbers("s", *steady.age))
+    yield ReportLine("... queue age: median, 99 %, most", "0.25 s (99 %)", _numbers("s", *steady.age))
+    yield ReportLine("... of windows with nothing new", "", _numbers("s", *steady.glanced))
+    yield ReportLine("... of windows that were estimated", "", _numbers("s", *steady.estimated))
     yield ReportLine(
         "... request to answer: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in report.latency))
     )

@@ -31,12 +31,12 @@ _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
 def backlog(connection: sa.Connection, now: float) -> Backlog:
     """Number, age and lag of the unprocessed messages."""
     counts = [sa.select(sa.func.count()).select_from(messages).where(queue) for queue in (WORK, VERIFICATIONS)]
-    first = sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None))
-    query = sa.select(*(count.scalar_subquery() for count in counts), first.scalar_subquery(), _OLDEST)
+    firsts = [sa.select(sa.func.min(turn)).where(turn.is_not(None)) for turn in (twins.c.ready, twins.c.estimate_ready)]
+    query = sa.select(*(each.scalar_subquery() for each in (*counts, *firsts)), _OLDEST)
     row: Any = connection.execute(query).one()
-    work, verifications, turn, oldest = row
-    age, lag = (0.0 if since is None else max(0.0, now - since) for since in (oldest, turn))
-    return Backlog(work, verifications, age, lag)
+    work, verifications, *turns, oldest = row
+    age, *lags = (0.0 if since is None else max(0.0, now - since) for since in (oldest, *turns))
+    return Backlog(work, verifications, age, max(lags))
 
 
 def servos(connection: sa.Connection, after: str, limit: int) -> list[ServoSummary]:

@@ -84,6 +84,8 @@ class Lease(NamedTuple):
     attempts : int
         Number of leases of the servo since its last result, this one included. More than a few mean that the work kills
         its workers.
+    estimate : bool
+        The servo's turn is for the estimate of a window that was deferred.
     """
 
     servo: str
@@ -91,6 +93,7 @@ class Lease(NamedTuple):
     serial: int
     messages: tuple[StoredMessage, ...]
     attempts: int = 1
+    estimate: bool = False
 
 
 class EvidenceRecord(NamedTuple):
@@ -156,6 +159,9 @@ class WorkResult(NamedTuple):
         Messages of the twin to itself.
     contexts : tuple of (str, str)
         (key, JSON text) of the contexts that the evidence names.
+    deferred : int or None
+        Id of a window that stays unprocessed until the servo's turn for an estimate; 0: none. None: the work was not
+        on windows, and what was deferred stays so.
     """
 
     servo: str
@@ -167,6 +173,7 @@ class WorkResult(NamedTuple):
     outgoing: tuple[bytes, ...] = ()
     enqueue: tuple[Incoming, ...] = ()
     contexts: tuple[tuple[str, str], ...] = ()
+    deferred: int | None = None
 
 
 class OutgoingMessage(NamedTuple):
@@ -186,8 +193,8 @@ class Backlog(NamedTuple):
     age : float
         s since the oldest window or letter was received; 0.0: none waits.
     lag : float
-        s for which new messages of a servo have waited for its turn: the longest of all servos. A backlog that newer
-        messages have overtaken does not count.
+        s for which new messages of a servo have waited for its turn, or a servo for an estimate: the longest of all
+        servos. A backlog that newer messages have overtaken does not count.
     """
 
     messages: int

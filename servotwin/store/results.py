@@ -1,9 +1,8 @@
-"""Leases of servos with pending work, one worker each; and results of that work, stored as a whole or not at all."""
+"""Results of the work for servos, stored as a whole or not at all."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 from typing import Any
@@ -13,186 +12,11 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.engine import SQLITE
 from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
-from servotwin.store.records import EvidenceRecord, Lease, MessageKind, StoredMessage, WorkResult
-from servotwin.store.schema import VERIFICATIONS, WORK, bodies, contexts, evidence, messages, outgoing, states, twins
+from servotwin.store.records import EvidenceRecord, MessageKind, WorkResult
+from servotwin.store.schema import VERIFICATIONS, WORK, contexts, evidence, messages, outgoing, states, twins
 
-MAX_LEASE_BYTES = 4 * 1024 * 1024
-"""Bytes of the bodies in one lease; its first body may be larger."""
 BACKLOG_LATER_S = 60.0
 """s for which other servos' new messages come before the rest of a servo's backlog. It only orders the queue."""
-
-
-def acquire(
-    connection: sa.Connection,
-    owner: str,
-    limit: int,
-    until: float,
-    now: float,
-    kinds: Collection[MessageKind],
-    only: str | None,
-) -> list[str]:
-    """Lease the servos whose new messages have waited longest; servos due to be woken get at least half of the places.
-
-    A single place goes to the servo that has waited longest for either. Returns their names.
-    """
-    leased: list[str] = []
-    # A lease that ends later than any granted by now dates from before a clock was set back: it counts as expired.
-    bound = {"_now": now, "_late": until + (until - now)} | ({} if only is None else {"_only": only})
-    queues = _queues(frozenset(kinds), only is not None)
-    if limit == 1:
-        heads = [
-            (connection.execute(query, bound | {"_count": 1}).one_or_none(), n) for n, (query, _) in enumerate(queues)
-        ]
-        oldest = sorted((head[1], n) for head, n in heads if head is not None)[:1]
-        queues = [queues[n] for _, n in oldest]
-    for query, share in queues:
-        count = min(math.ceil(share * limit), limit - len(leased))
-        servos = connection.scalars(query, bound | {"_count": count}).all()
-        if servos:
-            connection.execute(_LEASE, {"_servos": servos, "_owner": owner, "_until": until})
-            leased += servos
-    return leased
-
-
-def release(connection: sa.Connection, owner: str, servos: Collection[str] | None = None) -> None:
-    """End an owner's leases: all of them, or those of some servos."""
-    ending = sa.update(twins).where(twins.c.lease_owner == owner).values(lease_owner=None, lease_until=None)
-    connection.execute(ending if servos is None else ending.where(twins.c.servo.in_(servos)))
-
-
-def renew(connection: sa.Connection, owner: str, servos: Collection[str], until: float) -> None:
-    """Extend an owner's leases of some servos; those that it has lost stay lost."""
-    mine = sa.update(twins).where(twins.c.lease_owner == owner, twins.c.servo.in_(servos))
-    connection.execute(mine.values(lease_until=until))
-
-
-def hold(connection: sa.Connection, servo: str, until: float) -> None:
-    """Lease a servo to nobody, unless somebody has it: its next turn is after `until`."""
-    free = sa.update(twins).where(twins.c.servo == servo, twins.c.lease_owner.is_(None))
-    connection.execute(free.values(lease_owner=_NOBODY, lease_until=until))
-
-
-def load(
-    connection: sa.Connection,
-    servos: Sequence[str],
-    kinds: Collection[MessageKind],
-    per_servo: int,
-    newest_first: bool,
-) -> list[Lease]:
-    """State and pending messages of leased servos, in their order."""
-    rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos})}
-    pending = _pending(connection, servos, kinds, per_servo, newest_first)
-    return [
-        Lease(servo, rows[servo].state or b"", rows[servo].serial, tuple(pending[servo]), rows[servo].attempts)
-        for servo in servos
-    ]
-
-
-def due(connection: sa.Connection, servos: Collection[str], now: float) -> set[str]:
-    """Servos among these that are due to be woken."""
-    return set(connection.scalars(_DUE, {"_servos": list(servos), "_now": now}))
-
-
-@lru_cache(maxsize=32)
-def _queues(kinds: frozenset[MessageKind], one: bool) -> list[tuple[sa.Select[Any], float]]:
-    """(query of the next servos in a queue, largest share of the limit that it may take); of `one` servo only."""
-    queues: list[tuple[sa.Select[Any], float]] = []
-    if kinds - {MessageKind.VERIFICATION}:
-        due, ready = twins.c.wake <= _NOW, twins.c.ready.is_not(None)
-        # Half of the places at most before those with messages, the rest after them: neither queue can starve the
-        # other.
-        queues.append((_next(due, twins.c.wake, one), 0.5))
-        queues.append((_next(ready, twins.c.ready, one), 1.0))
-        queues.append((_next(due, twins.c.wake, one), 1.0))
-    if MessageKind.VERIFICATION in kinds:
-        queues.append((_next(twins.c.verification_ready.is_not(None), twins.c.verification_ready, one), 1.0))
-    return queues
-
-
-def _next(turn: sa.ColumnElement[bool], order: sa.ColumnElement[float], one: bool) -> sa.Select[Any]:
-    """Query of servos whose turn it is and that are not leased."""
-    until = twins.c.lease_until
-    late = sa.bindparam("_late", type_=sa.Double)
-    free = sa.or_(until.is_(None), until <= _NOW, until > late)
-    count = sa.bindparam("_count", type_=sa.Integer)
-    query = sa.select(twins.c.servo, order).where(turn, free).order_by(order).limit(count)
-    query = query.where(twins.c.servo == sa.bindparam("_only")) if one else query
-    # SQLite has one writer at a time and ignores this.
-    return query.with_for_update(skip_locked=True)
-
-
-def _pending(
-    connection: sa.Connection,
-    servos: Sequence[str],
-    kinds: Collection[MessageKind],
-    per_servo: int,
-    newest_first: bool,
-) -> dict[str, list[StoredMessage]]:
-    """Pending messages of each servo in the order of their commits; of the windows the first ones, or the newest."""
-    pending: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
-    for queue in _NEWEST_FIRST if newest_first else _OLDEST_FIRST:
-        selected = queue & set(kinds)
-        if selected:
-            query = _few_messages(selected, newest_first and MessageKind.WINDOW in selected)
-            for row in connection.execute(query, {"_servos": servos, "_per_servo": per_servo}):
-                pending[row.servo].append(
-                    StoredMessage(row.id, MessageKind(row.kind), row.body, row.encoding, row.received, row.key)
-                )
-    return {servo: sorted(found, key=_work_before_verifications) for servo, found in pending.items()}
-
-
-def _work_before_verifications(message: StoredMessage) -> tuple[bool, int]:
-    return message.kind is MessageKind.VERIFICATION, message.id
-
-
-_OLDEST_FIRST = (frozenset(MessageKind) - {MessageKind.VERIFICATION}, frozenset({MessageKind.VERIFICATION}))
-_NEWEST_FIRST = tuple(frozenset({kind}) for kind in MessageKind)
-"""Kinds that share the places of a lease: where a part of the windows stays behind, no letter may."""
-
-
-@lru_cache(maxsize=16)
-def _few_messages(kinds: frozenset[MessageKind], newest: bool) -> sa.Select[Any]:
-    """Query of the first, or newest, pending messages of each servo, of these kinds: verifications only, or others."""
-    verifications = MessageKind.VERIFICATION in kinds
-    order = messages.c.id.desc() if newest else messages.c.id.asc()
-    place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=order).label("place")
-    waiting = sa.select(messages.c.id, messages.c.servo, place)
-    waiting = waiting.where(VERIFICATIONS if verifications else WORK, messages.c.servo.in_(_SERVOS))
-    if len(kinds) == 1 and not verifications:
-        waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
-    first = waiting.subquery()
-    few = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
-    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=first.c.servo, order_by=first.c.place)
-    sized = sa.select(first.c.id, first.c.place, so_far.label("so_far")).join(bodies, bodies.c.message == first.c.id)
-    some = sized.where(few).subquery()
-    known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
-    joined = some.join(messages, messages.c.id == some.c.id).join(bodies, bodies.c.message == messages.c.id)
-    small = sa.or_(some.c.place == 1, some.c.so_far <= MAX_LEASE_BYTES)
-    return sa.select(*known, bodies.c.body).select_from(joined).where(small).order_by(messages.c.id)
-
-
-_NOBODY = "nobody"
-"""Owner of the leases that only hold a servo."""
-_SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
-_NOW = sa.bindparam("_now", type_=sa.Double)
-
-_LEASE = (
-    sa.update(twins)
-    .where(twins.c.servo.in_(_SERVOS))
-    .values(
-        lease_owner=sa.bindparam("_owner"),
-        lease_until=sa.bindparam("_until", type_=sa.Double),
-        attempts=twins.c.attempts + 1,
-    )
-)
-_STATES = (
-    sa.select(twins.c.servo, states.c.state, twins.c.serial, twins.c.attempts)
-    .outerjoin(states, states.c.servo == twins.c.servo)
-    .where(twins.c.servo.in_(_SERVOS))
-)
-_DUE = sa.select(twins.c.servo).where(twins.c.servo.in_(_SERVOS), twins.c.wake <= _NOW)
-
-
 _ESTIMATES = ("glance", "estimate")
 
 
@@ -357,12 +181,18 @@ def _upsert_state(dialect: str) -> Any:
 
 
 def _places_in_queue(results: Sequence[WorkResult], now: float) -> list[dict[str, Any]]:
-    """Parameters of `_RESCHEDULE`: of each servo the newest message that was processed, and the backlog's turn."""
+    """Parameters of `_RESCHEDULE`: of each servo the newest message that was looked at, and the one deferred."""
     newest: dict[str, int] = {}
+    deferred: dict[str, int | None] = {}
     for result in results:
-        newest[result.servo] = max((*result.done, newest.get(result.servo, 0)))
-    later = now + BACKLOG_LATER_S
-    return [{"_servo": servo, "_newest": id_, "_later": later} for servo, id_ in sorted(newest.items())]
+        newest[result.servo] = max((*result.done, result.deferred or 0, newest.get(result.servo, 0)))
+        if result.deferred is not None:
+            deferred[result.servo] = result.deferred
+    times = {"_later": now + BACKLOG_LATER_S, "_now": now}
+    return [
+        {"_servo": servo, "_newest": id_, "_deferred": deferred.get(servo), **times}
+        for servo, id_ in sorted(newest.items())
+    ]
 
 
 def _oldest_time(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
@@ -370,12 +200,22 @@ def _oldest_time(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
     return oldest.order_by(messages.c.id).limit(1).correlate(twins).scalar_subquery()
 
 
+_DEFERRED = sa.bindparam("_deferred", type_=sa.BigInteger)
+
+
 def _next_turn() -> sa.ColumnElement[float]:
-    """Place in the queue: as of the oldest message that came after those processed, or of a backlog, or null."""
+    """Place in the queue: as of the oldest message that came after those looked at, or of a backlog, or null."""
     newer = messages.c.id > sa.bindparam("_newest", type_=sa.BigInteger)
-    left = sa.select(messages.c.id).where(WORK, messages.c.servo == twins.c.servo).correlate(twins).exists()
+    others = sa.or_(_DEFERRED.is_(None), messages.c.id != _DEFERRED)
+    left = sa.select(messages.c.id).where(WORK, others, messages.c.servo == twins.c.servo).correlate(twins).exists()
     backlog = sa.case((left, sa.bindparam("_later", type_=sa.Double)), else_=sa.null())
     return sa.func.coalesce(_oldest_time(sa.and_(WORK, newer)), backlog)
+
+
+def _next_estimate() -> sa.ColumnElement[float]:
+    """Place among the estimates: a servo keeps it until none of its windows is deferred any more."""
+    since = sa.func.coalesce(twins.c.estimate_ready, sa.bindparam("_now", type_=sa.Double))
+    return sa.case((_DEFERRED.is_(None), twins.c.estimate_ready), (_DEFERRED == 0, sa.null()), else_=since)
 
 
 # A separate statement after the serials were advanced: on PostgreSQL those rows are locked by then. Messages put before
@@ -383,5 +223,5 @@ def _next_turn() -> sa.ColumnElement[float]:
 _RESCHEDULE = (
     sa.update(twins)
     .where(twins.c.servo == sa.bindparam("_servo"))
-    .values(ready=_next_turn(), verification_ready=_oldest_time(VERIFICATIONS))
+    .values(ready=_next_turn(), verification_ready=_oldest_time(VERIFICATIONS), estimate_ready=_next_estimate())
 )

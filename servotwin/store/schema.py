@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlalchemy as sa
 
-REVISION = "0003"
+REVISION = "0004"
 """Newest migration, which makes the tables below."""
 
 metadata = sa.MetaData(
@@ -29,6 +29,8 @@ twins = sa.Table(
     # turn, was received; of a backlog alone, a later time (results.BACKLOG_LATER_S); null: nothing waits.
     sa.Column("ready", sa.Double),
     sa.Column("verification_ready", sa.Double),
+    # Time at which a window was first deferred, since which the servo waits for an estimate; null: it does not.
+    sa.Column("estimate_ready", sa.Double),
     sa.Column("wake", sa.Double),
     sa.Column("last_message", sa.Double),
     sa.Column("lease_owner", sa.Text),
@@ -133,6 +135,7 @@ _index("ix_messages_verifications", messages.c.servo, messages.c.id, where=VERIF
 _index("ix_messages_windows", messages.c.servo, messages.c.id, where=WINDOWS)
 _index("ix_twins_ready", twins.c.ready, where=twins.c.ready.is_not(None))
 _index("ix_twins_verification_ready", twins.c.verification_ready, where=twins.c.verification_ready.is_not(None))
+_index("ix_twins_estimate_ready", twins.c.estimate_ready, where=twins.c.estimate_ready.is_not(None))
 _index("ix_twins_wake", twins.c.wake, where=twins.c.wake.is_not(None))
 _index("ix_evidence_message", evidence.c.message)
 _index("ix_evidence_version", evidence.c.servo, evidence.c.kind, evidence.c.version, evidence.c.id)

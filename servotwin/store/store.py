@@ -9,7 +9,7 @@ from typing import TypeVar
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
-from servotwin.store import incoming, queries, results
+from servotwin.store import incoming, leases, queries, results
 from servotwin.store import outgoing as posting
 from servotwin.store.claims import StoredClaim, add_alarm, claim_of, raise_claim
 from servotwin.store.engine import (
@@ -114,11 +114,13 @@ class Store:
         per_servo: int = 16,
         servo: str | None = None,
         newest_first: bool = False,
+        estimate_first: bool = False,
     ) -> list[Lease]:
         """Lease servos that have unprocessed messages of these kinds, or that are due to be woken.
 
         A servo has one lease at a time, until its result is committed, it is released, or `lease_s` have passed. Being
-        due counts only where `kinds` has windows or letters.
+        due counts only where `kinds` has windows or letters. New messages come before estimates that were deferred, of
+        which one is leased, and those before a backlog.
 
         Parameters
         ----------
@@ -132,13 +134,18 @@ class Store:
             Only this one.
         newest_first : bool
             Where not all windows of a servo are leased, the newest ones are; of other kinds always the oldest.
+        estimate_first : bool
+            An estimate that was deferred comes before new messages, this time.
         """
-        leased = self._write(lambda c: results.acquire(c, owner, limit, now + lease_s, now, kinds, servo))
+        until = now + lease_s
+        leased = self._write(
+            lambda c: leases.acquire(c, owner, limit, until, now, kinds, servo, estimate_first=estimate_first)
+        )
         if not leased:
             return []
         with transaction(self.engines.reader) as connection:
-            loaded = results.load(connection, leased, kinds, per_servo, newest_first)
-            due = results.due(connection, leased, now)
+            loaded = leases.load(connection, leased, kinds, per_servo, newest_first)
+            due = leases.due(connection, {turn.servo for turn in leased}, now)
         idle = {lease.servo for lease in loaded if not lease.messages and lease.servo not in due}
         if idle:
             self.release(owner, idle)
@@ -146,15 +153,15 @@ class Store:
 
     def release(self, owner: str, servos: Collection[str] | None = None) -> None:
         """End leases without a result: all of an owner's, or those of some servos."""
-        self._write(lambda connection: results.release(connection, owner, servos))
+        self._write(lambda connection: leases.release(connection, owner, servos))
 
     def renew(self, owner: str, servos: Collection[str], until: float) -> None:
         """Extend an owner's leases of some servos until a time, s since the epoch; those that it has lost stay lost."""
-        self._write(lambda connection: results.renew(connection, owner, servos, until))
+        self._write(lambda connection: leases.renew(connection, owner, servos, until))
 
     def hold(self, servo: str, until: float) -> None:
         """Let nobody lease a servo until a time, s since the epoch; does nothing where somebody has it."""
-        self._write(lambda connection: results.hold(connection, servo, until))
+        self._write(lambda connection: leases.hold(connection, servo, until))
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
         """Messages to the edge with serials above `after`, lowest first.

@@ -39,11 +39,14 @@ class StepResult(NamedTuple):
         Messages to the edge, in order.
     evidence : tuple of Record
         Evidence to store, in order; the caller passes a `VerificationRequest` among it as an event, at any later time.
+    deferred : bool
+        The window needs an estimate, and nothing else came of the step: the caller passes it again later.
     """
 
     state: TwinState
     messages: tuple[Message, ...] = ()
     evidence: tuple[Record, ...] = ()
+    deferred: bool = False
 
 
 def take_act(model: TwinModel, state: TwinState, act: Act, now: float) -> StepResult:

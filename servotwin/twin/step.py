@@ -90,6 +90,8 @@ class WindowArrival(NamedTuple):
     too_late : str
         Reason why an update for this window could not be applied in time; empty: it could. It is estimated, and changes
         no setting.
+    deferrable : bool
+        Where a glance does not do, the window may be estimated later.
     """
 
     window: WindowMessage
@@ -97,6 +99,7 @@ class WindowArrival(NamedTuple):
     overtaken: bool = False
     unseen: bool = False
     too_late: str = ""
+    deferrable: bool = False
 
 
 class Wake(NamedTuple):
@@ -170,7 +173,7 @@ class _Learnt(NamedTuple):
 
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
     """Process a window: estimate, redesign, and request."""
-    message, arrived = event.window, event.time
+    before, message, arrived = state, event.window, event.time
     if not state.is_of_other_boot(message):
         state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
     decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
@@ -179,6 +182,8 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         glance = None  # the setting that is sent again needs the window's estimate
     if glance is None and event.overtaken and event.unseen:
         glance = no_glance(_OVERTAKEN)
+    if glance is not None and glance.moved and event.deferrable:
+        return StepResult(before, deferred=True)
     if not state.has_overtaken(message):
         state = replace(state, newest=(message.boot, message.start))
     if glance is not None:

@@ -7,6 +7,7 @@ evidence whose status begins with "failed", and the next message finds the twin 
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -47,11 +48,14 @@ class Urgency:
         Least ratio of sample time to real time.
     others_wait : bool
         Overtaken windows are not estimated, because other servos wait.
+    defer : bool
+        A window for which a glance does not do is left for a lease that is for an estimate.
     """
 
     expected_s: float = 0.0
     speed: float = 1.0
     others_wait: bool = False
+    defer: bool = False
 
 
 def work(registry: ModelRegistry, lease: Lease, now: float, urgency: Urgency | None = None) -> WorkResult:
@@ -68,12 +72,15 @@ def work(registry: ModelRegistry, lease: Lease, now: float, urgency: Urgency | N
         Only the newest window of the lease may change the setting, if that can still be in time, and receipts are
         processed first. None, as in lock-step: every window may, in order.
     """
+    if urgency is not None and lease.estimate:
+        urgency = dataclasses.replace(urgency, defer=False)
     batch = lease.messages[:1] if lease.attempts >= ONE_BY_ONE else lease.messages
     try:
         return _Worker(registry.model_of(lease.servo), lease, now).result(batch, now, urgency)
     except InvalidInput as error:
         evidence = tuple(failure_row(stored.id, str(error)) for stored in batch)
-        return WorkResult(lease.servo, lease.serial, lease.state, None, tuple(stored.id for stored in batch), evidence)
+        done = tuple(stored.id for stored in batch)
+        return WorkResult(lease.servo, lease.serial, lease.state, None, done, evidence, deferred=0)
 
 
 class _Worker:
@@ -85,6 +92,7 @@ class _Worker:
         self.evidence: list[EvidenceRecord] = []
         self.unverified: list[VerificationRequest] = []
         self.sent: list[Message] = []
+        self.deferred = 0
         self.model, self.state = self._restored(now)
 
     def result(self, batch: Sequence[StoredMessage], now: float, urgency: Urgency | None) -> WorkResult:
@@ -102,11 +110,12 @@ class _Worker:
             self.lease.serial,
             encode_state(self.state),
             next_wake(self.model, self.state) if woken else None,
-            tuple(stored.id for stored in batch),
+            tuple(stored.id for stored in batch if stored.id != self.deferred),
             tuple(self.evidence),
             tuple(messages.encode(message) for message in self.sent),
             enqueue=tuple(_queued(request, now) for request in self.unverified),
             contexts=(self.context,) if any(row.context for row in self.evidence) else (),
+            deferred=self.deferred if any(stored.kind is MessageKind.WINDOW for stored in batch) else None,
         )
 
     def _restored(self, now: float) -> tuple[TwinModel, TwinState]:
@@ -147,7 +156,7 @@ class _Worker:
                     self._note(message, ActRecord(event, "the twin of this servo is switched off"))
                     continue
             if urgency is not None and isinstance(event, WindowArrival) and self.state.has_overtaken(event.window):
-                event = event._replace(overtaken=True, unseen=urgency.others_wait)
+                event = event._replace(overtaken=True, unseen=urgency.others_wait, deferrable=False)
             self._step(message, event, now)
 
     def _decoded(self, batch: Sequence[StoredMessage]) -> Iterator[tuple[int, Event]]:
@@ -171,6 +180,7 @@ class _Worker:
         except Exception as error:
             self.evidence.append(failure_row(message, f"{type(error).__name__}: {error}"))
             return False
+        self.deferred = message if result.deferred else self.deferred
         self.state = result.state
         self.evidence += evidence
         self.unverified += [record for record in result.evidence if isinstance(record, VerificationRequest)]
@@ -198,7 +208,7 @@ def _newest(events: Sequence[Event], state: TwinState) -> WindowArrival | None:
 def _urgent(
     events: Sequence[tuple[int, Event]], state: TwinState, validity: float, now: float, urgency: Urgency
 ) -> list[tuple[int, Event]]:
-    """Events with receipts and acts first, and windows that come too late marked.
+    """Events with receipts and acts first; windows marked that are overtaken, come too late or may be deferred.
 
     An update then names the right base, and nothing is sent that an act forbids.
     """
@@ -214,7 +224,10 @@ def _urgent(
         late = f"too late by {-left:.3g} s: an update may be applied for {validity:g} s from the window's start"
         overtaken = event is not newest
         return event._replace(
-            overtaken=overtaken, unseen=overtaken and urgency.others_wait, too_late="" if left > 0.0 else late
+            overtaken=overtaken,
+            unseen=overtaken and urgency.others_wait,
+            too_late="" if left > 0.0 else late,
+            deferrable=urgency.defer and not overtaken,
         )
 
     # Stable: the order of the others stays.

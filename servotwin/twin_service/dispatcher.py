@@ -18,6 +18,7 @@ from servotwin.store.records import EvidenceRecord, Lease, MessageKind, WorkResu
 from servotwin.store.store import WORK_KINDS, Store
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPace
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import LeaseResult, WorkerLost, WorkerProcess
 from servotwin.twin_service.worker_pool import WorkerPool
@@ -27,14 +28,8 @@ log = logging.getLogger(__name__)
 LEASE_S, _POLL_S, _RETRY_S = 120.0, 0.5, 1.0
 _RENEWALS = 4.0
 """Renewals of a lease within its time while a worker is at work, however long that takes."""
-_SERVOS, _MESSAGES = 16, 16
-"""Servos in one job, and messages of each, at most."""
-_JOB_S = 0.5
-"""s that a job may be expected to take: a servo in it has no newer messages than those of its lease."""
-_FORGETTING = 0.1
-"""Weight of the newest work in the mean time for one servo."""
-_SHORTEST_HOLD_S = 0.1
-"""A shorter hold is not worth a write."""
+_MESSAGES = 16
+"""Messages of each servo in a job, at most."""
 _MAX_STEPS = 64
 """Results that one lock-step request may lead to."""
 QUIET = ("glance", "trend", "machine", "motor", "disturbance", "excitation")
@@ -45,59 +40,6 @@ ALARMS = ("failed", "fallback", "withdrawn", "alarm")
 
 class NoResult(Exception):
     """A worker failed, or its result could not be committed; the messages stay unprocessed."""
-
-
-class VerificationQuota:
-    """Token bucket for verifications, two at most.
-
-    Parameters
-    ----------
-    per_minute : float
-        0: none is started.
-    """
-
-    MAX = 2.0
-
-    def __init__(self, per_minute: float) -> None:
-        self._rate = per_minute / 60.0
-        self._level, self._at = (self.MAX if per_minute else 0.0), 0.0
-
-    def refill(self, now: float) -> bool:
-        """Refill up to `now` (s, monotonic); returns whether a verification may be started."""
-        passed, self._at = (max(0.0, now - self._at) if self._at else 0.0), now
-        self._level = min(self.MAX, self._level + self._rate * passed)
-        return self._level >= 1.0
-
-    def take(self) -> None:
-        """Count a verification that was started."""
-        self._level -= 1.0
-
-
-class WorkPace:
-    """Mean time of the work for one servo, and what follows from it.
-
-    Parameters
-    ----------
-    share : float
-        Largest share of one worker's time for one servo.
-    """
-
-    def __init__(self, share: float = 1.0) -> None:
-        self._share, self.seconds = share, 0.0
-
-    def note(self, seconds: float) -> None:
-        """Note the time that a servo took."""
-        self.seconds += (_FORGETTING if self.seconds else 1.0) * (seconds - self.seconds)
-
-    @property
-    def servos(self) -> int:
-        """Number of servos that a job may have."""
-        return _SERVOS if self.seconds * _SERVOS <= _JOB_S else max(1, int(_JOB_S / self.seconds))
-
-    def hold(self, seconds: float) -> float:
-        """s for which a servo that took so long waits for its next turn."""
-        hold = seconds * (1.0 / self._share - 1.0)
-        return hold if hold >= _SHORTEST_HOLD_S else 0.0
 
 
 class Dispatcher:
@@ -142,11 +84,12 @@ class Dispatcher:
         self._commit, self._notify, self._metrics, self._clocks = commit, notify, metrics, clocks
         self._owner, self._quota = owner, quota
         self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
+        self._estimate_pace, self._estimates = WorkPace(), EstimateShare()
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for, self._latest = False, False, set[str]()
         self._tasks: set[asyncio.Task[None]] = set()
         self._to_release: set[str] = set()
-        self._failures: Counter[tuple[str, bool]] = Counter()
+        self._failures: Counter[_Queue] = Counter()
 
     def wake(self) -> None:
         """Look for work now."""
@@ -236,7 +179,7 @@ class Dispatcher:
         return []
 
     async def _lease_next(self) -> list[Lease]:
-        """Lease a verification if the quota allows one, otherwise messages."""
+        """Lease a verification if the quota allows one, otherwise messages, or an estimate that was deferred."""
         now = self._clocks.wall()
         if self._quota.refill(self._clocks.monotonic()):
             verifications = await self._lease(now, 1, (MessageKind.VERIFICATION,))
@@ -247,7 +190,16 @@ class Dispatcher:
 
     async def _lease(self, now: float, servos: int, kinds: Collection[MessageKind]) -> list[Lease]:
         return await self._executor.run(
-            lambda: self._store.lease(self._owner, servos, LEASE_S, now, kinds, per_servo=_MESSAGES, newest_first=True)
+            lambda: self._store.lease(
+                self._owner,
+                servos,
+                LEASE_S,
+                now,
+                kinds,
+                per_servo=_MESSAGES,
+                newest_first=True,
+                estimate_first=self._estimates.due,
+            )
         )
 
     async def _rest(self, seconds: float) -> None:
@@ -271,7 +223,9 @@ class Dispatcher:
         ]
         left = dict.fromkeys(lease.servo for job in jobs for lease in job)
         commits: list[asyncio.Task[WorkResult | None]] = []
-        now, urgency = self._clocks.wall(), (self._pace.seconds, self._speed, others_wait)
+        pace = self._estimate_pace if leases[0].estimate else self._pace
+        # Of several servos the last one would wait for the estimates of all before it.
+        now, urgency = self._clocks.wall(), (pace.seconds, self._speed, others_wait, others_wait or len(leases) > 1)
         renewal = asyncio.create_task(self._renew(left))
         try:
             for job in filter(None, jobs):
@@ -311,8 +265,9 @@ class Dispatcher:
     ) -> WorkResult | None:
         """Commit a worker's result; None: there is none, and the servo is to be released."""
         self._metrics.work.observe(done.seconds)
-        if not _queue(lease)[1]:
-            self._pace.note(done.seconds)
+        if _queue(lease)[1] != _VERIFICATION:
+            (self._estimate_pace if lease.estimate else self._pace).note(done.seconds)
+            self._estimates.note(done.seconds, lease.estimate)
         if done.result is None:
             self._fail(lease, done.error)
             return None
@@ -366,7 +321,8 @@ class Dispatcher:
     def _report(self, lease: Lease, result: WorkResult, seconds: float, now: float) -> None:
         """Count and log a committed result."""
         for message in lease.messages:
-            self._metrics.age.observe(max(0.0, now - message.received))
+            if message.id != result.deferred:
+                self._metrics.age.observe(max(0.0, now - message.received))
         for kind, number in Counter(map(log_kind, result.evidence)).items():
             self._metrics.evidence.add(kind, by=number)
         about = {"servo": lease.servo, "serial": lease.serial, "seconds": round(seconds, 6)}
@@ -378,9 +334,16 @@ class Dispatcher:
                 log.log(level, kind, extra={**about, **_identifiers(record, windows)})
 
 
-def _queue(lease: Lease) -> tuple[str, bool]:
-    """Key of the failure count: windows that succeed do not reset the count of a verification that kills workers."""
-    return lease.servo, any(message.kind is MessageKind.VERIFICATION for message in lease.messages)
+_Queue = tuple[str, str]
+"""(servo, kind of its turn), the key of the failure count."""
+_VERIFICATION, _ESTIMATE, _NEW = "verification", "estimate", "new"
+
+
+def _queue(lease: Lease) -> _Queue:
+    """Windows that succeed do not reset the count of a verification, or of an estimate, that kills workers."""
+    if any(message.kind is MessageKind.VERIFICATION for message in lease.messages):
+        return lease.servo, _VERIFICATION
+    return lease.servo, _ESTIMATE if lease.estimate else _NEW
 
 
 def log_kind(record: EvidenceRecord) -> str:

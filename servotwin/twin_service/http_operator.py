@@ -76,7 +76,7 @@ class OperatorApi:
         self._backlog: tuple[float, Backlog | None] = -math.inf, None
         metrics.add_gauge("servotwin_waiting", "Messages and verifications not yet processed.", self._counts, "kind")
         metrics.add_gauge("servotwin_waiting_seconds", "Age of the oldest message not yet processed.", self._age)
-        lag = "Longest time for which new messages of a servo have waited for its turn."
+        lag = "Longest time for which new messages of a servo have waited for its turn, or a servo for an estimate."
         metrics.add_gauge("servotwin_lag_seconds", lag, self._lag)
 
     def routes(self) -> list[HttpRoute]:

@@ -25,7 +25,7 @@ from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
-from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
+from servotwin.twin_service.dispatcher import Dispatcher
 from servotwin.twin_service.fleet_feed import FleetFeed
 from servotwin.twin_service.fleet_process import ChangeReader
 from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
@@ -46,6 +46,7 @@ from servotwin.twin_service.live_views import LiveViews
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
+from servotwin.twin_service.pace import VerificationQuota, WorkPace
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch

@@ -56,7 +56,7 @@ class StoreAddress(NamedTuple):
     url: str
 
 
-WorkerUrgency = tuple[float, float, bool]
+WorkerUrgency = tuple[float, float, bool, bool]
 """Fields of `twin.work.Urgency`."""
 
 
@@ -68,7 +68,7 @@ class WorkerJob(NamedTuple):
     leases : tuple of Lease
     now : float
         s: since the epoch, or sample time in lock-step.
-    urgency : (float, float, bool), optional
+    urgency : (float, float, bool, bool), optional
         Fields of `twin.work.Urgency`; the time then runs on from `now`. None: in lock-step.
     """
 

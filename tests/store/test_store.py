@@ -8,8 +8,8 @@ from store_cases import bodies_of, claim, letter, outcome, verification, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import transaction
+from servotwin.store.leases import MAX_LEASE_BYTES
 from servotwin.store.records import Backlog, EvidenceRecord, Lease, MessageKind, OutgoingMessage, PutResult
-from servotwin.store.results import MAX_LEASE_BYTES
 from servotwin.store.schema import bodies, contexts, evidence, messages, outgoing, twins
 from servotwin.store.store import Store, open_store
 
@@ -115,6 +115,62 @@ def test_a_single_place_goes_to_whoever_waited_longest(store: Store) -> None:
     store.put([window("m", received=140.0), window("late", received=160.0)])
     assert [claim(store, limit=1)[0].servo for _ in range(3)] == ["m", "w", "late"]
     assert claim(store, limit=1) == []
+
+
+def deferred(store: Store, *servos: str, now: float) -> None:
+    """Take these servos' turns; the newest window of each needs an estimate."""
+    for servo in servos:
+        (one,) = claim(store, servo=servo, now=now)
+        *done, last = (message.id for message in one.messages)
+        assert store.commit([outcome(one)._replace(done=tuple(done), deferred=last)], now) == [True]
+
+
+def test_new_messages_come_before_deferred_estimates_and_those_before_backlogs(store: Store) -> None:
+    store.put([window("backlog", sequence) for sequence in range(3)])
+    (one,) = claim(store, newest_first=True, per_servo=1)
+    store.commit([outcome(one, deferred=0)], 200.0)
+    store.put([window("a"), window("b")])
+    deferred(store, "a", now=201.0)
+    deferred(store, "b", now=202.0)
+    store.put([window("new", received=203.0)])
+    turns = [claim(store, now=204.0, limit=4) for _ in range(4)]
+    assert [[(lease.servo, lease.estimate) for lease in turn] for turn in turns] == [
+        [("new", False)], [("a", True)], [("b", True)], [("backlog", False)],
+    ]  # fmt: skip
+    assert claim(store, now=204.0) == []
+
+
+def test_estimates_can_be_given_a_turn_before_new_messages(store: Store) -> None:
+    store.put([window("a")])
+    deferred(store, "a", now=201.0)
+    store.put([window("new")])
+    turns = [claim(store, now=204.0, estimate_first=True) for _ in range(2)]
+    assert [[(lease.servo, lease.estimate) for lease in turn] for turn in turns] == [[("a", True)], [("new", False)]]
+
+
+def test_a_servo_keeps_its_place_among_the_estimates_although_newer_windows_come(store: Store) -> None:
+    store.put([window("a"), window("b")])
+    deferred(store, "a", now=201.0)
+    deferred(store, "b", now=202.0)
+    store.put([window("a", 2)])
+    deferred(store, "a", now=203.0)
+    assert store.backlog(211.0).lag == 10.0
+    (first,) = claim(store, now=204.0)
+    assert (first.servo, first.estimate, [message.key for message in first.messages]) == ("a", True, ["boot/2"])
+    store.put([verification("a")])
+    store.commit([outcome(first, deferred=0)], 205.0)
+    (second,) = claim(store, now=206.0)
+    assert (second.servo, second.estimate) == ("b", True)
+
+
+def test_a_verification_leaves_the_place_among_the_estimates(store: Store) -> None:
+    store.put([window("a")])
+    deferred(store, "a", now=201.0)
+    store.put([window("new", received=202.0), verification("a")])
+    (proof,) = claim(store, kinds=(MessageKind.VERIFICATION,), now=204.0)
+    store.commit([outcome(proof)], 205.0)
+    turns = [claim(store, now=206.0) for _ in range(2)]
+    assert [[(lease.servo, lease.estimate) for lease in turn] for turn in turns] == [[("new", False)], [("a", True)]]
 
 
 def test_large_messages_are_leased_a_few_at_a_time(store: Store) -> None:

@@ -24,10 +24,23 @@ Rows = dict[str, list[tuple[object, ...]]]
 
 
 def rows(store: Store) -> Rows:
-    """All rows of the tables of the revision before."""
+    """All rows of the tables of the revision before, without the columns that came since."""
     with transaction(store.engines.reader) as connection:
-        tables = sorted({*sa.inspect(connection).get_table_names()} - {"claims", migrations.VERSIONS})
-        return {name: sorted(map(tuple, connection.execute(sa.text(f"SELECT * FROM {name}")))) for name in tables}
+        return {
+            table.name: sorted(map(tuple, connection.execute(sa.select(*_columns_before(table)))))
+            for table in tables(connection)
+        }
+
+
+def tables(connection: sa.Connection) -> list[sa.Table]:
+    """Tables of the revision before, each after those that it refers to."""
+    known = sa.MetaData()
+    known.reflect(connection)
+    return [table for table in known.sorted_tables if table.name not in ("claims", migrations.VERSIONS)]
+
+
+def _columns_before(table: sa.Table) -> list[sa.Column[object]]:
+    return [column for column in table.columns if column.name != "estimate_ready"]
 
 
 def revision(store: Store) -> str:
@@ -35,19 +48,26 @@ def revision(store: Store) -> str:
         return str(connection.execute(sa.text(f"SELECT version_num FROM {migrations.VERSIONS}")).scalar())
 
 
-def filled_before(url: str) -> Rows:
-    """Fill a new database of the revision before; its rows."""
-    engines = engines_of(parse_address(url))
-    migrations.migrate(engines.writer, BEFORE)
-    store = Store(engines)
+def filled_before(url: str, folder: Path) -> Rows:
+    """Fill a new database of the revision before, as this version would have; its rows."""
+    store = open_store(f"sqlite:///{folder}/now.db")
     store.put([window(sequence=n, body=bytes([n]) * 500, received=100.0 + n) for n in range(5)])
     [lease] = claim(store)
     estimate = EvidenceRecord("estimate", lease.messages[0].id, b"evidence", gap=0.1, status="ok")
     assert store.commit([outcome(lease, estimate, outgoing=(b"update",))], 300.0) == [True]
     found = rows(store)
-    assert revision(store) == BEFORE
     assert len(found["messages"]) == len(found["bodies"]) == 5
     store.close()
+    engines = engines_of(parse_address(url))
+    migrations.migrate(engines.writer, BEFORE)
+    with transaction(engines.writer) as connection:
+        for table in tables(connection):
+            names = [column.name for column in table.columns]
+            for row in found[table.name]:
+                connection.execute(sa.insert(table), dict(zip(names, row, strict=True)))
+    old = Store(engines)
+    assert (revision(old), rows(old)) == (BEFORE, found)
+    old.close()
     return found
 
 
@@ -73,7 +93,7 @@ def test_a_store_of_the_revision_before_goes_forth_and_back_from_its_backup(
     new_address: NewAddress, tmp_path: Path
 ) -> None:
     url = new_address()
-    before = filled_before(url)
+    before = filled_before(url, tmp_path)
     restore_to = dumped(url, tmp_path / "backup")
     for address in (url, new_address()):
         if address != url:
@@ -90,6 +110,7 @@ def test_a_store_of_the_revision_before_goes_forth_and_back_from_its_backup(
             PutResult.NEW,
         ]
         assert [each.body for each in store.outgoing("a", 0)] == [b"update"]
+        assert [message.key for message in claim(store)[0].messages] == ["boot/5"]
         store.close()
 
 
@@ -108,7 +129,7 @@ def test_of_claims_only_a_higher_number_counts(new_address: NewAddress) -> None:
 
 def test_a_backup_of_the_revision_before_is_made_and_restored_by_this_version(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/twin.db"
-    before = filled_before(url)
+    before = filled_before(url, tmp_path)
     backup(url, tmp_path / "backup.db")
     other = f"sqlite:///{tmp_path}/other.db"
     restore(tmp_path / "backup.db", other)

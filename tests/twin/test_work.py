@@ -440,6 +440,36 @@ def test_with_triage_a_window_that_was_overtaken_gets_a_glance_only():
     assert len(outcome.outgoing) == 1
 
 
+def test_a_window_for_which_a_glance_does_not_do_waits_for_a_turn_of_its_own_and_then_gives_the_same():
+    quick, lease = fleet(triage=TriageSettings()), claim(*windows()[:3], received=[0.0, 0.0, 0.0])
+    at_once = work(quick, lease, 0.1, Urgency())
+    glanced = work(quick, lease, 0.1, Urgency(defer=True))
+    assert (glanced.done, glanced.deferred, glanced.outgoing) == ((1, 2), 3, ())
+    assert [kinds(glanced, n) for n in (1, 2, 3)] == [["glance"], ["glance"], []]
+    left = claim(windows()[2], state=glanced.state, serial=1, received=[0.0])._replace(estimate=True)
+    [message] = left.messages
+    left = left._replace(messages=(message._replace(id=3),))
+    later = work(quick, left, 0.1, Urgency(defer=True))
+    assert (later.done, later.deferred) == ((3,), 0)
+    assert (later.state, later.outgoing) == (at_once.state, at_once.outgoing)
+    assert later.evidence == tuple(row for row in at_once.evidence if row.message == 3)
+
+
+def test_a_deferred_window_that_is_overtaken_before_its_turn_gets_a_glance_only():
+    quick = fleet(triage=TriageSettings())
+    glanced = work(quick, claim(windows()[1], received=[0.0]), 0.1, Urgency(defer=True))
+    assert (glanced.done, glanced.deferred, glanced.evidence) == ((), 1, ())
+    lease = claim(*windows()[1:3], state=glanced.state, serial=1, received=[0.0, 0.0])
+    again = work(quick, lease, 0.2, Urgency(defer=True))
+    assert (again.done, again.deferred, kinds(again, 1)) == ((1,), 2, ["glance"])
+
+
+def test_without_triage_no_window_is_deferred_and_other_work_leaves_what_was_deferred():
+    outcome = work(fleet(), claim(windows()[0], received=[0.0]), 0.1, Urgency(defer=True))
+    assert (outcome.done, outcome.deferred) == ((1,), 0)
+    assert work(fleet(), claim(state=outcome.state, serial=1), 0.2, Urgency(defer=True)).deferred is None
+
+
 def test_while_other_servos_wait_an_overtaken_window_is_stored_only():
     outcome = work(fleet(), claim(*windows()[:3], received=[0.0, 0.0, 0.0]), 0.1, Urgency(others_wait=True))
     assert [kinds(outcome, n) for n in (1, 2)] == [["glance"], ["glance"]]

@@ -5,9 +5,10 @@ from collections.abc import AsyncIterator, Sequence
 
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin_service import dispatcher as dispatching
-from servotwin.twin_service.dispatcher import Dispatcher, VerificationQuota, WorkPace
+from servotwin.twin_service.dispatcher import Dispatcher
 from servotwin.twin_service.ingest import Clocks
 from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPace
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import LeaseResult, WorkerLost
 
@@ -146,6 +147,29 @@ def test_jobs_are_as_large_as_the_work_is_quick():
     for _ in range(100):
         pace.note(0.001)
     assert pace.servos == 16
+
+
+def test_deferred_estimates_get_a_quarter_of_the_time_while_new_messages_wait():
+    share, spent = EstimateShare(), {True: 0.0, False: 0.0}
+    for _ in range(1000):
+        estimate = share.due
+        seconds = 0.03 if estimate else 0.016
+        share.note(seconds, estimate)
+        spent[estimate] += seconds
+    assert abs(spent[True] / sum(spent.values()) - 0.25) < 0.01
+    for _ in range(1000):  # nothing else to do: that is not held against them for long
+        share.note(0.03, True)
+    waits = 0
+    while not share.due:
+        share.note(0.016, False)
+        waits += 1
+    assert 0.016 * waits < 5.0
+
+
+def test_an_estimate_that_kills_its_workers_is_counted_although_glances_succeed():
+    estimate, window = claim("a", DIES)._replace(estimate=True), claim("a")
+    lender = through([[estimate], [window], [estimate], [window], [estimate]])
+    assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
 
 
 def test_a_servo_waits_until_its_share_of_a_worker_is_not_exceeded():

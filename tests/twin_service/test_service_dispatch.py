@@ -13,7 +13,7 @@ from service_system import bearer, place, twin_file, unpacked, window
 from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
-from servotwin.twin_service.dispatcher import VerificationQuota
+from servotwin.twin_service.pace import VerificationQuota
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker_pool import WorkerPool
