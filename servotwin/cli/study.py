@@ -72,13 +72,14 @@ def convert(
     motor_unit: MotorUnit = None,
     load_unit: LoadUnit = None,
 ) -> None:
-    """Convert a recorded log to another format; with --motor and --load any log, cleaned of what is damaged."""
+    """Convert a recorded log to another format; any other than servotwin's own is cleaned of what is damaged."""
     from servotwin.cli.simulate import convert as run
     from servotwin.cli.simulate import convert_recording
+    from servotwin.logs.log import holds_signals
     from servotwin.logs.recordings import RecordingColumns
 
     columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
-    if columns == RecordingColumns():
+    if columns == RecordingColumns() and holds_signals(log):
         run(log, output)
         return
     for defect, count in convert_recording(log, output, columns).items():

@@ -50,6 +50,10 @@ _PIECES = 10  # of a stroke on the average, in each of which noise and hunting a
 _SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
 _SKEW = 2.0  # samples between two channels that are nothing unusual
 _ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
+_EXCHANGED = (
+    "the motor's column follows the load's through a gap, and not the load's the motor's: --motor and --load are "
+    "exchanged, or the load overshoots at every reversal"
+)
 _CHANCE = 0.025  # on either side of a 95 % interval
 
 
@@ -140,6 +144,28 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     InvalidInput
         The motor or the load does not move, the motor never reverses, or the load jumps against it.
     """
+    found = _estimated(recording)
+    if found.interval_motor == NOTHING_KNOWN and _exchanged(recording):
+        return replace(found, reasons=(_EXCHANGED, *found.reasons))
+    return found
+
+
+def _exchanged(recording: EncoderRecording) -> bool:
+    """True where a lost motion shows with motor and load exchanged."""
+    other = replace(
+        recording,
+        motor=recording.load,
+        load=recording.motor,
+        motor_count=recording.load_count,
+        load_count=recording.motor_count,
+    )
+    try:
+        return _estimated(other).ok
+    except InvalidInput:
+        return False
+
+
+def _estimated(recording: EncoderRecording) -> LostMotion:
     motor_count, load_count = counts_of(recording)
     least = _least_motion(recording.motor, motor_count)
     strokes = strokes_of(recording, least)
