@@ -43,7 +43,9 @@ def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str
     fitting = [name for name in names if given in (name, bare_name(name))]
     within = [name for name in names if given == _last_part(name)]
     if not fitting and len(within) > 1:
-        raise InvalidInput(f"log {path}: --{part} {given!r}: {len(within)} columns end so: {', '.join(within)}; give one")
+        raise InvalidInput(
+            f"log {path}: --{part} {given!r}: {len(within)} columns end so: {', '.join(within)}; give one"
+        )
     fitting = fitting or within
     if not fitting:
         hint = did_you_mean(given, names)

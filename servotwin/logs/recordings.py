@@ -116,8 +116,7 @@ def read_recording(path: Path, wanted: RecordingColumns, told: Callable[[int], o
                 raise InvalidInput(f"log {path}: {error}") from None
             told(gathering.samples)
     clean = gathering.cleaned()
-    if clean.found.get(OUT_OF_ORDER, 0) > _JOINED * gathering.samples and clock.set_back is not None:
-        raise InvalidInput(f"log {path}: {clock.set_back}: two logs in one file, or two machines; give each by itself")
+    check_one_log(path, clean, clock)
     _check_left(path, clean, gathering.samples, damaged)
     thinned = THINNED in clean.found
     recording = EncoderRecording(
@@ -179,6 +178,17 @@ def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[
                 "they must be of one table"
             )
     return arrays
+
+
+def check_one_log(path: Path, clean: Cleaned, clock: LogClock) -> None:
+    """Refuse a log whose times begin anew and leave too many samples out of order.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    if clean.found.get(OUT_OF_ORDER, 0) > _JOINED * clock.samples and clock.set_back is not None:
+        raise InvalidInput(f"log {path}: {clock.set_back}: two logs in one file, or two machines; give each by itself")
 
 
 def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]) -> None:

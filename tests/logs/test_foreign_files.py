@@ -85,6 +85,12 @@ def test_two_logs_in_one_file_are_refused_where_the_clock_goes_back(tmp_path, ma
     assert "at sample 1601 its times go back by 7.995 s: two logs in one file" in refused(path)
 
 
+def test_two_logs_of_a_drive_in_one_file_are_refused_too(tmp_path, made):
+    one = np.column_stack([made.time, made.motor, made.load])
+    path = table(tmp_path / "two.csv", made, one, one, header="time,position [mm],force [N]")
+    assert "at sample 1601 its times go back by 7.995 s" in refused(path, command="commission")
+
+
 def test_a_small_step_back_of_the_clock_is_no_second_log(tmp_path, made):
     rows = np.column_stack([made.time, made.motor, made.load])
     rows[1300:, 0] -= 1.0
