@@ -116,7 +116,7 @@ def _batches() -> dict[str, Batch]:
     from benchmarks import logs, shelf
     from benchmarks.policies import loops
 
-    return {loops.NAME: loops.BATCH, logs.NAME: logs.BATCH, f"{logs.NAME}-dynamics": logs.DYNAMICS, **shelf.BATCHES}
+    return {loops.NAME: loops.BATCH, logs.NAME: logs.BATCH, **shelf.BATCHES}
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -108,7 +108,7 @@ def identify(
         typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
     ] = False,
     dynamics: Annotated[
-        bool, typer.Option("--dynamics", help="Fit the load's frequency, damping and friction beside the gap.")
+        bool, typer.Option("--dynamics", help="Fit the load's dynamics beside the gap, also where it does not swing.")
     ] = False,
     dates: Annotated[
         str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")

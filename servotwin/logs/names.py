@@ -54,7 +54,7 @@ def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str
 
 
 def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
-    """The column with the first of the guessed names that occurs; the last part of a path counts where it is the only."""
+    """The column with the first of the guessed names that occurs; the last part of a path counts where it is unique."""
     within: dict[str, list[str]] = {}
     for name in names:
         within.setdefault(_plain(_last_part(name)), []).append(name)

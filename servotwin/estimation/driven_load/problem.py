@@ -28,6 +28,7 @@ _FIRST = 0.02  # of the recording: what shows the first speed
 _VISCOUS = 0.05  # of the critical damping: where the load's own damping begins
 _SAMPLES = 12.0  # in a period of the fastest load: between two the motor is taken to move evenly
 _BEYOND, _LEAST_LIMIT = 1.5, 0.1  # times that one: a faster load costs time, and says nothing; least limit
+_MOST_DAMPED = 4.0  # of the critical damping: such a load does not swing
 _ENDS = (0.002, 0.998)
 _NONE = Controller(0.0, 0.0, 0.0, 1.0)
 
@@ -173,12 +174,18 @@ class DrivenLoad:
         return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
 
     def limits(self) -> Array:
-        """(u,) largest sizes of the unknowns; of the stiffness such that the samples nearly show the load."""
-        fastest = 2.0 * math.log(_BEYOND * self.fastest / self.dynamics.frequency)
-        stiffness = max(fastest, _LEAST_LIMIT)
+        """(u,) largest sizes of the unknowns: a load that nearly is too fast for the samples, or hardly swings.
+
+        A faster or stiffer one costs time, and says nothing.
+        """
+        most = {
+            "shaft stiffness": 2.0 * math.log(_BEYOND * self.fastest / self.dynamics.frequency),
+            "shaft damping": math.log(_MOST_DAMPED / self.dynamics.damping),
+            "load damping": math.log(_MOST_DAMPED / self.dynamics.viscous),
+        }
         return np.array(
             [
-                min(LARGEST * unknown.std, stiffness if unknown.name == "shaft stiffness" else math.inf)
+                min(LARGEST * unknown.std, max(most.get(unknown.name, math.inf), _LEAST_LIMIT))
                 for unknown in self.model.unknowns
             ]
         )

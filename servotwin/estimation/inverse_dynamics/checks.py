@@ -91,7 +91,7 @@ def check_one_drive(recording: DriveRecording, rows: Rows) -> None:
     if left < _LEFT_OF_TWO * whole.left and differ:
         raise InvalidInput(
             f"{recording.source}: in the first {100.0 * place / len(blocks):.0f} % of the motion the inertia is "
-            f"{before:.4g}, and {after:.4g} in the rest: two drives, loads or units in one log; give each part by itself"
+            f"{before:.4g}, and {after:.4g} in the rest: two drives, loads or units in one log; give each by itself"
         )
 
 

@@ -93,7 +93,7 @@ def test_the_longest_part_without_a_pause_counts(made, found):
 def test_the_table_of_models_says_why_the_dynamics_were_taken_or_not(found, made):
     taken = found.trial()
     assert (taken.name, taken.gap) == (MODEL, found.gap.lost.at_motor)
-    assert re.match(r"taken: \d+(\.\d+)? % of the error of play alone in the next samples, 9\.5\d? Hz", taken.evidence)
+    assert re.match(r"taken: \d+(\.\d+)? % of the error of play alone on unseen strokes, 9\.5\d? Hz", taken.evidence)
     known = LoadDynamics(1e4, 0.1, 0.0)
     fast = gap_of_driven_load(made, UNKNOWN, known)
     assert fast.trial().evidence.startswith("not taken: the load swings too fast for the recording: record at ")
