@@ -236,7 +236,16 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     result.add_column("preset")
     for heading in (
         *("logs", "lost\nmotion", "in its\ninterval", "or gap to\nlost motion", "gap in\ninterval"),
-        *("doubtful", "lost\nmotion in", "gap in", "refused", "ok without\nan axis", "gap in", "with an\naxis", "gap in"),
+        *(
+            "doubtful",
+            "lost\nmotion in",
+            "gap in",
+            "refused",
+            "ok without\nan axis",
+            "gap in",
+            "with an\naxis",
+            "gap in",
+        ),
     ):
         result.add_column(heading, justify="right")
     for name in (*SHELF, ""):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, carried, slowest_and_fastest
-from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
+from servotwin.estimation.driven_load.problem import ONE_MASS, DrivenLoad, Links, LoadDynamics
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial
@@ -23,16 +23,14 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 
-MODEL = "two masses"
-"""`model_kind` of an answer that this model gave."""
 _MOST = 10_000  # samples
 _PAUSE = 12.0  # usual intervals, over which nothing says how the load moved
 _LEAST, _ENOUGH = 6, 12  # strokes within them
 _DAMPED = 2.0  # of the critical damping: beyond, the load does not swing
 _FOLDS = 8  # parts of the recording, whose errors are compared
 _EVIDENCE = 2.0  # standard errors
-# Of the error of a model without dynamics: a larger one is no evidence for dynamics. Loads that the samples show left 0.02
-# to 0.6 %; loads that are too fast for them, and rigid ones whose counts the fit smooths, 24 to 40 %.
+# Of the error of play alone on unseen strokes: a larger one is no evidence for dynamics. Loads that the samples show
+# left 0.02 to 4 %; loads that are too fast for them, and rigid ones whose counts the fit smooths, 24 to 40 %.
 _BETTER = 0.1
 _SEEN = 0.75  # of the samples are fitted; the others are predicted
 _OTHERS = (0.8, 1.25)  # gaps over the best one that the recording must rule out
@@ -71,7 +69,8 @@ class DrivenGap(NamedTuple):
         tried = f"{100.0 * self.share:.3g} % of the error of play alone on unseen strokes"
         swings = "" if self.dynamics is None else f", {self.dynamics.frequency / (2.0 * math.pi):.3g} Hz"
         said = "taken: " + tried + swings if self.gap is not None else f"not taken: {self.reason}"
-        return ModelTrial(MODEL, found, math.nan, said)
+        name = "two masses" if self.dynamics is None else self.dynamics.name
+        return ModelTrial(name, found, math.nan, said)
 
 
 def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion, known: LoadDynamics | None = None) -> DrivenGap:
@@ -105,7 +104,8 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion, known: Loa
     cycles = lost.cycles if "cyclic" in lost.model else ()
     fitted, unseen = _parted(piece)
     strokes = max(round(_SEEN * strokes), 1)
-    problem = DrivenLoad(LoadDynamics(1.0, 1.0, 1.0), fitted, lost.ratio, 0.0, cycles)
+    blank = LoadDynamics(1.0, 1.0, 1.0)
+    problem = DrivenLoad(blank, fitted, lost.ratio, 0.0, cycles)
     quasi_static = _quasi_static(problem, lost)
     if known is not None and known.frequency > problem.fastest:
         return DrivenGap(None, known, _too_fast(known.frequency, problem))
@@ -130,7 +130,9 @@ def gap_of_driven_load(recording: EncoderRecording, lost: LostMotion, known: Loa
 
 
 def load_of(machine: Plant, load_unit: float) -> LoadDynamics | None:
-    """Dynamics of a machine's load, its masses taken for one; None where nothing between motor and load gives way.
+    """Dynamics of a machine's load; None where nothing between motor and load gives way.
+
+    A chain that is held to the ground is taken for one mass.
 
     `load_unit` is the recording's unit of the load in SI units.
     """
@@ -139,12 +141,16 @@ def load_of(machine: Plant, load_unit: float) -> LoadDynamics | None:
     stiffness, mass = machine.transmission.k_d, float(np.sum(machine.load.masses))
     frequency = math.sqrt(stiffness / mass)
     critical = 2.0 * mass * frequency
-    return LoadDynamics(
-        frequency,
-        machine.transmission.c_d / critical,
-        machine.guide.friction / stiffness / load_unit,
-        float(np.sum(machine.load.dampings)) / critical,
+    damping, friction = machine.transmission.c_d / critical, machine.guide.friction / stiffness / load_unit
+    load = machine.load
+    if load.n == 1 or not load.free:
+        return LoadDynamics(frequency, damping, friction, float(np.sum(load.dampings)) / critical)
+    links = Links(
+        tuple((load.masses / mass).tolist()),
+        tuple((load.stiffnesses[1:] / stiffness).tolist()),
+        tuple((load.dampings[1:] / critical).tolist()),
     )
+    return LoadDynamics(frequency, damping, friction, load.c[0] / critical, links)
 
 
 def swings(found: TransmissionGap) -> bool:
@@ -155,12 +161,15 @@ def swings(found: TransmissionGap) -> bool:
 def with_dynamics(recording: EncoderRecording, found: TransmissionGap, machine: Plant | None = None) -> TransmissionGap:
     """The gap that the load's dynamics show where the motion alone does not; else what is known, and the reason.
 
-    With a `machine` the search also begins at its load.
+    With a `machine` the search also begins at its load. One whose load is a chain is tried with one mass first.
     """
     if found.ok or found.status is GapStatus.LOWER_BOUND:
         return found
     known = None if machine is None else load_of(machine, units_of(recording, machine)[1])
-    driven = gap_of_driven_load(recording, found.lost, known)
+    single = known if known is None else replace(known, links=ONE_MASS)
+    driven = gap_of_driven_load(recording, found.lost, single)
+    if driven.gap is None and known is not None and len(known.links.masses) > 1:
+        driven = gap_of_driven_load(recording, found.lost, known)
     if driven.gap is not None:
         return replace(driven.gap, dynamics=driven.trial())
     *others, last = found.reasons or ("",)
@@ -198,7 +207,8 @@ def _unseen_share(found: LoadFit, recording: EncoderRecording, lost: LostMotion)
     """Error of the motion that a fit predicts in samples that it has not seen, over that of play alone."""
     problem = replace(found.problem, dynamics=found.dynamics, recording=recording)
     values = carried(found, problem, found.gap)
-    values[-2:] = problem.start(0.0, 0.0)[-2:]
+    states = -2 * problem.model.axis.n
+    values[states:] = problem.start(0.0, 0.0)[states:]
     settled = min(round(_SETTLED / (found.rate * problem.interval)), problem.position.size // 2)
     left = problem.misfit(values, found.rate)[settled:]
     bare = problem.quasi_static_misfit(_quasi_static(problem, lost), found.rate)[settled:]
@@ -320,7 +330,7 @@ def _answer(found: LoadFit, half: float, lost: LostMotion) -> TransmissionGap:
         lag=float(found.fit.values[DELAY]),
         status=GapStatus.OK,
         reasons=(),
-        model=MODEL,
+        model=found.dynamics.name,
         rms=found.rms,
     )
     interval = (max(at_motor - half, 0.0), at_motor + half)
