@@ -13,12 +13,13 @@ from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, carried, slowest_and_fastest
 from servotwin.estimation.driven_load.problem import ONE_MASS, DrivenLoad, Links, LoadDynamics
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
+from servotwin.estimation.kinematic.curves import FittedCurves
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, units_of
-from servotwin.estimation.output_error.models import DELAY, HALF
+from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
@@ -306,6 +307,14 @@ def _std(found: LoadFit, slower: LoadFit, counts: float) -> float:
     return math.hypot(statistical, slower.gap - found.gap, counts / math.sqrt(12.0))
 
 
+def _curves(found: LoadFit, ratio: float) -> FittedCurves:
+    """What the fit leaves of the next samples, and the motor's lead; other gaps were tried at two places only."""
+    problem, none = found.problem, np.empty(0)
+    driven = found.scale * problem.drive + float(found.fit.values[OFFSET])
+    time = problem.recording.time[0] + problem.interval * np.arange(driven.size)
+    return FittedCurves(time, problem.position, (driven - problem.position) / ratio, found.fit.raw, none, none)
+
+
 def _counts(recording: EncoderRecording, ratio: float) -> float:
     motor, load = counts_of(recording)
     return math.hypot(motor * ratio, load)
@@ -332,6 +341,8 @@ def _answer(found: LoadFit, half: float, lost: LostMotion) -> TransmissionGap:
         reasons=(),
         model=found.dynamics.name,
         rms=found.rms,
+        local=(),
+        curves=_curves(found, ratio),
     )
     interval = (max(at_motor - half, 0.0), at_motor + half)
     return TransmissionGap(shown, at_motor, std, interval, GapStatus.OK, (reason,))

@@ -13,7 +13,7 @@ from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
-from servotwin.estimation.kinematic.local import LocalGap, local_gaps
+from servotwin.estimation.kinematic.local import LocalGap, drift_of, local_gaps
 from servotwin.estimation.kinematic.models import Model, ModelScore, chosen
 from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
@@ -190,7 +190,8 @@ def _estimated(recording: EncoderRecording) -> LostMotion:
     found = _answer(recording, prepared, best, comparisons, least)
     shown = found.at_motor if math.isfinite(found.at_motor) else 0.0
     curves = fitted_curves(prepared._replace(lag=found.lag), best.model, shown, found.interval_motor)
-    return replace(found, curves=curves)
+    drift = "" if found.ok else drift_of(found.local, recording.motor_unit)
+    return replace(found, curves=curves, reasons=(drift, *found.reasons) if drift else found.reasons)
 
 
 def _least_motion(values: Array, count: float) -> float:

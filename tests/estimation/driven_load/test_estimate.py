@@ -61,6 +61,14 @@ def test_the_gap_is_told_from_the_wind_up_of_an_unknown_load(found):
     assert found.gap.lost.model == "two masses"
 
 
+def test_the_picture_shows_what_the_dynamics_leave(found):
+    curves = found.gap.lost.curves
+    assert curves.time.size == curves.load.size == curves.residual.size
+    assert np.sqrt(np.mean(curves.residual**2)) == pytest.approx(found.gap.lost.rms)
+    # The motor leads by half the gap and the wind-up where it pushes.
+    assert 0.5 * GAP < np.quantile(np.abs(curves.lead), 0.9) < 2.0 * GAP
+
+
 def test_the_dynamics_of_the_load_are_found_too(found):
     assert found.dynamics.frequency == pytest.approx(FREQUENCY, rel=5e-3)
     assert found.dynamics.friction == pytest.approx(FRICTION, rel=2e-2)
