@@ -31,7 +31,7 @@ _DAMPED = 2.0  # of the critical damping: beyond, the load does not swing
 _FOLDS = 8  # parts of the recording, whose errors are compared
 _EVIDENCE = 2.0  # standard errors
 # Of the error of play alone on unseen strokes: a larger one is no evidence for dynamics. Loads that the samples show
-# left 0.02 to 4 %; loads that are too fast for them, and rigid ones whose counts the fit smooths, 24 to 40 %.
+# left 0.02 to 8 %; loads that are too fast for them, and rigid ones whose counts the fit smooths, 24 to 40 %.
 _BETTER = 0.1
 _SEEN = 0.75  # of the samples are fitted; the others are predicted
 _OTHERS = (0.8, 1.25)  # gaps over the best one that the recording must rule out
