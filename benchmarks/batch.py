@@ -116,12 +116,7 @@ def _batches() -> dict[str, Batch]:
     from benchmarks import axis_presets, logs
     from benchmarks.policies import loops
 
-    return {
-        loops.NAME: loops.BATCH,
-        logs.NAME: logs.BATCH,
-        f"{logs.NAME}-dynamics": logs.DYNAMICS,
-        **axis_presets.BATCHES,
-    }
+    return {loops.NAME: loops.BATCH, logs.NAME: logs.BATCH, **axis_presets.BATCHES}
 
 
 def main(arguments: Sequence[str]) -> None:

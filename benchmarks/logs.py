@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,8 +23,7 @@ from benchmarks.axis_presets import DUTIES
 from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import with_dynamics
-from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.driven_load.estimate import swings, with_dynamics
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within, wind_up
@@ -117,11 +115,6 @@ class LogCase:
         )
 
 
-def _swings(found: TransmissionGap) -> bool:
-    """True where play alone shows not even the lost motion, for the load swings or winds up."""
-    return not (found.ok or found.lost.ok or found.status is GapStatus.LOWER_BOUND)
-
-
 def _counted(values: Array, count: float) -> Array:
     return np.round(values / count) * count if count else values
 
@@ -170,15 +163,19 @@ def _answered(case: LogCase, path: Path, table: Array) -> _Answered:
     recording = read_recording(path, WRITERS[case.file](path, table)).recording
     lost = estimate_lost_motion(recording)
     in_si = replace(recording, load_unit=position_unit(case.plant).si)
+    machine = Axis.preset(case.name)
     try:
-        known: TransmissionGap | str = gap_of_machine(in_si, lost, Axis.preset(case.name))
+        known: TransmissionGap | str = gap_of_machine(in_si, lost, machine)
     except InvalidInput as error:
         known = str(error).partition(": ")[2]
-    return _Answered(in_si, gap_within(lost, None), known)
+    if not isinstance(known, str) and swings(known):
+        known = with_dynamics(in_si, known, machine)
+    alone = gap_within(lost, None)
+    return _Answered(in_si, with_dynamics(in_si, alone) if swings(alone) else alone, known)
 
 
-def measured(case: LogCase, dynamics: bool = False) -> dict[str, Any]:
-    """Write a case's log, read it and estimate its gap; with `dynamics` those of a load that swings too."""
+def measured(case: LogCase) -> dict[str, Any]:
+    """Write a case's log, read it and estimate its gap as `servotwin identify` does."""
     table, defects = damaged(case.recorded(), np.random.default_rng([*case.seed, 3]), wrapped=True)
     found: dict[str, Any] = {
         "gap": case.gap, "lost": case.gap + case.wind_up, "speed": case.speed, "file": case.file, "defects": defects,
@@ -192,10 +189,6 @@ def measured(case: LogCase, dynamics: bool = False) -> dict[str, Any]:
     answer, lost = answered.alone, answered.alone.lost
     known = answered.with_axis
     of_axis = {"status": "refused", "reasons": [known]} if isinstance(known, str) else _said(known)
-    if dynamics:
-        begun = time.process_time()
-        fitted = with_dynamics(answered.recording, answer) if _swings(answer) else answer
-        found["dynamics"] = _said(fitted) | {"seconds": time.process_time() - begun}
     return found | {
         "axis": of_axis,
         "ratio": lost.ratio / case.plant.p,
@@ -207,11 +200,6 @@ def measured(case: LogCase, dynamics: bool = False) -> dict[str, Any]:
         "interval": _numbers(answer.interval_motor),
         "interval_load": _numbers(answer.interval_load),
     }
-
-
-def measured_with_dynamics(case: LogCase) -> dict[str, Any]:
-    """As `measured`, with the dynamics of the load where play alone shows nothing."""
-    return measured(case, dynamics=True)
 
 
 def _said(found: TransmissionGap) -> dict[str, Any]:
@@ -248,7 +236,16 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     result.add_column("preset")
     for heading in (
         *("logs", "lost\nmotion", "in its\ninterval", "or gap to\nlost motion", "gap in\ninterval"),
-        *("doubtful", "lost\nmotion in", "gap in", "refused", "ok without\nan axis", "with an\naxis", "gap in"),
+        *(
+            "doubtful",
+            "lost\nmotion in",
+            "gap in",
+            "refused",
+            "ok without\nan axis",
+            "gap in",
+            "with an\naxis",
+            "gap in",
+        ),
     ):
         result.add_column(heading, justify="right")
     for name in (*DUTIES, ""):
@@ -266,6 +263,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
 def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     accepted = [each for each in rows if each["status"] == "lost motion"]
     known = [each for each in rows if each.get("axis", {}).get("status") == "ok"]
+    fine = [each for each in rows if each["status"] == "ok"]
     doubtful = [each for each in rows if each["status"] not in ("ok", "lost motion", "refused")]
     return (
         len(rows),
@@ -277,7 +275,8 @@ def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
         sum(inside(each["lost_motion_interval"], each["lost"]) for each in doubtful),
         sum(inside(each["interval"], each["gap"]) for each in doubtful),
         sum(each["status"] == "refused" for each in rows),
-        sum(each["status"] == "ok" for each in rows),
+        len(fine),
+        sum(inside(each["interval"], each["gap"]) for each in fine),
         len(known),
         sum(inside(each["axis"]["interval"], each["gap"]) for each in known),
     )
@@ -285,5 +284,3 @@ def _line(rows: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
 
 BATCH = Batch(_units, measured, _show, tuple(DUTIES))
 """For `benchmarks.batch`."""
-DYNAMICS = Batch(_units, measured_with_dynamics, _show, tuple(DUTIES))
-"""The same with the dynamics of loads that swing, which take half a minute each."""

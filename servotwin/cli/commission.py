@@ -253,6 +253,7 @@ def _remarks(found: CommissionedAxis) -> list[str]:
             f"force by {100 * simulated.force_error:.2g} %"
         )
     lines += _shaft_lines(found)
+    lines += [drive.late] if drive.late else []
     lines += [f"no simulation: {doubt}" for doubt in drive.doubts]
     if found.axis is None:
         lines.append(
@@ -383,5 +384,6 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
         "gap": _gap_dict(found.logs[0]),
         "force_per_command": found.force_per_command,
         "doubts": list(drive.doubts),
+        "late": drive.late or None,
         "next_experiment": str(drive.advice),
     }

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import with_dynamics
+from servotwin.estimation.driven_load.estimate import swings, with_dynamics
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
@@ -49,7 +49,8 @@ def show(
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
-    With `dynamics` the load's frequency, damping and friction are fitted beside the gap.
+    The load's frequency, damping and friction are fitted beside the gap where play alone shows that it swings, and
+    with `dynamics` in any log whose gap is not known.
 
     Raises
     ------
@@ -75,7 +76,7 @@ def show(
             lost = estimate_lost_motion(log.recording)
             known = 0.0 if stiff else None
             found = gap_within(lost, known) if machine is None else gap_of_machine(log.recording, lost, machine)
-            if dynamics:
+            if dynamics or swings(found):
                 status.update(f"{path.name}: dynamics of the load")
                 found = with_dynamics(log.recording, found, machine)
             answers.append((log, found))

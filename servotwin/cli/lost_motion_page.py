@@ -14,6 +14,7 @@ from servotwin.report import style
 from servotwin.report.page import page
 from servotwin.runtime import files
 
+_NOT_SHOWN = "not known with this model"
 _SUFFIXES = (".html", ".png", ".svg")
 
 
@@ -60,6 +61,9 @@ def picture(log: RecordedLog, found: TransmissionGap) -> Any:
             local.axhspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0, label="95 % interval")
         local.plot([each.position for each in lost.local], [each.gap * scale for each in lost.local], "o",
                    markersize=3.0, color=style.BLUE)  # fmt: skip
+        for panel, known in ((local, lost.local), (profile, curves is not None and curves.gaps.size)):
+            if not known:
+                panel.text(0.5, 0.5, _NOT_SHOWN, transform=panel.transAxes, ha="center", va="center", color=style.GREY)
         loop.set(xlabel=f"Load position ({unit})", ylabel=f"Motor's lead, at the load ({unit})")
         local.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, None))
         left.set(xlabel="Time (s)", ylabel=f"Left by the model ({unit})")

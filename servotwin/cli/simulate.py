@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import servotwin as st
 from servotwin.cosim import Loop
+from servotwin.errors import InvalidInput
 from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import check_output, read_log, write_log
 from servotwin.logs.recordings import RecordingColumns, read_recording
@@ -54,9 +55,15 @@ def convert(log: Path, output: Path) -> Path:
     InvalidInput
         The log is not one, or the output cannot be written.
     """
-    check_output(output)
+    _check_another_file(log, output)
     write_log(read_log(log).table(), output)
     return output
+
+
+def _check_another_file(log: Path, output: Path) -> None:
+    check_output(output)
+    if log.resolve() == output.resolve():
+        raise InvalidInput(f"output {output}: is the log itself, which would be lost: give another name")
 
 
 def convert_recording(log: Path, output: Path, columns: RecordingColumns) -> Mapping[str, int]:
@@ -67,7 +74,7 @@ def convert_recording(log: Path, output: Path, columns: RecordingColumns) -> Map
     InvalidInput
         The log is not one, or the output cannot be written.
     """
-    check_output(output)
+    _check_another_file(log, output)
     read = read_recording(log, columns)
     made = read.recording
     table = {"time_s": made.time, f"motor [{made.motor_unit}]": made.motor, f"load [{made.load_unit}]": made.load}

@@ -72,13 +72,14 @@ def convert(
     motor_unit: MotorUnit = None,
     load_unit: LoadUnit = None,
 ) -> None:
-    """Convert a recorded log to another format; with --motor and --load any log, cleaned of what is damaged."""
+    """Convert a recorded log to another format; any other than servotwin's own is cleaned of what is damaged."""
     from servotwin.cli.simulate import convert as run
     from servotwin.cli.simulate import convert_recording
+    from servotwin.logs.log import holds_signals
     from servotwin.logs.recordings import RecordingColumns
 
     columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
-    if columns == RecordingColumns():
+    if columns == RecordingColumns() and holds_signals(log):
         run(log, output)
         return
     for defect, count in convert_recording(log, output, columns).items():
@@ -107,7 +108,7 @@ def identify(
         typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
     ] = False,
     dynamics: Annotated[
-        bool, typer.Option("--dynamics", help="Fit the load's frequency, damping and friction beside the gap.")
+        bool, typer.Option("--dynamics", help="Fit the load's dynamics beside the gap, also where it does not swing.")
     ] = False,
     dates: Annotated[
         str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")

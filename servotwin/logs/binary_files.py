@@ -32,7 +32,7 @@ def read_npz(path: Path, requested: Collection[str]) -> LogColumns:
                 {name: place.of(arrays[place.array]) for name, place in wanted.items()}, tuple(places), metadata
             )
     except _DAMAGED as error:
-        raise InvalidInput(f"log {path}: is not an .npz file of numbers ({str(error).splitlines()[0]})") from None
+        raise InvalidInput(f"log {path}: is not an .npz file of numbers{_why(error)}") from None
 
 
 def _head(file: IO[bytes]) -> tuple[tuple[int, ...], np.dtype[Any]]:
@@ -48,11 +48,17 @@ def read_npy(path: Path, requested: Collection[str]) -> LogColumns:
     try:
         array = np.load(path, mmap_mode="r", allow_pickle=False)
     except _DAMAGED as error:
-        raise InvalidInput(f"log {path}: is not an .npy file of numbers ({str(error).splitlines()[0]})") from None
+        raise InvalidInput(f"log {path}: is not an .npy file of numbers{_why(error)}") from None
     places = places_of("", array.shape, array.dtype)
     if not array.dtype.names:
         places = {f"col{i}": place for i, place in enumerate(places.values(), 1)}
     return LogColumns({name: place.of(array) for name, place in places.items() if name in requested}, tuple(places), {})
+
+
+def _why(error: Exception) -> str:
+    """NumPy's reason in brackets; where it advises to load Python objects it took another kind of file for them."""
+    text = (str(error).splitlines() or [""])[0]
+    return f" ({text})" if text and "pickle" not in text else ""
 
 
 def write_npz(table: SignalTable, path: Path) -> None:

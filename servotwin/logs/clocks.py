@@ -24,7 +24,18 @@ _SECONDS = {
     **dict.fromkeys(("d", "days"), _DAY),
 }
 _SHOWN = ("s", "ms", "us", "ns", "min", "h", "d")
+_SET_BACK = 100.0  # usual intervals: a smaller step back is disorder
 _CONTINUES = 5.0  # usual intervals, within which a clock that was set back goes on
+
+
+class SetBack(NamedTuple):
+    """Sample, counted from 1, at which a log's times go back, and by how much, s."""
+
+    sample: int
+    by: float
+
+    def __str__(self) -> str:
+        return f"at sample {self.sample} its times go back by {self.by:.4g} s"
 
 
 class _Epoch(NamedTuple):
@@ -82,9 +93,12 @@ class LogClock:
         self._path, self._unit, self._rate = path, unit.lower(), rate
         self._epoch: _Epoch | None = None
         self._last = np.nan  # as the log has it, s
+        self._newest: Array | None = None  # the last time, s
         self._shift = 0.0  # s, by which midnights and hours moved it
         self.samples = 0
         self.found: dict[str, int] = {}
+        self.set_back: SetBack | None = None
+        """The largest step back of its times, beyond some samples."""
 
     def seconds(self, times: Array | None, size: int) -> Array:
         """Times of the next block, (size,) s; NaN where the log has none.
@@ -106,8 +120,23 @@ class LogClock:
         if self._epoch is not None:
             name = f"with times in {self._epoch.name}"
             self.found[name] = self.found.get(name, 0) + size
-            return times * self._epoch.unit + self._epoch.begin
-        return self._continued(times * _SECONDS.get(self._unit, 1.0))
+            result = times * self._epoch.unit + self._epoch.begin
+        else:
+            result = self._continued(times * _SECONDS.get(self._unit, 1.0))
+        self._note_set_back(result, before)
+        return result
+
+    def _note_set_back(self, times: Array, before: int) -> None:
+        known = np.flatnonzero(np.isfinite(times))
+        own = times[known]
+        steps = np.diff(own, prepend=own[:1] if self._newest is None else self._newest)
+        if not steps.size:
+            return
+        place, usual = int(np.argmin(steps)), float(np.median(np.abs(steps)))
+        least = 0.0 if self.set_back is None else self.set_back.by
+        if -steps[place] > max(least, _SET_BACK * usual):
+            self.set_back = SetBack(before + int(known[place]) + 1, -float(steps[place]))
+        self._newest = own[-1:]
 
     def _continued(self, times: Array) -> Array:
         """The times with the days and hours that a clock on the wall leaves out."""

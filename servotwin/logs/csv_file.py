@@ -103,7 +103,7 @@ def _layout(path: Path) -> _Layout:
         raise InvalidInput(f"log {path}: line 1 must name the columns; the file holds no row")
     separator = _separator([line for _, line in kept[1:_LOOKED_AT]] or [kept[0][1]])
     rows = [_cells(line, separator) for _, line in kept]
-    comma = separator != "," and any(_COMMA.match(cell) for cells in rows[1:_LOOKED_AT] for cell in cells)
+    comma = any(_decimal_comma(cell, separator) for cells in rows[1:_LOOKED_AT] for cell in cells)
     size = _usual_size(rows[1:_LOOKED_AT] or rows)
     first = next((i for i, cells in enumerate(rows) if _numeric(cells[:size], comma)), len(rows))
     # Above the names there may be prose.
@@ -118,6 +118,11 @@ def _layout(path: Path) -> _Layout:
         names = [_with_unit(name, unit) for name, unit in zip(names, heads[1], strict=True)]
     last = kept[first][0] if first < len(kept) else len(lines)
     return _Layout(encoding, separator, comma, tuple(names), bool(heads), last, metadata)
+
+
+def _decimal_comma(cell: str, separator: str | None) -> bool:
+    """True for a cell with a decimal comma; between commas it stands in quotes, where thousands may stand as well."""
+    return _COMMA.match(cell) is not None and (separator != "," or _THOUSANDS.match(cell) is None)
 
 
 def _no_numbers(path: Path, kept: Sequence[tuple[int, str]], rows: Sequence[Sequence[str]], size: int) -> str:

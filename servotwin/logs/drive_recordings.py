@@ -19,7 +19,7 @@ from servotwin.logs.cleaning import cleaned
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.log import read_columns
 from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
-from servotwin.logs.recordings import CUT, TIME_NAMES, numbers_of
+from servotwin.logs.recordings import CUT, TIME_NAMES, check_one_log, numbers_of
 from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
@@ -135,6 +135,7 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
         clean = cleaned(time, arrays, turns)
     except InvalidInput as error:
         raise InvalidInput(f"log {path}: {error}") from None
+    check_one_log(path, clean, clock)
     if clean.time.size < _LEAST:
         raise InvalidInput(f"log {path}: {clean.time.size} samples can be used, of at least {_LEAST}")
     grid, usable, rate = _grid(clean.time)

@@ -48,6 +48,11 @@ class Log:
         return next(name for name, unit in names if unit.exact and unit.si == self.unit(channel))
 
 
+def holds_signals(path: Path) -> bool:
+    """True for a log that `read_log` may read: it has a position under one of servotwin's own names."""
+    return not set(SIGNAL_COLUMNS["position"]).isdisjoint(read_columns(path, ()).names)
+
+
 def read_log(path: Path) -> Log:
     """Read a log, complete and uniformly sampled.
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import sys
+import traceback
 from collections.abc import Collection
 from pathlib import Path
 
@@ -23,7 +26,7 @@ def read_mdf(path: Path, requested: Collection[str]) -> LogColumns:
     """
     asammdf = require("asammdf", f"log {path}")
     try:
-        with asammdf.MDF(path) as file:
+        with path.open("rb") as opened, asammdf.MDF(opened) as file:
             places: dict[str, tuple[int, int]] = {}
             for group, each in enumerate(file.groups):
                 master = file.masters_db.get(group)
@@ -43,4 +46,16 @@ def read_mdf(path: Path, requested: Collection[str]) -> LogColumns:
     # The library raises whatever a damaged file leads to.
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
+        _let_go(error)
         raise InvalidInput(f"log {path}: is not an MDF file that can be read ({reason})") from None
+
+
+def _let_go(error: Exception) -> None:
+    """Drop what a failed reading holds: the library's half-made file complains on the standard error when it ends."""
+    before, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        traceback.clear_frames(error.__traceback__)
+        error.__traceback__ = None
+        gc.collect()
+    finally:
+        sys.unraisablehook = before

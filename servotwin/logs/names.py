@@ -41,6 +41,12 @@ def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str
         There is none.
     """
     fitting = [name for name in names if given in (name, bare_name(name))]
+    within = [name for name in names if given == _last_part(name)]
+    if not fitting and len(within) > 1:
+        raise InvalidInput(
+            f"log {path}: --{part} {given!r}: {len(within)} columns end so: {', '.join(within)}; give one"
+        )
+    fitting = fitting or within
     if not fitting:
         hint = did_you_mean(given, names)
         raise InvalidInput(f"log {path}: --{part} {given!r}: there is no such column{hint}; it has {', '.join(names)}")
@@ -48,9 +54,22 @@ def given_column(path: Path, part: str, given: str, names: Sequence[str]) -> str
 
 
 def guessed_column(guesses: Sequence[str], names: Sequence[str]) -> str | None:
-    """The column with the first of the guessed names that occurs."""
-    bare = {bare_name(name).lower().replace(" ", "_"): name for name in reversed(names)}
-    return next((bare[guess] for guess in guesses if guess in bare), None)
+    """The column with the first of the guessed names that occurs; the last part of a path counts where it is unique."""
+    within: dict[str, list[str]] = {}
+    for name in names:
+        within.setdefault(_plain(_last_part(name)), []).append(name)
+    known = {part: found[0] for part, found in within.items() if len(found) == 1}
+    known |= {_plain(bare_name(name)): name for name in reversed(names)}
+    return next((known[guess] for guess in guesses if guess in known), None)
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace(" ", "_")
+
+
+def _last_part(name: str) -> str:
+    """Name of a column within its structure or group, without its unit."""
+    return bare_name(name).rpartition("/")[2]
 
 
 def bare_name(name: str) -> str:

@@ -13,7 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.estimation.kinematic.wind_up import ANGLES
-from servotwin.logs.cleaning import SAME_TIME, Cleaned
+from servotwin.logs.cleaning import OUT_OF_ORDER, SAME_TIME, Cleaned
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
@@ -21,13 +21,15 @@ from servotwin.logs.log import read_blocks, read_columns
 from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
 from servotwin.plant.signals import Array
 
-CUT = "last line without its end: the file may have been cut off there"
+CUT = "last row without its end: the file may have been cut off there"
 _LEAST = 100  # samples
 _BLOCK = 1_000_000  # samples that are cleaned at a time
 TURNED = "in a log with the newest first, which was turned round"
 _BACKWARDS = 0.9  # of the steps in time
+_JOINED = 0.3  # of the samples: so many out of order are no accident of a clock
 _LEFT = 0.3  # of the samples, at least: with fewer the log is not what it seems
-TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "datetime", "date_time", "date", "zeit", "x_value")
+_INDEX = "__index_level_0__"  # how pandas writes an index without a name
+TIME_NAMES = ("time", "t", "timestamp", "time_stamp", "datetime", "date_time", "date", "zeit", "x_value", _INDEX)
 """Names of a column of times, in order of preference."""
 # Names by which columns are found where none is given, in order of preference.
 _GUESSES = {
@@ -114,6 +116,7 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
                 raise InvalidInput(f"log {path}: {error}") from None
             progress(gathering.samples)
     clean = gathering.cleaned()
+    check_one_log(path, clean, clock)
     _check_left(path, clean, gathering.samples, damaged)
     thinned = THINNED in clean.found
     recording = EncoderRecording(
@@ -177,8 +180,21 @@ def _arrays(path: Path, chosen: Mapping[str, str], columns: LogColumns) -> dict[
     return arrays
 
 
+def check_one_log(path: Path, clean: Cleaned, clock: LogClock) -> None:
+    """Refuse a log whose times begin anew and leave too many samples out of order.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    if clean.found.get(OUT_OF_ORDER, 0) > _JOINED * clock.samples and clock.set_back is not None:
+        raise InvalidInput(f"log {path}: {clock.set_back}: two logs in one file, or two machines; give each by itself")
+
+
 def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str]) -> None:
     left = clean.time.size
+    if size == 0:
+        raise InvalidInput(f"log {path}: holds no row of numbers below the names of its columns")
     if left == 1 and clean.found.get(SAME_TIME, 0) > _LEFT * size:
         raise InvalidInput(f"log {path}: its {size} samples have one time stamp: give --rate in Hz")
     whole = size - clean.found.get(THINNED, 0) - clean.found.get(PARTED, 0)
@@ -230,6 +246,8 @@ def numbers_of(path: Path, name: str, columns: LogColumns) -> Array:
     """
     values = columns.values[name]
     kind = getattr(getattr(values, "dtype", None), "kind", "")
+    if name == _INDEX and kind in "iu":
+        raise InvalidInput(f"log {path}: the table's index counts rows: give --time COLUMN, or --rate in Hz")
     if kind in "mM" and kind:
         values = values.astype("datetime64[ns]" if kind == "M" else "timedelta64[ns]").astype(np.int64) * 1e-9
     try:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import logging
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,13 +27,15 @@ def read_tdms(path: Path, requested: Collection[str]) -> LogColumns:
         npTDMS is not installed, or the file is damaged.
     """
     nptdms = require("nptdms", f"log {path}")
+    cut = False
     try:
-        with path.open("rb") as opened, nptdms.TdmsFile.open(opened) as file:
+        with path.open("rb") as opened, _silent(nptdms), nptdms.TdmsFile.open(opened) as file:
+            cut = file.file_status.incomplete_final_segment
             groups = [group for group in file.groups() if group.channels()]
             channels = {_name(channel, len(groups) > 1): channel for group in groups for channel in group.channels()}
             if not any("wf_increment" in channel.properties for channel in channels.values()):
                 found = {name: channel[:] for name, channel in channels.items() if name in requested}
-                return LogColumns(found, tuple(channels), {})
+                return LogColumns(found, tuple(channels), {}, ends_within_line=cut)
 
             def channel_of(name: str) -> TimedChannel:
                 channel = channels[name]
@@ -46,11 +50,23 @@ def read_tdms(path: Path, requested: Collection[str]) -> LogColumns:
 
             first = min(_start(channel) for channel in channels.values())
 
-            return one_table(tuple(channels), requested, channel_of)
+            return one_table(tuple(channels), requested, channel_of)._replace(ends_within_line=cut)
     # The library raises whatever a damaged file leads to.
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = "it is cut off" if cut else (str(error).splitlines() or [type(error).__name__])[0]
         raise InvalidInput(f"log {path}: is not a TDMS file that can be read ({reason})") from None
+
+
+@contextmanager
+def _silent(nptdms: Any) -> Iterator[None]:
+    """The library without its warnings on the standard error: that a file is cut off is told as a defect."""
+    manager = nptdms.log.log_manager
+    before = manager.log_level
+    manager.set_level(logging.ERROR)
+    try:
+        yield
+    finally:
+        manager.set_level(before)
 
 
 def _start(channel: Any) -> float:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from servotwin.estimation.core.whitening import Autoregression
-from servotwin.estimation.driven_load.problem import DrivenLoad, LoadDynamics
+from servotwin.estimation.driven_load.problem import ONE_MASS, DrivenLoad, LoadDynamics
 from servotwin.estimation.output_error.fit import Fit, descend
 from servotwin.estimation.output_error.models import HALF, OFFSET, RATIO
 from servotwin.plant.signals import Array
@@ -62,7 +62,7 @@ class LoadFit:
     @property
     def lost(self) -> float:
         """Gap and wind-up together, the load's unit."""
-        return self.gap + 2.0 * self.dynamics.friction
+        return self.gap + 2.0 * self.dynamics.friction * self.dynamics.compliance
 
     @property
     def dynamics(self) -> LoadDynamics:
@@ -79,7 +79,8 @@ class LoadFit:
     def split(self, gap: float, steps: int, gap_free: bool) -> LoadFit:
         """Fit with that gap (the load's unit) first, or only; the rest of the lost motion is wind-up to begin with."""
         wind_up = max(0.5 * (self.lost - gap), _LEAST_WIND_UP * self.lost)
-        problem = self.problem.with_load(replace(self.dynamics, friction=wind_up))
+        dynamics = self.dynamics
+        problem = self.problem.with_load(replace(dynamics, friction=wind_up / dynamics.compliance))
         return descended(problem, carried(self, problem, gap), steps, self.rate, gap_free)
 
 
@@ -87,7 +88,8 @@ def carried(found: LoadFit, problem: DrivenLoad, gap: float) -> Array:
     """Unknowns (u,) of a problem whose load was set anew: what does not belong to the load is kept."""
     old = found.fit.values
     values = problem.model.start(0.5 * gap / found.scale, float(old[OFFSET]), (0.0, 0.0))
-    values[OFFSET : RATIO + 1], values[-2:] = old[OFFSET : RATIO + 1], old[-2:]
+    states = -2 * problem.model.axis.n
+    values[OFFSET : RATIO + 1], values[states:] = old[OFFSET : RATIO + 1], old[states:]
     return values
 
 
@@ -117,8 +119,9 @@ def best_fit(
     if not high > 2.0 * low:
         return None
     reach, middle = problem.range, -0.5 * float(np.max(problem.lead) + np.min(problem.lead))
+    links = ONE_MASS if known is None else known.links
     begins = [
-        [LoadDynamics(each, _DAMPING, friction * reach) for friction in _FRICTIONS]
+        [LoadDynamics(each, _DAMPING, friction * reach, links=links) for friction in _FRICTIONS]
         for each in np.geomspace(low, high, _FREQUENCIES).tolist()
     ]
     kept = []

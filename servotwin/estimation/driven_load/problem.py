@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.signal import lfilter
@@ -28,8 +29,31 @@ _FIRST = 0.02  # of the recording: what shows the first speed
 _VISCOUS = 0.05  # of the critical damping: where the load's own damping begins
 _SAMPLES = 12.0  # in a period of the fastest load: between two the motor is taken to move evenly
 _BEYOND, _LEAST_LIMIT = 1.5, 0.1  # times that one: a faster load costs time, and says nothing; least limit
+_MOST_DAMPED = 4.0  # of the critical damping: such a load does not swing
 _ENDS = (0.002, 0.998)
+_FACTORS = ("shaft stiffness", "shaft damping", "load damping", "load friction", "load stiffness", "mass ratio")
 _NONE = Controller(0.0, 0.0, 0.0, 1.0)
+
+
+class Links(NamedTuple):
+    """Masses of a load that is a chain, from the spring outwards, and the links between each and the one before it.
+
+    Attributes
+    ----------
+    masses : tuple of float
+        n, of which the sum is 1.
+    stiffnesses : tuple of float
+        n - 1, over the stiffness of the spring.
+    dampings : tuple of float
+        n - 1, as shares of the critical damping of the load as one mass.
+    """
+
+    masses: tuple[float, ...] = (1.0,)
+    stiffnesses: tuple[float, ...] = ()
+    dampings: tuple[float, ...] = ()
+
+
+ONE_MASS = Links()
 
 
 @dataclass(frozen=True)
@@ -46,30 +70,60 @@ class LoadDynamics:
         Coulomb friction over the stiffness: how far the spring winds up while the load slides, the load's unit.
     viscous : float
         Of the load on the ground, as a share of the critical damping.
+    links : Links
+        One mass, or a chain of which the last mass rubs and has the encoder.
     """
 
     frequency: float
     damping: float
     friction: float
     viscous: float = _VISCOUS
+    links: Links = ONE_MASS
+
+    @property
+    def name(self) -> str:
+        """Of the model, the motor's mass included."""
+        n = len(self.links.masses)
+        return "two masses" if n == 1 else f"chain of {n + 1} masses"
+
+    @property
+    def compliance(self) -> float:
+        """From the motor to the last mass, over that of the spring."""
+        return 1.0 + sum(1.0 / each for each in self.links.stiffnesses)
 
     def machine(self) -> Axis:
         """An axis of this load, its mass one, behind a motor that moves as it likes."""
         k = self.frequency**2
         shaft = Transmission(1.0, k, 2.0 * self.damping * self.frequency, in_gap="free")
-        load = Load((1.0,), c=(2.0 * self.viscous * self.frequency,), friction=k * self.friction)
+        inner = tuple(2.0 * each * self.frequency for each in self.links.dampings)
+        load = Load(
+            self.links.masses,
+            (0.0, *(k * each for each in self.links.stiffnesses)),
+            (2.0 * self.viscous * self.frequency, *inner),
+            friction=k * self.friction,
+        )
         return Axis(TorqueDrive(1.0), shaft, load, _NONE)
 
     def moved(self, model: ShaftModel, values: Array) -> LoadDynamics:
         """The load at unknowns (u,) of a model that began here."""
         named = dict(zip((each.name for each in model.unknowns), values.tolist(), strict=True))
-        stiffness = math.exp(named["shaft stiffness"])
-        slower = math.sqrt(stiffness)
+        factor = {name: math.exp(named.get(name, 0.0)) for name in _FACTORS}
+        *inner, last = self.links.masses
+        masses = (*inner, last * factor["mass ratio"])
+        total, stiffness = sum(masses), factor["shaft stiffness"]
+        faster = math.sqrt(stiffness / total)
+        drag = factor["load damping"] / (total * faster)
+        links = Links(
+            tuple(each / total for each in masses),
+            tuple(each * factor["load stiffness"] / stiffness for each in self.links.stiffnesses),
+            tuple(each * drag for each in self.links.dampings),
+        )
         return LoadDynamics(
-            self.frequency * slower,
-            self.damping * math.exp(named["shaft damping"]) / slower,
-            self.friction * math.exp(named["load friction"]) / stiffness,
-            self.viscous * math.exp(named["load damping"]) / slower,
+            self.frequency * faster,
+            self.damping * factor["shaft damping"] / (total * faster),
+            self.friction * factor["load friction"] / stiffness,
+            self.viscous * drag,
+            links,
         )
 
 
@@ -173,12 +227,18 @@ class DrivenLoad:
         return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
 
     def limits(self) -> Array:
-        """(u,) largest sizes of the unknowns; of the stiffness such that the samples nearly show the load."""
-        fastest = 2.0 * math.log(_BEYOND * self.fastest / self.dynamics.frequency)
-        stiffness = max(fastest, _LEAST_LIMIT)
+        """(u,) largest sizes of the unknowns: a load that nearly is too fast for the samples, or hardly swings.
+
+        A faster or stiffer one costs time, and says nothing.
+        """
+        most = {
+            "shaft stiffness": 2.0 * math.log(_BEYOND * self.fastest / self.dynamics.frequency),
+            "shaft damping": _room(self.dynamics.damping),
+            "load damping": _room(self.dynamics.viscous),
+        }
         return np.array(
             [
-                min(LARGEST * unknown.std, stiffness if unknown.name == "shaft stiffness" else math.inf)
+                min(LARGEST * unknown.std, max(most.get(unknown.name, math.inf), _LEAST_LIMIT))
                 for unknown in self.model.unknowns
             ]
         )
@@ -219,3 +279,8 @@ class DrivenLoad:
     def on_one_flank(self, values: Array) -> list[list[Array]]:
         """None: a lost motion shows both."""
         return [[values]]
+
+
+def _room(damping: float) -> float:
+    """Logarithm of the factor from a damping to the largest one."""
+    return math.log(_MOST_DAMPED / damping) if damping > 0.0 else math.inf

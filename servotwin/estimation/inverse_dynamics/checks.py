@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,6 +22,9 @@ _ONE_WAY = 0.02  # of the way: share in the rarer direction
 _SAME_SPEED = 0.1  # of the speed: part that is no combination of its sign and the others
 _STEADY = 0.02  # of the acceleration, likewise
 _UNEXPLAINED = 0.7  # of the force
+_JUMP, _FAST = 10.0, 0.999  # times the way from sample to sample, and its quantile
+_LEFT_OF_TWO = 0.3  # of what one drive's parameters leave: two drives' do not leave more
+_OTHER_INERTIA = 1.2  # ratio of two drives' inertias
 
 
 def at_limit(recording: DriveRecording) -> Mask:
@@ -58,6 +62,49 @@ def check_motion(recording: DriveRecording) -> None:
             f"{recording.source}: the command is {recording.force[0]:g} {recording.force_unit} throughout: record the "
             "torque, current or voltage that the controller demands"
         )
+    steps = np.diff(recording.position)
+    place, usual = int(np.argmax(np.abs(steps))), float(np.quantile(np.abs(steps), _FAST))
+    if abs(steps[place]) > _JUMP * max(usual, recording.resolution):
+        raise InvalidInput(
+            f"{recording.source}: {(place + 1) / recording.rate:.4g} s after its begin the position jumps by "
+            f"{steps[place]:+.3g} {unit}, and else by {usual:.3g} {unit} at most from sample to sample: the encoder "
+            "slipped, its unit changes, or two logs were joined; give each part by itself"
+        )
+
+
+def check_one_drive(recording: DriveRecording, rows: Rows) -> None:
+    """Refuse a recording of which two parts have two inertias, and next to nothing is left then.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    design, blocks = rows.design[:, :4], rows.blocks
+    whole = _fit_of(design, rows.force)
+    tried = []
+    for block in np.unique(blocks)[1:]:
+        behind = blocks >= block
+        one, other = (_fit_of(design[part], rows.force[part]) for part in (~behind, behind))
+        tried.append((math.hypot(one.left, other.left), one.inertia, other.inertia, int(np.argmax(behind))))
+    left, before, after, place = min(tried)
+    differ = min(before, after) > 0.0 and max(before, after) > _OTHER_INERTIA * min(before, after)
+    if left < _LEFT_OF_TWO * whole.left and differ:
+        raise InvalidInput(
+            f"{recording.source}: in the first {100.0 * place / len(blocks):.0f} % of the motion the inertia is "
+            f"{before:.4g}, and {after:.4g} in the rest: two drives, loads or units in one log; give each by itself"
+        )
+
+
+class _PartFit(NamedTuple):
+    """Inertia, and norm of the force that is left."""
+
+    inertia: float
+    left: float
+
+
+def _fit_of(design: Array, force: Array) -> _PartFit:
+    values = np.linalg.lstsq(design, force, rcond=None)[0]
+    return _PartFit(float(values[0]), float(np.linalg.norm(force - design @ values)))
 
 
 def check_limit(recording: DriveRecording, motion: DriveMotion) -> None:

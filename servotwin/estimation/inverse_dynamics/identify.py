@@ -13,6 +13,7 @@ from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, b
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
+from servotwin.estimation.inverse_dynamics.lateness import said_late
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
@@ -44,6 +45,8 @@ class IdentifiedDrive:
         From motor to load, of the first recording; None: it has no load encoder.
     split : ParameterFit or None
         With the inertias before and behind the shaft; None: the recording shows no elasticity.
+    late : str
+        By how much command and position of the first recording are not of one time; empty: they are.
     """
 
     symmetric: ParameterFit
@@ -55,6 +58,7 @@ class IdentifiedDrive:
     advice: NextExperiment
     shaft: ShaftResponse | None = None
     split: ParameterFit | None = None
+    late: str = ""
 
 
 def identify_drive(
@@ -92,6 +96,7 @@ def identify_drive(
         motions.append(motion)
         bands.append(band)
         rows.append(rows_of(each, motion, band, cycle_time(motion)))
+        checks.check_one_drive(each, rows[-1])
         held.append(rows_of(held_command(each), motion, band, cycle_time(motion)))
     every = joined(rows)
     checks.check_separable(used[0], every)
@@ -102,9 +107,10 @@ def identify_drive(
     law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
     # No further motion shows more of what the hold does.
     advice = next_experiment(fits[0], every, motions[0], used[0].unit)
+    late = said_late(used[0], motions[0], bands[0])
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
-    return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split)
+    return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split, late)
 
 
 def stated_law(cascade: GivenGains, pid: GivenPid) -> GivenLaw:

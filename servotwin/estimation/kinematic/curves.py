@@ -23,7 +23,7 @@ class FittedCurves(NamedTuple):
         Times in s, positions of the load, by how much the motor leads it (the motor's unit, the lag taken off), and
         what the model leaves (the load's).
     gaps, rms : (g,) array
-        Error of the model, the load's unit, for gaps from 0 to beyond the one found.
+        Error of the model, the load's unit, for gaps from 0 to beyond the one found; empty for a model of the dynamics.
     """
 
     time: Array

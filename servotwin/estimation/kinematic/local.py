@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from servotwin.plant.signals import Array
 
+_LEAST, _CLEAR = 8, 0.9  # reversals, and correlation of their lost motion with the time
 _SHARE = 0.25  # of a stroke, next to the reversal
 
 
@@ -63,4 +65,18 @@ def _beside(before: tuple[int, int], after: tuple[int, int]) -> tuple[slice, sli
     length, other = before[1] - before[0], after[1] - after[0]
     return slice(before[1] - max(1, int(_SHARE * length)), before[1]), slice(
         after[0], after[0] + max(1, int(_SHARE * other))
+    )
+
+
+def drift_of(found: Sequence[LocalGap], unit: str) -> str:
+    """Say that the lost motion of the reversals grows or falls while the log lasts; empty: it does not."""
+    if len(found) < _LEAST:
+        return ""
+    times, gaps = (np.array([getattr(each, name) for each in found]) for name in ("time", "gap"))
+    if np.ptp(times) == 0.0 or np.ptp(gaps) == 0.0 or abs(np.corrcoef(times, gaps)[0, 1]) < _CLEAR:
+        return ""
+    slope, value = np.polyfit(times - times[0], gaps, 1)
+    return (
+        f"the lost motion of the reversals goes from {value:.4g} to {value + slope * np.ptp(times):.4g} {unit} in this "
+        "log: the machine changes; give the log in parts"
     )

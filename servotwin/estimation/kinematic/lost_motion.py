@@ -13,7 +13,7 @@ from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
-from servotwin.estimation.kinematic.local import LocalGap, local_gaps
+from servotwin.estimation.kinematic.local import LocalGap, drift_of, local_gaps
 from servotwin.estimation.kinematic.models import Model, ModelScore, chosen
 from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
@@ -50,6 +50,10 @@ _PIECES = 10  # of a stroke on the average, in each of which noise and hunting a
 _SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
 _SKEW = 2.0  # samples between two channels that are nothing unusual
 _ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
+_EXCHANGED = (
+    "the motor's column follows the load's through a gap, and not the load's the motor's: --motor and --load are "
+    "exchanged, or the load overshoots at every reversal"
+)
 _CHANCE = 0.025  # on either side of a 95 % interval
 
 
@@ -140,6 +144,28 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     InvalidInput
         The motor or the load does not move, the motor never reverses, or the load jumps against it.
     """
+    found = _estimated(recording)
+    if found.interval_motor == NOTHING_KNOWN and _exchanged(recording):
+        return replace(found, reasons=(_EXCHANGED, *found.reasons))
+    return found
+
+
+def _exchanged(recording: EncoderRecording) -> bool:
+    """True where a lost motion shows with motor and load exchanged."""
+    other = replace(
+        recording,
+        motor=recording.load,
+        load=recording.motor,
+        motor_count=recording.load_count,
+        load_count=recording.motor_count,
+    )
+    try:
+        return _estimated(other).ok
+    except InvalidInput:
+        return False
+
+
+def _estimated(recording: EncoderRecording) -> LostMotion:
     motor_count, load_count = counts_of(recording)
     least = _least_motion(recording.motor, motor_count)
     strokes = strokes_of(recording, least)
@@ -164,7 +190,8 @@ def estimate_lost_motion(recording: EncoderRecording) -> LostMotion:
     found = _answer(recording, prepared, best, comparisons, least)
     shown = found.at_motor if math.isfinite(found.at_motor) else 0.0
     curves = fitted_curves(prepared._replace(lag=found.lag), best.model, shown, found.interval_motor)
-    return replace(found, curves=curves)
+    drift = "" if found.ok else drift_of(found.local, recording.motor_unit)
+    return replace(found, curves=curves, reasons=(drift, *found.reasons) if drift else found.reasons)
 
 
 def _least_motion(values: Array, count: float) -> float:

@@ -1,5 +1,6 @@
 """Parameters of a drive from its command and position."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -118,6 +119,7 @@ def refused(**changes):
 
 
 SPEED = np.abs(np.gradient(strokes(cycles=2)))
+SECOND_HALF = np.arange(strokes().size) > strokes().size / 2
 ONE_WAY = recording_of(np.cumsum(SPEED + 1e-5), 3.0 + 1e4 * SPEED + 1e5 * np.gradient(SPEED))
 
 
@@ -134,6 +136,9 @@ ONE_WAY = recording_of(np.cumsum(SPEED + 1e-5), 3.0 + 1e4 * SPEED + 1e5 * np.gra
         (refused(force=lambda each: np.clip(each.force, -15.0, 15.0)), "at its limit of 15 N"),
         (ONE_WAY, "goes forwards only"),
         (prescribed(speeds=(0.1,), acceleration=5.0, cruise=1.5), "one speed only"),
+        (refused(position=lambda each: each.position + 0.01 * SECOND_HALF), r"the position jumps by \+0.01 m"),
+        (refused(position=lambda each: each.position * (1.0 + 999.0 * SECOND_HALF)), "two drives, loads or units"),
+        (refused(force=lambda each: each.force * (1.0 + SECOND_HALF)), r"inertia is 20\.\d+, and 39\.\d+ in the rest"),
     ],
 )
 def test_a_recording_that_does_not_show_the_parameters_is_refused(recording, says):
@@ -153,3 +158,12 @@ def test_reference_and_position_that_are_swapped_are_told():
     log = simulated()
     with pytest.raises(InvalidInput, match="--reference and --motor are swapped"):
         identify_drive([replace(log, position=log.reference, reference=log.position)], p=P)
+
+
+@pytest.mark.parametrize("shift", [20, -20])
+def test_a_command_that_is_not_of_the_positions_time_is_told(shift):
+    log = prescribed()
+    found = identify_drive([replace(log, force=np.roll(log.force, -shift))])
+    sense = "later" if shift > 0 else "earlier"
+    assert re.search(rf"best (3[6-9]|4\d)\.?\d* ms {sense} than it was logged", found.late)
+    assert identify_drive([log]).late == ""

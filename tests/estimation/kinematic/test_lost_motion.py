@@ -188,3 +188,16 @@ def test_curves_take_the_lag_off_and_have_their_least_error_at_the_gap():
     assert curves.gaps[0] == 0.0
     # Before: the lag of 20 ms let the loop bulge by several gaps.
     assert np.ptp(np.quantile(curves.lead, (0.01, 0.99))) == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_gap_that_grows_within_the_log_is_said_to():
+    made = recording(seconds=40.0, rate=200.0, noise=0.0, gap=0.0)
+    half = 0.5 * np.linspace(0.03, 0.09, made.time.size)
+    place, load = 0.0, np.empty(made.time.size)
+    for row, motor in enumerate(made.motor):
+        place = min(max(place, motor - half[row]), motor + half[row])
+        load[row] = 0.1 * place
+    found = estimate_lost_motion(replace(made, load=load))
+    assert not found.ok
+    assert "goes from 0.03" in found.reasons[0]
+    assert "give the log in parts" in found.reasons[0]
