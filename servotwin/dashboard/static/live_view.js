@@ -7,7 +7,7 @@ import { positionUnit } from "./format.js";
 
 const ASK_MS = 500, IDLE_MS = 3000, SHOWN_S = 30;
 const WORDS = {
-  off: ["Off at the edge", "The edge's file does not allow it: live = true in its table [twin] would. Over MQTT, and with edges of earlier versions, there is no live view."],
+  off: ["Off at the edge", "The edge's file does not allow it: live = true in its table [twin] would. With edges of earlier versions there is none."],
   away: ["The edge is not connected", "The live view begins when it is."],
   waiting: ["Waiting", "The edge has been asked; nothing has come yet."],
   live: ["Live", "Least and greatest sample of each column. The edge streams while a page like this one is looked at."],
