@@ -24,7 +24,7 @@ export class LiveViewPanel {
     this.note = element("span", { class: "soft" });
     const places = [element("div", { class: "chart low" }), element("div", { class: "chart low" }), element("div", { class: "chart low" })];
     const band = { series: [{ label: "greatest", color: "blue", width: 1 }, { label: "least", color: "blue", width: 1 }], bands: [[1, 2, "blue"]] };
-    this.plots = places.map((place) => new TimePlot(place, { sync: "live", xLabel: "Time to the newest sample (s)", ...band }));
+    this.plots = places.map((place) => new TimePlot(place, { sync: "live", moving: true, xLabel: "Time to the newest sample (s)", ...band }));
     this.body = element("div", { hidden: true }, legend(["blue band", "least to greatest sample of each 100 ms"]), element("div", { class: "three" }, places));
     this.content = [element("p", { class: "live" }, this.word, " ", this.note), this.body];
     this.seen = () => this.schedule(0);
