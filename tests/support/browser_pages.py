@@ -43,7 +43,7 @@ WATCH_SHIFTS = """new PerformanceObserver((list) => {
         performance.timeOrigin, entry.startTime, entry.value,
         entry.sources.map((each) => [part(each.node), place(each.previousRect), place(each.currentRect)])]);
 }).observe({ type: "layout-shift", buffered: true })"""
-"""Tells each shift without an input or another width of the window: load of the page (ms), time since then (ms), size, what moved from where."""
+"""Tells each shift without an input or a resize: load of the page (ms), time since then (ms), size, what moved."""
 
 
 def layout_shift(shifts):
