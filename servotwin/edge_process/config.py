@@ -56,7 +56,7 @@ class TwinLink:
         bool,
         key(
             help="While somebody watches the machine on the twin's dashboard, send the least and greatest position, "
-            "error and voltage of each 100 ms; over HTTP only.",
+            "error and voltage of each 100 ms.",
             later=True,
         ),
     ] = False
@@ -71,8 +71,6 @@ class TwinLink:
             raise InvalidInput(f"user = {self.user!r} is for a broker, mqtt(s)://host[:port]; url is {self.url!r}")
         if (self.password_file, self.password_env).count(None) != (2 if self.user is None else 1):
             raise InvalidInput("user and one of password_file and password_env belong together")
-        if self.live and self.over_mqtt:
-            raise InvalidInput(f"live = true works over http(s):// only; url is {self.url!r}")
         if (self.token_file is None) == (self.token_env is None):
             raise InvalidInput("token_file or token_env is needed, and only one of them")
         check(self)

@@ -76,7 +76,7 @@ class LinkProcess:
             self._sender = Sender(self._session, self._transport)
             self._receiver = Receiver(self._transport, config.agent.servo, self._token, cursor, retry, random.random)
         self._outbox_changed, self._stopping = Event(), Event()
-        self._live = _live_view(config, samples, self._transport, self._stopping)
+        self._live = _live_view(config, run, samples, self._transport, self._stopping)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._outgoing: list[bytes] = []
@@ -340,11 +340,13 @@ def _outbox(config: EdgeConfig) -> SqliteOutbox:
 
 
 def _live_view(
-    config: EdgeConfig, samples: SampleReader | None, transport: ExclusiveTransport | None, stopping: Event
+    config: EdgeConfig, run: str, samples: SampleReader | None, transport: ExclusiveTransport | None, stopping: Event
 ) -> LiveView | None:
     """Make the live view where the edge's file allows it."""
-    link = live_link(config)
-    if link is None or samples is None or transport is None:
+    if samples is None or transport is None:
+        return None
+    link = live_link(config, run)
+    if link is None:
         return None
     agent = config.agent
     return LiveView(link, samples, agent.servo, agent.sample_rate, lambda: transport.claim, stopping)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from servotwin import __version__
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.live_view import LiveLink
 from servotwin.link.claim import ClaimingTransport, ExclusiveTransport, HeldClaim
 from servotwin.link.sqlite_outbox import SqliteOutbox
+
+if TYPE_CHECKING:
+    from servotwin.link.broker import Broker
 
 _CLAIM = "claim"
 """Name under which the outbox keeps the claim of the last run."""
@@ -32,16 +36,19 @@ def exclusive_transport(config: EdgeConfig, outbox: SqliteOutbox, run: str) -> E
     )
 
 
-def live_link(config: EdgeConfig) -> LiveLink | None:
+def live_link(config: EdgeConfig, run: str) -> LiveLink | None:
     """Make the connection of the live view; None: the edge's file does not allow it."""
     twin = config.twin
     if twin is None or not twin.live:
         return None
+    servo, token = config.agent.servo, link_token(config)
+    if twin.over_mqtt:
+        from servotwin.link.mqtt import LiveMqtt
+
+        return LiveMqtt(_broker(config, twin), servo, token, twin.timeout_s, twin.wait_s, run)
     from servotwin.link.http import LiveHttp
 
-    return LiveHttp(
-        twin.url, config.agent.servo, link_token(config), _ca_file(config, twin), twin.timeout_s, twin.wait_s
-    )
+    return LiveHttp(twin.url, servo, token, _ca_file(config, twin), twin.timeout_s, twin.wait_s)
 
 
 def _ca_file(config: EdgeConfig, twin: TwinLink) -> str | None:
@@ -57,11 +64,16 @@ def _http(config: EdgeConfig, twin: TwinLink, _run: str) -> ClaimingTransport:
 
 
 def _mqtt(config: EdgeConfig, twin: TwinLink, run: str) -> ClaimingTransport:
-    from servotwin.link.broker import Broker
     from servotwin.link.mqtt import MqttTransport
 
-    broker = Broker(twin.url, twin.user, password_of(twin, config.folder), _ca_file(config, twin))
-    return MqttTransport(broker, config.agent.servo, link_token(config), twin.timeout_s, twin.wait_s, run)
+    servo, token = config.agent.servo, link_token(config)
+    return MqttTransport(_broker(config, twin), servo, token, twin.timeout_s, twin.wait_s, run)
+
+
+def _broker(config: EdgeConfig, twin: TwinLink) -> Broker:
+    from servotwin.link.broker import Broker
+
+    return Broker(twin.url, twin.user, password_of(twin, config.folder), _ca_file(config, twin))
 
 
 _TRANSPORTS: dict[str, Callable[[EdgeConfig, TwinLink, str], ClaimingTransport]] = {"http": _http, "mqtt": _mqtt}

@@ -33,6 +33,7 @@ from servotwin.link.mqtt_messages import (
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, ClaimStatus, EdgeClaim, InvalidMessage, Refusal
+from servotwin.messages.live import LiveColumns, encode_live
 
 _SESSION_S = 3600
 _NO_MESSAGE = 2**53
@@ -55,6 +56,8 @@ class MqttTransport:
     run : str
         Name of this run of the edge. It is part of the client's name: a broker that sees a name twice ends the older
         connection, and two edges of one servo would do that to each other for ever.
+    session_s : int
+        Time for which the broker keeps what it has for this end after its connection broke, s.
     """
 
     def __init__(
@@ -65,6 +68,7 @@ class MqttTransport:
         timeout_s: float = 10.0,
         wait_s: float = 25.0,
         run: str = "",
+        session_s: int = _SESSION_S,
     ) -> None:
         self._servo, self._key, self.claim = servo, key_of(verifier_of(token)), HeldClaim()
         self._timeout, self._wait = timeout_s, wait_s
@@ -75,7 +79,7 @@ class MqttTransport:
         self._without_subscriber: set[int] = set()
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
         name = f"servotwin-edge-{servo}" + (f"-{run}" if run else "")
-        session = MqttSession(name, (response_topic(servo), TWIN_GONE), _SESSION_S)
+        session = MqttSession(name, (response_topic(servo), TWIN_GONE), session_s)
         self._connection = Connection(
             broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._no_subscriber)
         )
@@ -102,6 +106,18 @@ class MqttTransport:
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a claim is none")
         return response.claim_status
+
+    def stream(self, columns: LiveColumns, claim: HeldClaim) -> bool:
+        """Send columns of a live view; see `LiveMqtt`."""
+        wait = 0.0 if columns.columns else self._wait
+        # In a poll, as a claim is: a twin of an earlier version answers it like any other.
+        asked = PollRequest(_NO_MESSAGE, wait, claim.text, live=encode_live(columns))
+        response = self._request(asked, wait + self._timeout)
+        if not isinstance(response, PollResponse):
+            raise Unreachable("the answer to a live view is none")
+        if response.watched is None:
+            raise Refused(Refusal.UNKNOWN_SCHEMA, "the twin is of a version without the live view over a broker")
+        return response.watched
 
     def close(self) -> None:
         """Close the connection; requests under way raise `Unreachable`."""
@@ -193,6 +209,34 @@ class MqttTransport:
             waiting = list(self._waiting.values())
         for future in waiting:
             _set_result(future, Unreachable(why))
+
+
+class LiveMqtt:
+    """The live view's connection to a broker, beside that of windows and letters, which it cannot hold up.
+
+    Parameters
+    ----------
+    broker, servo, token, timeout_s, wait_s, run
+        As those of `MqttTransport`.
+    """
+
+    def __init__(self, broker: Broker, servo: str, token: str, timeout_s: float, wait_s: float, run: str) -> None:
+        # What the broker would keep for it while it is away is old.
+        self._transport = MqttTransport(broker, servo, token, timeout_s, wait_s, f"{run}-live", session_s=0)
+
+    def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:
+        """Send columns; without any, wait until somebody watches. Return True while somebody does.
+
+        Raises
+        ------
+        Refused, Unreachable
+            Refused with UNKNOWN_SCHEMA: the twin is of a version without the live view over a broker.
+        """
+        return self._transport.stream(columns, claim)
+
+    def close(self) -> None:
+        """Close the connection; the request under way fails at once."""
+        self._transport.close()
 
 
 def _set_result(future: Future[MqttResponse | UnknownPeer], result: MqttResponse | UnknownPeer | Exception) -> None:

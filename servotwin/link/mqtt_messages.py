@@ -15,6 +15,7 @@ from msgspec import Meta, Struct, field
 from servotwin.link.seal import OVERHEAD, TO_TWIN, Sealed, opened, seal
 from servotwin.messages import MAX_BYTES, ClaimStatus, EdgeClaim, InvalidMessage, Refusal
 from servotwin.messages.checks import Count
+from servotwin.messages.live import MAX_LIVE_BYTES
 
 ROOT = "servotwin"
 TWIN_GONE = f"{ROOT}/gone"
@@ -59,12 +60,16 @@ class PollRequest(Struct, frozen=True, omit_defaults=True, tag="listen/1"):
         Claim that the sender holds; "": none.
     question : EdgeClaim, optional
         Question or claim, which is answered at once, without messages. A twin of a version without claims ignores it.
+    live : bytes, optional
+        Encoded columns of a live view, which are answered without messages: at once, or where there are none as soon as
+        somebody watches. A twin of a version without live views over a broker ignores them.
     """
 
     after: Count
     wait: Annotated[float, Meta(ge=0.0, le=30.0)]
     claim: ClaimText = ""
     question: EdgeClaim | None = None
+    live: Annotated[bytes, Meta(max_length=MAX_LIVE_BYTES)] | None = None
 
 
 class PutResponse(Struct, frozen=True, tag="taken/1"):
@@ -72,10 +77,14 @@ class PutResponse(Struct, frozen=True, tag="taken/1"):
 
 
 class PollResponse(Struct, frozen=True, omit_defaults=True, tag="heard/1"):
-    """Response: messages, each sealed, with rising serials; `claim_status` is the answer to a question."""
+    """Response: messages, each sealed, with rising serials.
+
+    `claim_status` is the answer to a question, `watched` that to columns of a live view: True while somebody watches.
+    """
 
     messages: list[bytes]
     claim_status: ClaimStatus | None = field(default=None, name="standing")
+    watched: bool | None = None
 
 
 class RefusedResponse(Struct, frozen=True, tag="refused/1"):

@@ -177,9 +177,9 @@ class EdgeGate:
         self._access.check_servo(servo, token)
         self.admit_authenticated_poll(servo)
 
-    def admit_authenticated(self, servo: str) -> None:
+    def admit_authenticated(self, servo: str, *, limited: bool = True) -> None:
         """`admit` for a servo whose seal was checked already."""
-        self._admit(servo, self._messages)
+        self._admit(servo, self._messages if limited else None)
 
     def admit_authenticated_poll(self, servo: str) -> None:
         """`admit_poll` for a servo whose seal was checked already."""

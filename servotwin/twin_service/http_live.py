@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-from servotwin.messages import InvalidMessage, Refusal
-from servotwin.messages.live import MAX_LIVE_BYTES, Watched, decode_columns, encode_live
+from servotwin.messages import Refusal
+from servotwin.messages.live import MAX_LIVE_BYTES, Watched, encode_live
 from servotwin.twin_service.auth import EdgeGate
-from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
 from servotwin.twin_service.http_edge import MAX_WAIT_S, SERVO_PATH
 from servotwin.twin_service.http_operator import admitted_servo
 from servotwin.twin_service.http_server import BodyReader
-from servotwin.twin_service.limits import RateLimiter, RequestRejected
-from servotwin.twin_service.live_views import LiveViews
+from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.live_views import LiveIntake, LiveViews
 from servotwin.twin_service.openapi import (
     CLAIM,
     INTEGER,
@@ -28,8 +25,6 @@ from servotwin.twin_service.openapi import (
 from servotwin.twin_service.sessions import OperatorAccess
 
 _BODY_S = 10.0
-_RATE, _BURST = 4.0, 12.0
-"""Messages of one edge: per s, and at once; it sends two a second."""
 
 
 class LiveApi:
@@ -39,23 +34,13 @@ class LiveApi:
     ----------
     gate : EdgeGate
     operators : OperatorAccess
-    claims : EdgeClaims
+    intake : LiveIntake
     views : LiveViews
-    monotonic : callable
-        s.
     """
 
-    def __init__(
-        self,
-        gate: EdgeGate,
-        operators: OperatorAccess,
-        claims: EdgeClaims,
-        views: LiveViews,
-        monotonic: Callable[[], float],
-    ) -> None:
-        self._gate, self._operators, self._claims, self._views = gate, operators, claims, views
+    def __init__(self, gate: EdgeGate, operators: OperatorAccess, intake: LiveIntake, views: LiveViews) -> None:
+        self._gate, self._operators, self._intake, self._views = gate, operators, intake, views
         self._bodies = BodyReader(MAX_LIVE_BYTES, _BODY_S)
-        self._limit = RateLimiter(_RATE, _BURST, monotonic, "live messages")
 
     def routes(self) -> list[HttpRoute]:
         """Declarations."""
@@ -90,20 +75,13 @@ class LiveApi:
     async def _post(self, request: HttpRequest) -> HttpResponse:
         servo = request.path["servo"]
         self._gate.admit(servo, request.token, limited=False)
-        self._limit.take(servo)
         wait = request.seconds("wait", 0.0)
         if wait > MAX_WAIT_S:
             detail = f"wait = {wait:g} s: at most {MAX_WAIT_S:g} s are allowed"
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, detail)
-        await self._claims.check(servo, request.claim)
+        await self._intake.admit(servo, request.claim)
         body = await self._bodies.read(request.content_length, request.receive)
-        try:
-            sent = decode_columns(body)
-        except InvalidMessage as error:
-            raise RequestRejected(error.refusal, str(error)) from None
-        if sent.servo != servo:
-            raise RequestRejected(Refusal.OTHER_NAME, f"the columns are of servo {sent.servo!r}, not of {servo!r}")
-        watched = self._views.take(servo, sent) if sent.columns else await self._views.wait(servo, wait)
+        watched = await self._intake.take(servo, body, wait)
         return HttpResponse(200, encode_live(Watched(watched)), MSGPACK)
 
     async def _get(self, request: HttpRequest) -> HttpResponse:

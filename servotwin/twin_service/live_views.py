@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from servotwin.messages import Refusal
-from servotwin.messages.live import COLUMN_S, LiveColumn, LiveColumns
-from servotwin.twin_service.limits import MAX_SERVOS, RequestRejected
+from servotwin.messages import InvalidMessage, Refusal
+from servotwin.messages.live import COLUMN_S, LiveColumn, LiveColumns, decode_columns
+from servotwin.twin_service.claims import EdgeClaims
+from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, RequestRejected
 
 WATCHED_S = 5.0
 """s after its last question for which a page still counts as watching."""
@@ -22,6 +23,8 @@ _STALE_S, _ALLOWED_S = 3.0, 40.0
 one that allows the view: longer than its longest wait."""
 _NOTHING: LiveColumn = (None, None, None, None, None, None)
 """Stands for a column that the edge could not send."""
+_RATE, _BURST = 4.0, 12.0
+"""Messages of one edge: per s, and at once; it sends two a second."""
 _POLLS = 2
 """Edges of one servo that may wait at once: one that was superseded may not have noticed yet."""
 
@@ -187,3 +190,40 @@ class LiveViews:
             others.discard(woken)
             if not others:
                 self._waiting.pop(servo, None)
+
+
+class LiveIntake:
+    """Takes what edges send for live views, over HTTP and MQTT; the sender's seal or token is checked before.
+
+    Parameters
+    ----------
+    claims : EdgeClaims
+    views : LiveViews
+    monotonic : callable
+        s.
+    """
+
+    def __init__(self, claims: EdgeClaims, views: LiveViews, monotonic: Callable[[], float]) -> None:
+        self._claims, self._views = claims, views
+        self._limit = RateLimiter(_RATE, _BURST, monotonic, "live messages")
+
+    async def admit(self, servo: str, claim: str) -> None:
+        """Check the rate of an edge and its claim; raises RequestRejected."""
+        self._limit.take(servo)
+        await self._claims.check(servo, claim)
+
+    async def take(self, servo: str, body: bytes, wait: float) -> bool:
+        """Take encoded columns, or wait `wait` s for a watcher where there are none; True while somebody watches.
+
+        Raises
+        ------
+        RequestRejected
+            The bytes are no columns, are another servo's, or too many edges wait.
+        """
+        try:
+            sent = decode_columns(body)
+        except InvalidMessage as error:
+            raise RequestRejected(error.refusal, str(error)) from None
+        if sent.servo != servo:
+            raise RequestRejected(Refusal.OTHER_NAME, f"the columns are of servo {sent.servo!r}, not of {servo!r}")
+        return self._views.take(servo, sent) if sent.columns else await self._views.wait(servo, wait)

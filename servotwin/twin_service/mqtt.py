@@ -34,6 +34,7 @@ from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_edge import LongPolls, seal_messages
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RequestRejected
+from servotwin.twin_service.live_views import LiveIntake
 from servotwin.twin_service.monitoring import Metrics
 
 log = logging.getLogger(__name__)
@@ -57,6 +58,7 @@ class MqttRequestHandler:
     ingest : Ingest
     polls : LongPolls
     claims : EdgeClaims
+    live : LiveIntake
     wake : callable
         Wakes the dispatcher after a new message.
     metrics : Metrics
@@ -68,11 +70,12 @@ class MqttRequestHandler:
         ingest: Ingest,
         polls: LongPolls,
         claims: EdgeClaims,
+        live: LiveIntake,
         wake: Callable[[], None],
         metrics: Metrics,
     ) -> None:
         self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
-        self._claims = claims
+        self._claims, self._live = claims, live
 
     def decode(self, servo: str, data: bytes) -> ReceivedRequest | bytes | None:
         """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
@@ -99,6 +102,10 @@ class MqttRequestHandler:
 
     async def _handle(self, request: ReceivedRequest) -> MqttResponse:
         servo, question = request.servo, request.content
+        if isinstance(question, PollRequest) and question.live is not None:
+            self._gate.admit_authenticated(servo, limited=False)
+            await self._live.admit(servo, question.claim)
+            return PollResponse([], watched=await self._live.take(servo, question.live, question.wait))
         if isinstance(question, PollRequest):
             self._gate.admit_authenticated_poll(servo)
             if question.question is not None:

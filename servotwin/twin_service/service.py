@@ -42,7 +42,7 @@ from servotwin.twin_service.http_webhook import WebhookApi
 from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
-from servotwin.twin_service.live_views import LiveViews
+from servotwin.twin_service.live_views import LiveIntake, LiveViews
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
@@ -158,11 +158,12 @@ class TwinService:
         self._changes = ChangeReader(self._reader, self._readers, _readable_elsewhere(store))
         self.feed = FleetFeed(self._changes, presence, config.watchers, self._shared)
         self.live_views = LiveViews(self.clocks.monotonic, presence, config.watchers, config.long_polls)
+        self._live_intake = LiveIntake(self.claims, self.live_views, self.clocks.monotonic)
         self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
         self._mqtt: MqttServer | None = None
         if config.mqtt is not None:
             handler = MqttRequestHandler(
-                self.gate, self.ingest, self.polls, self.claims, self.dispatcher.wake, self.metrics
+                self.gate, self.ingest, self.polls, self.claims, self._live_intake, self.dispatcher.wake, self.metrics
             )
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []
@@ -184,7 +185,7 @@ class TwinService:
             self.operators, self.store, self._readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
             self.clocks.monotonic,
         )  # fmt: skip
-        live = LiveApi(self.gate, self.operators, self.claims, self.live_views, self.clocks.monotonic)
+        live = LiveApi(self.gate, self.operators, self._live_intake, self.live_views)
         parquet = ParquetApi(self.operators, self.store, self._readers, self.what_if)
         webhook = WebhookApi(self.operators, self.config.webhook, self.clocks.monotonic)
         parts = edge, operator, dashboard, what_if, acts, live, parquet, webhook

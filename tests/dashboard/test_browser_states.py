@@ -195,10 +195,31 @@ def test_states_are_photographed_and_accessible(open_page, twin, theme):
     take("session-ended")
 
 
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_bad_input_is_photographed_and_accessible(open_page, twin, theme):
+    page = open_page(theme=theme, expected=("status of",))
+    page.add_init_script("delete globalThis.SharedWorker; const now = Date.now; Date.now = () => now() - 7.2e6;")
+    rows = httpx.get(f"{twin.url}/v1/fleet?limit=1000", headers=bearer(OPERATOR)).json()
+    hostile = {"servo": MARKUP, "status": MARKUP, "alarms": [{"time": 0.0, "sentence": MARKUP}]}
+    rows["rows"] = [{**rows["rows"][0], **hostile}, *rows["rows"][1:]]
+    del rows["rows"][1000:]
+    page.route("**/v1/fleet?*limit=1000&after=", lambda route: route.fulfill(json=rows))
+    page.route("**/v1/fleet?*after=m-*", lambda route: route.fulfill(json={**rows, "rows": []}))
+    page.reload()
+    has_text(page, ".rows .row a", "<img src=x")
+    photographed(page, theme, "markup-and-skew")
+    broken = "id: 1-1\nevent: rows\ndata: {broken\n\n"
+    page.route("**/v1/fleet/events*", lambda route: route.fulfill(body=broken, content_type="text/event-stream"))
+    page.reload()
+    has_text(page, "#state", "What is shown is of")
+    photographed(page, theme, "malformed-frame")
+
+
 def photographed(page, theme, name):
     """Take a picture of a state at three widths; it is accessible and fits."""
     PICTURES.mkdir(parents=True, exist_ok=True)
     assert serious_faults(page) == []
+    page.evaluate("window.resized = true")
     for kind, width, height in (("desk", 1280, 900), ("phone", 360, 740), ("wall", 3840, 2160)):
         page.set_viewport_size({"width": width, "height": height})
         page.evaluate("scrollTo(0, 0)")
@@ -206,6 +227,8 @@ def photographed(page, theme, name):
         (PICTURES / f"{name}-{theme}-{kind}.png").write_bytes(page.screenshot())
         assert page.evaluate("document.documentElement.scrollWidth") <= width
     page.set_viewport_size({"width": 1280, "height": 900})
+    page.wait_for_timeout(250)
+    page.evaluate("window.resized = false")
 
 
 # Last: the file of tokens that it leaves names another fleet, so that this twin could not be started again.
@@ -219,6 +242,9 @@ def test_a_revoked_token_ends_the_session(open_page, twin):
         page.wait_for_selector("#token")
         has_text(page, "#state", "session has ended")
         assert page.is_visible("h1 >> text=ax-1")
+        for theme in ("light", "dark"):
+            page.emulate_media(color_scheme=theme)
+            photographed(page, theme, "token-revoked")
         page.fill("#token", "another")
         page.press("#token", "Enter")
         page.wait_for_selector(".hysteresis svg")

@@ -184,7 +184,7 @@ def test_samples_that_are_no_numbers_leave_the_others() -> None:
     assert column == (None, None, None, None, 1.0, 3.0)
 
 
-def test_the_live_view_is_off_unless_allowed_and_not_over_mqtt() -> None:
-    assert not TwinLink("https://h", "token").live
-    with pytest.raises(InvalidInput, match=r"live = true works over http\(s\):// only; url is 'mqtts://h'"):
-        TwinLink("mqtts://h", "token", live=True)
+def test_the_live_view_is_off_unless_allowed_over_http_and_mqtt() -> None:
+    for url in ("https://h", "mqtts://h"):
+        assert not TwinLink(url, "token").live
+        assert TwinLink(url, "token", live=True).live

@@ -4,10 +4,11 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -18,9 +19,11 @@ from relay import Relay, State, Weather
 from servotwin.link import mqtt_messages as wire
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.claim import ExclusiveTransport, HeldClaim
+from servotwin.link.mqtt import LiveMqtt
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Setting, encode
+from servotwin.messages.live import LiveColumns
 from servotwin.store.store import Store, open_store
 
 
@@ -312,3 +315,67 @@ def test_a_second_edge_of_a_servo_takes_over_over_a_broker_too(server: Mosquitto
         assert kept(store) == [0, 1, 3]
         assert [(event.kind, event.status[:8]) for event in store.events("axis-1")] == [("alarm", "conflict")]
         assert refusals(there)["superseded"] >= 2
+
+
+@contextmanager
+def live_edge(at: Broker, token: str = TOKENS["axis-1"]) -> Iterator[LiveMqtt]:
+    link = LiveMqtt(at, "axis-1", token, timeout_s=20.0, wait_s=20.0, run="run")
+    try:
+        yield link
+    finally:
+        link.close()
+
+
+COLUMNS = LiveColumns("axis-1", 1, 0, 0.1, ((-1e-3, 1e-3, -1e-4, 1e-4, -2.0, 3.0),))
+
+
+def test_a_live_view_waits_for_a_page_and_streams_over_a_broker_too(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as there, edge(at) as here, live_edge(at) as live, ThreadPoolExecutor(1) as pool:
+        assert not live.send(COLUMNS, HeldClaim())  # nobody looks: they are dropped
+        waiting = pool.submit(live.send, LiveColumns("axis-1"), HeldClaim())
+        here.deliver(parcel(0))  # windows pass while it waits
+        assert there.look("axis-1")["columns"] == []
+        assert waiting.result(PATIENCE)
+        assert live.send(COLUMNS, HeldClaim())
+        shown = there.look("axis-1")
+        assert shown["state"] == "live"
+        assert shown["columns"] == list(COLUMNS.columns)
+        with pytest.raises(Refused) as refused:
+            live.send(LiveColumns("axis-2"), HeldClaim())
+        assert refused.value.reason is Refusal.OTHER_NAME
+    assert kept(store) == [0]
+
+
+def test_a_live_view_over_a_broker_needs_the_servos_token(server: Mosquitto, store: Store) -> None:
+    at = Broker(server.url)
+    with twin(at, store) as there, live_edge(at, TOKENS["axis-2"]) as live:
+        there.look("axis-1")
+        with pytest.raises(Refused) as refused:
+            live.send(COLUMNS, HeldClaim())
+        assert refused.value.reason is Refusal.BAD_TOKEN
+        assert there.look("axis-1")["columns"] == []
+
+
+def test_a_twin_of_an_earlier_version_has_no_live_view_over_a_broker(server: Mosquitto, store: Store) -> None:
+    """It ignores the columns, as it does not know them, and answers a poll."""
+    at = Broker(server.url)
+    with twin(at, store) as there, live_edge(at) as live:
+        there.look("axis-1")
+        with pytest.MonkeyPatch.context() as patched:
+            older = msgspec.msgpack.Decoder(wire.PutRequest | OlderPoll)
+            patched.setattr(wire, "_request_decoder", older)
+            patched.setattr("servotwin.twin_service.mqtt.PollRequest", OlderPoll)
+            with pytest.raises(Refused) as refused:
+                live.send(COLUMNS, HeldClaim())
+    assert refused.value.reason is Refusal.UNKNOWN_SCHEMA
+
+
+class OlderPoll(msgspec.Struct, frozen=True, tag="listen/1"):
+    """A poll as versions without live views over a broker knew it."""
+
+    after: int
+    wait: float
+    claim: str = ""
+    question: None = None
+    live = None

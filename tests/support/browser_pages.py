@@ -39,11 +39,11 @@ class Twin:
 WATCH_SHIFTS = """new PerformanceObserver((list) => {
     const part = (node) => `${node?.nodeName}.${node?.getAttribute?.("class") ?? ""}`;
     const place = (rect) => [rect.x, rect.y, rect.width, rect.height].map(Math.round);
-    for (const entry of list.getEntries()) if (!entry.hadRecentInput) noteShift([
+    for (const entry of list.getEntries()) if (!entry.hadRecentInput && !window.resized) noteShift([
         performance.timeOrigin, entry.startTime, entry.value,
         entry.sources.map((each) => [part(each.node), place(each.previousRect), place(each.currentRect)])]);
 }).observe({ type: "layout-shift", buffered: true })"""
-"""Tells each shift without an input: load of the page (ms), time since then (ms), size, what moved from where."""
+"""Tells each shift without an input or a resize: load of the page (ms), time since then (ms), size, what moved."""
 
 
 def layout_shift(shifts):

@@ -22,6 +22,7 @@ from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_edge import LongPolls
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.live_views import LiveIntake, LiveViews
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.store_executor import StoreExecutor
@@ -60,6 +61,14 @@ class Twin:
         ]
         self._loop.call_soon_threadsafe(self.polls.notify, servo)
 
+    def look(self, servo: str) -> dict[str, Any]:
+        """As a page asks for the live view."""
+
+        async def asked() -> dict[str, Any]:
+            return self.views.look(servo, 0, 0)
+
+        return asyncio.run_coroutine_threadsafe(asked(), self._loop).result(PATIENCE)
+
     def close(self) -> None:
         self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join(PATIENCE)
@@ -78,7 +87,9 @@ class Twin:
         gate = EdgeGate(AccessControl(VERIFIERS), known, limiter, limiter)
         executor = StoreExecutor()
         claims = EdgeClaims(self.store, executor, self.polls.evict, self.metrics, Clocks(), True, "test")
-        handler = MqttRequestHandler(gate, ingest, self.polls, claims, lambda: None, self.metrics)
+        self.views = LiveViews(self._loop.time, lambda _: None, 5, 5)
+        live = LiveIntake(claims, self.views, self._loop.time)
+        handler = MqttRequestHandler(gate, ingest, self.polls, claims, live, lambda: None, self.metrics)
         server = MqttServer(self._broker, handler, "twins")
         await server.start()
         while not server.connected:

@@ -115,7 +115,14 @@ function start() {
     await api.logout().catch(() => null);
     location.reload();
   });
-  addEventListener("hashchange", show);
+  addEventListener("hashchange", () => {
+    show();
+    byId("view").focus({ preventScroll: true }); // what had the focus is gone
+  });
+  document.querySelector(".skip").addEventListener("click", (event) => {
+    event.preventDefault(); // the part after # is the address of a page here
+    (byId("login").hidden ? byId("view") : byId("token")).focus();
+  });
   showState();
   firstTime();
 }

@@ -45,11 +45,16 @@ function marks(list) {
 
 /* A plot over time that follows the width of its place.
    options: height, time (x is s since the epoch), xLabel, yLabel, series [{label, color, width, dash, points, paths}],
-   bands [[high, low, color]], marks () => [{at, word, color, dash}], range (low, high) => [low, high], sync, about. */
+   bands [[high, low, color]], marks () => [{at, word, color, dash}], range (low, high) => [low, high], sync, about,
+   moving: the newest data come by themselves, so that nobody looks closer. */
 export class TimePlot {
   constructor(place, options) {
     Object.assign(this, { place, options, data: null });
     place.setAttribute("role", "img");
+    if (!options.moving) {
+      place.tabIndex = 0;
+      place.addEventListener("keydown", (event) => this.key(event));
+    }
     this.observer = new ResizeObserver(() => this.resize());
     this.observer.observe(place);
   }
@@ -88,6 +93,17 @@ export class TimePlot {
     this.plot.root.setAttribute("aria-hidden", "true");
   }
 
+  // As dragging does with a mouse: + and - look closer and less close, arrows move, 0 and Escape show all.
+  key(event) {
+    const zoom = ZOOM[event.key], move = MOVE[event.key];
+    if (!(zoom || move) || !this.plot || !this.data[0].length || event.ctrlKey || event.metaKey || event.altKey) return;
+    event.preventDefault();
+    const { min, max } = this.plot.scales.x, first = this.data[0][0], last = this.data[0].at(-1);
+    const shift = Math.min(last - max, Math.max(first - min, (move ?? 0) * (max - min))), half = ((zoom ?? 1) * (max - min)) / 2;
+    const x = { min: Math.max(first, (min + max) / 2 + shift - half), max: Math.min(last, (min + max) / 2 + shift + half) };
+    for (const plot of this.options.sync ? uPlot.sync(this.options.sync).plots : [this.plot]) plot.setScale("x", x);
+  }
+
   resize() {
     if (!this.plot) return this.make();
     const width = this.place.clientWidth;
@@ -114,6 +130,8 @@ export class TimePlot {
     this.plot?.destroy();
   }
 }
+
+const ZOOM = { "+": 0.5, "=": 0.5, "-": 2, 0: 1e12, Escape: 1e12 }, MOVE = { ArrowLeft: -0.25, ArrowRight: 0.25 };
 
 // Times of day in 24 hours, the day where it changes.
 const TIME_FORMATS = [

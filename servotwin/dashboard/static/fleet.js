@@ -140,10 +140,11 @@ export class FleetPage {
       this.search.focus();
     }
     const link = event.target.closest?.(".rows a");
-    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    const step = { ArrowDown: 1, ArrowUp: -1, PageDown: 10, PageUp: -10, End: Infinity, Home: -Infinity }[event.key];
     if (link && step) {
       event.preventDefault();
-      this.focusRow(this.sorted.findIndex((row) => row.servo === link.textContent) + step);
+      const place = this.sorted.findIndex((row) => row.servo === link.textContent) + step;
+      this.focusRow(Math.max(0, Math.min(this.sorted.length - 1, place)));
     } else if (typing === this.search && event.key === "ArrowDown") this.focusRow(0);
   }
 
@@ -154,6 +155,7 @@ export class FleetPage {
     if (top < scrollY + 7 * 16 || top + height > scrollY + innerHeight) scrollTo(0, top - innerHeight / 2);
     this.render();
     this.pool.get(row.servo)?.cells.servo.querySelector("a").focus({ preventScroll: true });
+    this.schedule();
   }
 
   rowHeight() {
@@ -197,7 +199,15 @@ export class FleetPage {
         this.pool.delete(name);
       }
     }
+    this.chooseStop(shown, this.sorted[Math.max(0, Math.ceil(-top / height))]?.servo);
     this.askHistories(shown);
+  }
+
+  // One row is a stop of the Tab key, the last that had the focus or the first that is seen; arrows move on from there.
+  chooseStop(shown, first) {
+    const focused = this.body.querySelector("a:focus")?.textContent ?? this.stop;
+    this.stop = shown.has(focused) ? focused : first;
+    for (const [name, { cells }] of this.pool) cells.servo.firstChild.tabIndex = name === this.stop ? 0 : -1;
   }
 
   renderHead() {

@@ -7,7 +7,7 @@ import { positionUnit } from "./format.js";
 
 const ASK_MS = 500, IDLE_MS = 3000, SHOWN_S = 30;
 const WORDS = {
-  off: ["Off at the edge", "The edge's file does not allow it: live = true in its table [twin] would. Over MQTT, and with edges of earlier versions, there is no live view."],
+  off: ["Off at the edge", "The edge's file does not allow it: live = true in its table [twin] would. With edges of earlier versions there is none."],
   away: ["The edge is not connected", "The live view begins when it is."],
   waiting: ["Waiting", "The edge has been asked; nothing has come yet."],
   live: ["Live", "Least and greatest sample of each column. The edge streams while a page like this one is looked at."],
@@ -24,7 +24,7 @@ export class LiveViewPanel {
     this.note = element("span", { class: "soft" });
     const places = [element("div", { class: "chart low" }), element("div", { class: "chart low" }), element("div", { class: "chart low" })];
     const band = { series: [{ label: "greatest", color: "blue", width: 1 }, { label: "least", color: "blue", width: 1 }], bands: [[1, 2, "blue"]] };
-    this.plots = places.map((place) => new TimePlot(place, { sync: "live", xLabel: "Time to the newest sample (s)", ...band }));
+    this.plots = places.map((place) => new TimePlot(place, { sync: "live", moving: true, xLabel: "Time to the newest sample (s)", ...band }));
     this.body = element("div", { hidden: true }, legend(["blue band", "least to greatest sample of each 100 ms"]), element("div", { class: "three" }, places));
     this.content = [element("p", { class: "live" }, this.word, " ", this.note), this.body];
     this.seen = () => this.schedule(0);

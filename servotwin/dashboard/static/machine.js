@@ -325,7 +325,7 @@ export class MachinePage {
     const kept = Math.max(...window.channels.map((each) => each.values.length));
     const every = kept >= window.samples;
     this.rate.disabled = every;
-    setText(this.windowNote, `${duration(window.samples / window.rate)} at ${brief(window.rate)} Hz, sent for: ${window.reason}; version ${window.version} in force. ${every ? "Every sample is shown." : "The least and greatest sample of each column are shown."} Drag to look closer, double click for all.`);
+    setText(this.windowNote, `${duration(window.samples / window.rate)} at ${brief(window.rate)} Hz, sent for: ${window.reason}; version ${window.version} in force. ${every ? "Every sample is shown." : "The least and greatest sample of each column are shown."} Drag to look closer, double click for all; with the keyboard + and −, arrows and 0.`);
     if (window.rest) this.showRest(window.rest, unit);
     this.positionPlot.options.yLabel = `Position (${unit.name})`;
     const joined = (first, second) => uPlot.join([first, second].map((each) => (each ? [each.time, each.values] : [[], []])));
