@@ -150,8 +150,10 @@ def _rests(
     begins: dict[int, int] = {}
     for first, last in stretches:
         begins[last] = min(first, begins.get(last, first))
-    batches = {last: _batches(window, size, first, last) for last, first in begins.items()}
+    batches: dict[int, _Batches] = {}
     for first, last in stretches:
+        if last not in batches:
+            batches[last] = _batches(window, size, begins[last], last)
         rest = _rest(window, servo, size, (last - first) // size, batches[last])
         if rest is not None:
             yield *rest, first, last

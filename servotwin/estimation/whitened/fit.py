@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -141,34 +141,50 @@ def _best_of(
 
 
 def refine(
-    reduction: Reduction, points: Sequence[Point], largest: float, tolerance: float, passes: int, order: int
+    reduction: Reduction,
+    points: Sequence[Point],
+    largest: float,
+    tolerance: float,
+    passes: int,
+    order: int,
+    nearby: WhitenedFit | None = None,
 ) -> WhitenedFit:
     """Fit in the noise of the fit's own residual, in some passes with autoregressions of at most `order`.
 
-    The first fit and the last start from all `points`: in the right noise another minimum may lie lower.
+    The first fit and the last start from all `points`: in the right noise another minimum may lie lower. With a
+    `nearby` fit, of the same samples with nearly the same model, only the last pass is made, from the first point on.
     """
-    white = reduction.coarse()
-    fit = continued(white, _best_of(white, points, largest, tolerance), largest, tolerance)
-    fit = off_the_plain(white, fit, largest, tolerance)
-    noise, evaluations = Autoregression.white(1.0), fit.evaluations
-    for number in range(passes):
-        table = reduction.table(fit.point)
+    if nearby is None:
+        begun = _in_white_noise(reduction, points, largest, tolerance)
+        point, noise, evaluations = begun.point, Autoregression.white(1.0), begun.evaluations
+    else:
+        point, noise, evaluations = points[0], nearby.noise, 0
+        reduction = replace(reduction, rate=nearby.reduction.rate)
+    for number in range(0 if nearby is None else passes - 1, passes):
+        table = reduction.table(point)
         noise = estimate_noise(reduction, table, noise, order, number >= _PLAIN)
         reduction = reduction.growing(noise, table)
         # In a growing gap the rate, and with it the table, has changed.
-        misfit = reduction.misfit(noise, fit.point, None if reduction.growth else table)
+        misfit = reduction.misfit(noise, point, None if reduction.growth else table)
         last = number == passes - 1
-        starts = [fit.point, *([*points, *in_contact(fit.point)] if last else [])]
-        fit = _best_of(misfit, starts, largest, tolerance)
+        starts = [point, *([*points, *in_contact(point)] if last else [])]
+        fit = _best_of(misfit, list(dict.fromkeys(starts)), largest, tolerance)
         if reduction.growth and number == _EARLY:
             others = _best_of(misfit, _elsewhere(fit.point), largest, tolerance, _GLANCE)
             fit = min(fit, others, key=lambda one: one.slopes.cost)
-        evaluations += fit.evaluations
+        point, evaluations = fit.point, evaluations + fit.evaluations
     fit = off_the_plain(misfit, fit, largest, tolerance)
     fit = descend(misfit, fit.point, largest, tolerance, gain=_FINE)
     table = reduction.table(fit.point)
     rows = reduction.prepared(noise, table, CONSTANT)
     return WhitenedFit(reduction, misfit, fit, noise, table, rows, evaluations + fit.evaluations)
+
+
+def _in_white_noise(reduction: Reduction, points: Sequence[Point], largest: float, tolerance: float) -> SearchResult:
+    """Find the lowest minimum that some points lead to, the noise taken as white."""
+    white = reduction.coarse()
+    fit = continued(white, _best_of(white, points, largest, tolerance), largest, tolerance)
+    return off_the_plain(white, fit, largest, tolerance)
 
 
 def _elsewhere(point: Point) -> list[Point]:
@@ -205,8 +221,10 @@ class AlignedFit:
     Attributes
     ----------
     whitened : WhitenedFit
+    shift : int
+        Samples by which the position is taken as late in the fit.
     delay : float
-        s, by which the position is late.
+        s, by which it is late: the shift and what the fit finds beside it.
     span : float
         rad, range of the motor's angle.
     first : float
@@ -214,6 +232,7 @@ class AlignedFit:
     """
 
     whitened: WhitenedFit
+    shift: int
     delay: float
     span: float
     first: float
@@ -230,24 +249,32 @@ class AlignedFit:
 
 
 def align_and_fit(
-    theta_m: Array, position: Array, rate: float, servo: Servo, points: list[Point], settings: WhitenedSettings
+    theta_m: Array,
+    position: Array,
+    rate: float,
+    servo: Servo,
+    points: list[Point],
+    settings: WhitenedSettings,
+    nearby: AlignedFit | None = None,
 ) -> AlignedFit:
     """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz) from some points on.
 
     A delay of more than half a sample is taken off in whole samples, and the fit repeated: what is left of it is small
-    enough to be linear.
+    enough to be linear. `nearby`: a fit of the same samples to nearly the same servo, whose shift and noise are right
+    but for little.
     """
-    shift = 0
+    shift = 0 if nearby is None else nearby.shift
+    known = None if nearby is None else nearby.whitened
     for attempt in range(_ALIGNMENTS):
         ahead, behind = max(-shift, 0), max(shift, 0)
         angle = theta_m[ahead : theta_m.size - behind]
         measured = position[behind : position.size - ahead]
-        fitted = _fit(angle, measured, rate, servo, points, settings)
-        late = _delay(fitted.whitened) * rate if settings.skew else 0.0
+        whitened = _fit(angle, measured, rate, servo, points, settings, known)
+        late = _delay(whitened) * rate if settings.skew else 0.0
         if abs(late) <= 0.5 or abs(shift + late) > settings.skew_limit * rate or attempt == _ALIGNMENTS - 1:
             break
-        shift, points = shift + round(late), [fitted.whitened.point]
-    return AlignedFit(fitted.whitened, (shift + late) / rate, fitted.span, fitted.first)
+        shift, points, known = shift + round(late), [whitened.point], None
+    return AlignedFit(whitened, shift, (shift + late) / rate, float(np.ptp(angle)), float(angle[0]))
 
 
 def look_around(
@@ -269,15 +296,22 @@ def look_around(
 
 
 def _fit(
-    theta_m: Array, position: Array, rate: float, servo: Servo, points: list[Point], settings: WhitenedSettings
-) -> AlignedFit:
+    theta_m: Array,
+    position: Array,
+    rate: float,
+    servo: Servo,
+    points: list[Point],
+    settings: WhitenedSettings,
+    nearby: WhitenedFit | None,
+) -> WhitenedFit:
     span = float(np.ptp(theta_m))
     model = response(servo, rate)
     growth = NuisancePrior(0.0, settings.gap_rate / rate) if settings.gap_rate > 0.0 else None
     offset = _offset(settings, model.static_gain, float(theta_m[0]), float(position[0]))
     reduction = Reduction.of(theta_m, position, model, offset, growth, settings.skew)
-    result = refine(reduction, points, _FREE * span, _PRECISION * span, settings.passes, settings.order)
-    return AlignedFit(result, 0.0, span, float(theta_m[0]))
+    # The noise is that of the decimated samples.
+    same = nearby if nearby is not None and nearby.reduction.decimation == reduction.decimation else None
+    return refine(reduction, points, _FREE * span, _PRECISION * span, settings.passes, settings.order, same)
 
 
 def gaps_to_try(span: float, count: int) -> list[float]:

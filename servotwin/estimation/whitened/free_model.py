@@ -33,7 +33,8 @@ FREEDOM = (0.1, 0.5, 0.05, 0.1)  # relative standard deviations of the factors w
 LARGEST = 4.0  # standard deviations by which a factor may move
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
 CYCLIC = 2e-3 * math.pi  # rad, usual size of an error once per turn: a thousandth of a turn
-_FIRST_DAMPING, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e8, 1e-9
+_WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: within these, the motion is linear in them
+_FIRST_DAMPING, _FIRST_LINEAR, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-6, 1e8, 1e-9
 _EVALUATIONS = 12  # of a fit
 _GAIN = 1e-3  # of the residual's variance, promised by a step: a thirtieth of one standard deviation of anything
 _SINGULAR = 1e-10  # of a column's length
@@ -76,6 +77,11 @@ class FactorPrior:
     def root(self) -> Array:
         """(4, 4) whitening matrix: root (factors - mean) has unit covariance."""
         return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)))
+
+    @property
+    def wide(self) -> bool:
+        """True where some factor is known so roughly that the motion is not linear in it."""
+        return bool(np.any(np.sqrt(np.diag(self.covariance)) > _WIDE))
 
     def limits(self) -> tuple[Array, Array]:
         """(4,) least and largest factors that are searched."""
@@ -232,7 +238,7 @@ class FreeProblem:
         lowest, highest = self.prior.limits()
         low, high = np.concatenate([[0.0, -1.0], lowest]), np.concatenate([[self.largest, 1.0], highest])
         movable, (enough, most, hopeless) = np.array([*free, *(True for _ in FACTORS)]), within
-        q, damping = np.clip(start, low, high), _FIRST_DAMPING
+        q, damping = np.clip(start, low, high), _FIRST_DAMPING if self.prior.wide else _FIRST_LINEAR
         residual, rows = self.rows(q)
         cost, count, floor = float(residual @ residual), 1, 0.0
         while count < evaluations and damping < _LARGEST_DAMPING and cost > enough:

@@ -37,7 +37,6 @@ from servotwin.plant.signals import Array
 
 _TURNS = 5
 _STILL = 0.1  # standard deviations of a factor: a smaller move needs no other turn
-_WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: wider ones are searched before the noise is known
 _TOGETHER = 5.0  # spreads: as unlikely for four factors as LARGEST is for one
 _AT_END = 1e-3  # of the range of a factor
 _SHOWN = 1.0  # information on the softness beyond what is usual of it: below, the window says nothing
@@ -162,8 +161,7 @@ class LearntFit:
         Both fits count alike, and what they differ by is part of the spread. None: the factors are known well already,
         or with what is known of them one contact does not explain the window.
         """
-        low, high = self.problem.prior.limits()
-        if not np.any(high - low > 2.0 * LARGEST * np.array(_WIDE)) or self.beyond:
+        if not self.problem.prior.wide or self.beyond:
             return None
         one = self.problem.descend(np.array([self.problem.largest, single.place, *self.free.factors]), (False, True))
         if one.cost > self.free.cost + BELIEVED * max(1.0, self.aligned.whitened.variance):
@@ -197,17 +195,17 @@ def learn_and_fit(
     """
     factors = machine.mean
     slow, points = look_around(theta_m, position, rate, adapted(servo, factors), prior, settings)
-    spread = np.sqrt(np.diag(machine.covariance))
-    if np.any(spread > _WIDE):
+    if machine.wide:  # what is known roughly is searched before the noise is known
         noise = Autoregression.white(_VAGUE * float(np.std(slow.position)))
         largest = 2.0 * float(np.ptp(slow.theta_m))
         problem = FreeProblem(slow, noise, servo, machine, largest)
         fits = [problem.descend(np.array([*point, *factors]), (True, True)) for point in points]
         fits.sort(key=lambda one: one.cost)
         factors, points = fits[0].factors, [one.point for one in fits[:2]]
+    aligned: AlignedFit | None = None
     for _ in range(_TURNS):
         here = adapted(servo, factors)
-        aligned = align_and_fit(theta_m, position, rate, here, points, settings)
+        aligned = align_and_fit(theta_m, position, rate, here, points, settings, aligned)
         whitened = aligned.whitened
         problem = FreeProblem(whitened.reduction, whitened.noise, servo, machine, aligned.largest)
         free = problem.descend(np.array([*whitened.point, *factors]), (True, True))

@@ -25,7 +25,7 @@ from servotwin.plant.signals import Array
 Indices: TypeAlias = NDArray[np.intp]
 
 PITCH, RATIO = 2, 3  # of the factors
-STEP = 1e-3  # of a factor's logarithm: difference quotients of the response
+STEP = 1e-4  # of a factor's logarithm: difference quotients of the response
 SOFT = 1e-2  # structure's stiffness over the screw's: far enough for the motion to be linear in the compliance
 
 
