@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol
 from servotwin.control.controller import Controller
 from servotwin.control.retuning import answer
 from servotwin.errors import InvalidInput
+from servotwin.estimation.disturbance import holds_position
 from servotwin.plant.plants import Plant, check_homogeneous
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
@@ -124,11 +125,25 @@ def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
 
 
 def _hysteresis(servo: Plant, _options: PolicyOptions) -> HysteresisPolicy:
+    _check_zone(servo, "hysteresis")
     return HysteresisPolicy(servo)
 
 
 def _paper(servo: Plant, options: PolicyOptions) -> PaperPolicy:
-    return PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
+    policy = PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
+    if policy.k_dz > 0.0:
+        _check_zone(servo, "paper")
+    return policy
+
+
+def _check_zone(servo: Plant, policy: str) -> None:
+    """Refuse a dead zone whose command of zero moves the motor: a stepper goes to its angle zero."""
+    if holds_position(servo) and not servo.controller.integral_only:
+        raise InvalidInput(
+            f"policy {policy!r}: inside its dead zone the command is zero, and this axis's stepper would go to the angle "
+            "zero; give its controller integral_only = true, with which the motor holds its angle there, or give the "
+            'policy "certified"'
+        )
 
 
 POLICIES: Mapping[str, PolicyEntry] = {

@@ -10,6 +10,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
@@ -211,3 +212,20 @@ def test_hysteresis_may_send_its_thresholds_and_no_other_gains(tmp_path):
     for wrong in (own.replace(Kp=1.1 * own.Kp), own.replace(Ki=1.1 * own.Ki), own.replace(leave=1.6)):
         assert not agent.limits.allows_gains(gains_of(wrong), agent.own)
     assert isinstance(agent.supervision.fallback.setting.gains, Gains)
+
+
+@pytest.mark.parametrize("name", ["paper", "hysteresis"])
+def test_a_stepper_is_not_sent_home_by_a_dead_zone(name: str):
+    """A command of zero is its angle zero: such a dead zone makes a loop hunt that rests without one."""
+    stage = Axis.preset("stepper-stage")
+    policy_of(stage, TwinSettings(policy=name))
+    with pytest.raises(InvalidInput, match="would go to the angle zero; give its controller integral_only = true"):
+        policy_of(stage.replace(integral_only=False), TwinSettings(policy=name))
+    gap = 2e-6 / stage.p
+    ends = {}
+    for only in (True, False):
+        axis = stage.replace(integral_only=only)
+        run = st.simulate(axis, 10.0, reference=1e-4, gap=gap, tolerance=2e-6, sample_rate=1000.0)
+        ends[only] = float(np.abs(run.reference - run.position)[5000:].max())
+    assert ends[True] <= 2e-6
+    assert ends[False] > 1e-5
