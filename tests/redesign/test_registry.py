@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from servotwin.config.table import Table, parse_toml
@@ -19,6 +20,7 @@ from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
+from servotwin.simulation import simulate
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 PAPER = Servo.preset("paper")
@@ -225,7 +227,7 @@ def test_a_stepper_is_not_sent_home_by_a_dead_zone(name: str):
     ends = {}
     for only in (True, False):
         axis = stage.replace(integral_only=only)
-        run = st.simulate(axis, 10.0, reference=1e-4, gap=gap, tolerance=2e-6, sample_rate=1000.0)
+        run = simulate(axis, 10.0, reference=1e-4, gap=gap, tolerance=2e-6, sample_rate=1000.0)
         ends[only] = float(np.abs(run.reference - run.position)[5000:].max())
     assert ends[True] <= 2e-6
     assert ends[False] > 1e-5
