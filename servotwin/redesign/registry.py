@@ -108,6 +108,7 @@ def _certified(servo: Plant, options: PolicyOptions) -> Policy:
 
 def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
     check_homogeneous(servo, 'policy = "margin"')
+    _check_zone(servo, "margin")
     if not isinstance(servo.controller, Controller):
         raise InvalidInput(
             "policy 'margin' reads its dead zone from a map, and maps are computed with the filtered PID: give another "

@@ -216,7 +216,7 @@ def test_hysteresis_may_send_its_thresholds_and_no_other_gains(tmp_path):
     assert isinstance(agent.supervision.fallback.setting.gains, Gains)
 
 
-@pytest.mark.parametrize("name", ["paper", "hysteresis"])
+@pytest.mark.parametrize("name", ["paper", "hysteresis", "margin"])
 def test_a_stepper_is_not_sent_home_by_a_dead_zone(name: str):
     """A command of zero is its angle zero: such a dead zone makes a loop hunt that rests without one."""
     stage = Axis.preset("stepper-stage")

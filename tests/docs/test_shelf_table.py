@@ -1,0 +1,51 @@
+"""The table of what each preset of the shelf can do, against the code."""
+
+from pathlib import Path
+
+import pytest
+
+from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Axis
+from servotwin.redesign.registry import policy_of
+from servotwin.twin.estimating import estimator_of, motor_learning_of
+from servotwin.twin.settings import TriageSettings, TwinSettings
+from servotwin.twin.triage import Triage
+
+PAGE = Path(__file__).parents[2] / "docs" / "howto" / "own-axis.md"
+HEAD = "| preset | estimate of the gap | `paper`, `hysteresis` | `certified` | learns its model | triage |"
+
+
+def rows() -> dict[str, list[str]]:
+    lines = PAGE.read_text().splitlines()
+    first = lines.index(HEAD) + 2
+    last = lines.index("", first)
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[first:last]]
+    return {name.strip("`"): rest for name, *rest in cells}
+
+
+def said(make: object) -> str:
+    """Word of the table for what is made or refused."""
+    try:
+        return "no" if make() is None else "yes"  # type: ignore[operator]
+    except InvalidInput as error:
+        assert "\n" not in str(error)
+        return "no"
+
+
+def test_the_table_has_every_preset() -> None:
+    shelf = Path(__file__).parents[2] / "servotwin" / "plant" / "shelf"
+    assert set(rows()) == {each.stem for each in shelf.glob("*.toml")}
+
+
+@pytest.mark.parametrize("name", rows())
+def test_each_preset_can_do_what_the_table_says(name: str) -> None:
+    axis, (estimate, zones, certified, learns, triage) = Axis.preset(name), rows()[name]
+    settings = TwinSettings(policy="paper")
+    assert estimate.split(",")[0] == said(lambda: estimator_of(axis, settings))
+    made = {
+        said(lambda policy=policy: policy_of(axis, TwinSettings(policy=policy))) for policy in ("paper", "hysteresis")
+    }
+    assert made == {zones.split(",")[0]}
+    assert learns == said(lambda: motor_learning_of(axis, settings))
+    assert triage == said(lambda: Triage.of(axis, TriageSettings()))
+    assert certified.split(",")[0] in ("yes", "no")
