@@ -59,8 +59,8 @@ class WatchSettings:
             "effort_floor_v",
             above=0.0,
             infinite=True,
-            help="A smaller voltage is no evidence, whatever the band says; inf: none is, as of a stepper, whose command "
-            "is its position.",
+            help="A smaller voltage is no evidence, whatever the band says; inf: none is, as of a stepper, whose "
+            "command is its position.",
         ),
     ] = 0.02
     swings: Annotated[int, key(minimum=2, help="Turns of the error, one up, one down, that make a limit cycle.")] = 6

@@ -11,7 +11,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.retuning import answer
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
-from servotwin.plant.plants import Plant, check_homogeneous
+from servotwin.plant.plants import Plant, check_homogeneous, check_load_encoder
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
@@ -77,13 +77,15 @@ def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
 
 
 def check_verifiable(servo: Plant) -> None:
-    """Refuse a controller whose settings cannot be verified.
+    """Refuse an axis or a controller whose settings cannot be verified.
 
     Raises
     ------
     InvalidInput
+        An axis without an encoder at the load.
         A cascade or a linear law without a sample rate, or one that does not answer to a constant error.
     """
+    check_load_encoder(servo, "the verification of settings")
     law = servo.controller
     if isinstance(law, Controller):
         return
@@ -141,9 +143,9 @@ def _check_zone(servo: Plant, policy: str) -> None:
     """Refuse a dead zone whose command of zero moves the motor: a stepper goes to its angle zero."""
     if holds_position(servo) and not servo.controller.integral_only:
         raise InvalidInput(
-            f"policy {policy!r}: inside its dead zone the command is zero, and this axis's stepper would go to the angle "
-            "zero; give its controller integral_only = true, with which the motor holds its angle there, or give the "
-            'policy "certified"'
+            f"policy {policy!r}: inside its dead zone the command is zero, and this axis's stepper would go to the "
+            "angle zero; give its controller integral_only = true, with which the motor holds its angle there, or give "
+            'the policy "certified"'
         )
 
 

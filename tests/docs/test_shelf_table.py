@@ -1,5 +1,7 @@
 """The table of what each preset of the shelf can do, against the code."""
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -23,13 +25,13 @@ def rows() -> dict[str, list[str]]:
     return {name.strip("`"): rest for name, *rest in cells}
 
 
-def said(make: object) -> str:
+def said(make: Callable[[], object]) -> str:
     """Word of the table for what is made or refused."""
     try:
-        return "no" if make() is None else "yes"  # type: ignore[operator]
-    except InvalidInput as error:
-        assert "\n" not in str(error)
+        made = make()
+    except InvalidInput:
         return "no"
+    return "no" if made is None else "yes"
 
 
 def test_the_table_has_every_preset() -> None:
@@ -42,10 +44,8 @@ def test_each_preset_can_do_what_the_table_says(name: str) -> None:
     axis, (estimate, zones, certified, learns, triage) = Axis.preset(name), rows()[name]
     settings = TwinSettings(policy="paper")
     assert estimate.split(",")[0] == said(lambda: estimator_of(axis, settings))
-    made = {
-        said(lambda policy=policy: policy_of(axis, TwinSettings(policy=policy))) for policy in ("paper", "hysteresis")
-    }
-    assert made == {zones.split(",")[0]}
+    for policy in ("paper", "hysteresis"):
+        assert zones.split(",")[0] == said(partial(policy_of, axis, TwinSettings(policy=policy)))
     assert learns == said(lambda: motor_learning_of(axis, settings))
     assert triage == said(lambda: Triage.of(axis, TriageSettings()))
     assert certified.split(",")[0] in ("yes", "no")

@@ -12,6 +12,7 @@ from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 from servotwin.plant.axis import Axis
+from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
@@ -214,6 +215,12 @@ def test_hysteresis_may_send_its_thresholds_and_no_other_gains(tmp_path):
     for wrong in (own.replace(Kp=1.1 * own.Kp), own.replace(Ki=1.1 * own.Ki), own.replace(leave=1.6)):
         assert not agent.limits.allows_gains(gains_of(wrong), agent.own)
     assert isinstance(agent.supervision.fallback.setting.gains, Gains)
+
+
+def test_verified_settings_of_an_axis_without_a_load_encoder_are_refused_at_configuration():
+    axis = Axis.preset("two-mass-drive").replace(sensors=Sensors(feedback="motor"))
+    with pytest.raises(InvalidInput, match="the verification of settings needs the position of the load"):
+        policy_of(axis, TwinSettings())
 
 
 @pytest.mark.parametrize("name", ["paper", "hysteresis", "margin"])
