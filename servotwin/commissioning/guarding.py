@@ -22,6 +22,7 @@ from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
 from servotwin.edge.watch import WatchSettings
+from servotwin.estimation.disturbance import holds_position
 from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Setting
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
@@ -83,7 +84,10 @@ def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guardi
 
 
 def supervision_of(servo: Plant, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
-    """Supervision of a servo in its own seconds and volts; errors count from a tenth of the smallest stated step on."""
+    """Supervision of a servo in its own seconds and volts; errors count from a tenth of the smallest stated step on.
+
+    The command of a stepper is its position and no evidence.
+    """
     usual, period = WatchSettings(), Supervision().period_s
     second, _, volt = scales(servo)
     watch = dataclasses.replace(
@@ -93,7 +97,7 @@ def supervision_of(servo: Plant, settings: TwinSettings, fallback: FallbackSet) 
         settling_s=usual.settling_s * second,
         persist_s=usual.persist_s * second,
         error_floor=settings.uncertainty.step[0] / _ERROR_FLOORS,
-        effort_floor=usual.effort_floor * volt,
+        effort_floor=math.inf if holds_position(servo) else usual.effort_floor * volt,
     )
     return Supervision(fallback, watch, period * second)
 

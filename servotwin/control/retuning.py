@@ -4,6 +4,8 @@ Kp of the filtered PID is velocity_gain position_gain / ratio of a cascade, its 
 of the speed. A linear law has one factor on everything, and no shapes.
 """
 
+import math
+
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
@@ -26,6 +28,22 @@ def integrates(law: AnyController) -> bool:
     if isinstance(law, Cascade):
         return law.integral_time is not None
     return bool(law.holds) and law.integral_share != 0.0
+
+
+def only_integrates(law: AnyController) -> bool:
+    """True for a filtered PID that has integral action and no other: a dead zone that stops it opens the loop."""
+    return isinstance(law, Controller) and law.Ki != 0.0 and law.Kp == law.Kd == 0.0
+
+
+def strength(law: AnyController) -> float:
+    """Gain by which laws of one kind are compared: that at rest, or Ki of one that only integrates."""
+    return law.Ki if isinstance(law, Controller) and only_integrates(law) else answer(law)
+
+
+def rest_gain(law: AnyController) -> float:
+    """Size of the command at rest per error of the position (V/m), before any integral action adds to it; infinite for
+    a law that only integrates."""
+    return math.inf if only_integrates(law) else abs(answer(law))
 
 
 def without_integral(law: AnyController) -> AnyController:
@@ -52,6 +70,8 @@ def scaled(own: AnyController, scale: float, shape: tuple[float, float], share: 
     gain."""
     lead, slower = shape
     if isinstance(own, Controller):
+        if only_integrates(own):
+            return own.replace(Ki=own.Ki * scale * share)
         return own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share)
     if isinstance(own, LinearLaw):
         # A share counts over the own integral gain, which the gain scales too.

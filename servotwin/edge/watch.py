@@ -54,7 +54,14 @@ class WatchSettings:
         ),
     ] = 1e-5
     effort_floor: Annotated[
-        float, key("effort_floor_v", above=0.0, help="A smaller voltage is no evidence, whatever the band says.")
+        float,
+        key(
+            "effort_floor_v",
+            above=0.0,
+            infinite=True,
+            help="A smaller voltage is no evidence, whatever the band says; inf: none is, as of a stepper, whose "
+            "command is its position.",
+        ),
     ] = 0.02
     swings: Annotated[int, key(minimum=2, help="Turns of the error, one up, one down, that make a limit cycle.")] = 6
     similarity: Annotated[

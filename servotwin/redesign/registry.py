@@ -10,7 +10,8 @@ from typing import NamedTuple, Protocol
 from servotwin.control.controller import Controller
 from servotwin.control.retuning import answer
 from servotwin.errors import InvalidInput
-from servotwin.plant.plants import Plant, check_homogeneous
+from servotwin.estimation.disturbance import holds_position
+from servotwin.plant.plants import Plant, check_homogeneous, check_load_encoder
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
@@ -76,13 +77,15 @@ def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
 
 
 def check_verifiable(servo: Plant) -> None:
-    """Refuse a controller whose settings cannot be verified.
+    """Refuse an axis or a controller whose settings cannot be verified.
 
     Raises
     ------
     InvalidInput
+        An axis without an encoder at the load.
         A cascade or a linear law without a sample rate, or one that does not answer to a constant error.
     """
+    check_load_encoder(servo, "the verification of settings")
     law = servo.controller
     if isinstance(law, Controller):
         return
@@ -107,6 +110,7 @@ def _certified(servo: Plant, options: PolicyOptions) -> Policy:
 
 def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
     check_homogeneous(servo, 'policy = "margin"')
+    _check_zone(servo, "margin")
     if not isinstance(servo.controller, Controller):
         raise InvalidInput(
             "policy 'margin' reads its dead zone from a map, and maps are computed with the filtered PID: give another "
@@ -124,11 +128,25 @@ def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
 
 
 def _hysteresis(servo: Plant, _options: PolicyOptions) -> HysteresisPolicy:
+    _check_zone(servo, "hysteresis")
     return HysteresisPolicy(servo)
 
 
 def _paper(servo: Plant, options: PolicyOptions) -> PaperPolicy:
-    return PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
+    policy = PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
+    if policy.k_dz > 0.0:
+        _check_zone(servo, "paper")
+    return policy
+
+
+def _check_zone(servo: Plant, policy: str) -> None:
+    """Refuse a dead zone whose command of zero moves the motor: a stepper goes to its angle zero."""
+    if holds_position(servo) and not servo.controller.integral_only:
+        raise InvalidInput(
+            f"policy {policy!r}: inside its dead zone the command is zero, and this axis's stepper would go to the "
+            "angle zero; give its controller integral_only = true, with which the motor holds its angle there, or give "
+            'the policy "certified"'
+        )
 
 
 POLICIES: Mapping[str, PolicyEntry] = {

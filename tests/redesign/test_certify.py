@@ -11,6 +11,7 @@ from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.control.controller import Controller
 from servotwin.control.law import start, tick
 from servotwin.control.retuning import unfed
 from servotwin.errors import InvalidInput
@@ -215,9 +216,25 @@ def test_no_candidate_is_one_sentence() -> None:
         certify(SERVO, Uncertainty(), replace(SMALL, Ms=1.01), SHORT)
 
 
-def test_a_controller_without_proportional_action_is_refused() -> None:
-    with pytest.raises(InvalidInput, match=r"controller kp = 0: verified settings have scaled proportional gains"):
-        certify(Axis.preset("stepper-stage"), Uncertainty())
+def test_a_controller_without_any_action_is_refused() -> None:
+    with pytest.raises(InvalidInput, match=r"controller kp = 0: verified settings have scaled gains"):
+        certify(Axis.preset("stepper-stage").replace(Ki=0.0), Uncertainty())
+
+
+def test_a_controller_that_only_integrates_is_scaled_and_verified() -> None:
+    """A stepper goes where it is told: its loop needs no proportional action, and its own gain is the most."""
+    stage = Axis.preset("stepper-stage")
+    known = Uncertainty(gap=(0.0, 2e-5 / stage.p), step=(1e-4, 4e-4), input_bias=(0.0, 0.0))
+    found = certify(stage, known, replace(SMALL, scales=(0.5, 1.0, 2.0)))
+    assert isinstance(found, Certificate)
+    law = found.setting.controller
+    assert isinstance(law, Controller)
+    assert law.Kp == law.Kd == 0.0
+    assert law.Ki == stage.pidf.Ki
+    assert found.settled == 1.0
+    # Neither a bias nor friction leaves an error; behind a ramp it lags by one over its crossover.
+    assert found.error_per_volt == 0.0
+    assert found.lag == pytest.approx(1.0 / found.crossover, rel=0.01)
 
 
 def test_without_a_verified_setting_the_best_candidate_is_reported() -> None:

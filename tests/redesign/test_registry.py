@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 
 from servotwin.config.table import Table, parse_toml
@@ -10,6 +11,8 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
+from servotwin.plant.axis import Axis
+from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
@@ -18,6 +21,7 @@ from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
+from servotwin.simulation import simulate
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 PAPER = Servo.preset("paper")
@@ -211,3 +215,26 @@ def test_hysteresis_may_send_its_thresholds_and_no_other_gains(tmp_path):
     for wrong in (own.replace(Kp=1.1 * own.Kp), own.replace(Ki=1.1 * own.Ki), own.replace(leave=1.6)):
         assert not agent.limits.allows_gains(gains_of(wrong), agent.own)
     assert isinstance(agent.supervision.fallback.setting.gains, Gains)
+
+
+def test_verified_settings_of_an_axis_without_a_load_encoder_are_refused_at_configuration():
+    axis = Axis.preset("two-mass-drive").replace(sensors=Sensors(feedback="motor"))
+    with pytest.raises(InvalidInput, match="the verification of settings needs the position of the load"):
+        policy_of(axis, TwinSettings())
+
+
+@pytest.mark.parametrize("name", ["paper", "hysteresis", "margin"])
+def test_a_stepper_is_not_sent_home_by_a_dead_zone(name: str):
+    """A command of zero is its angle zero: such a dead zone makes a loop hunt that rests without one."""
+    stage = Axis.preset("stepper-stage")
+    policy_of(stage, TwinSettings(policy=name))
+    with pytest.raises(InvalidInput, match="would go to the angle zero; give its controller integral_only = true"):
+        policy_of(stage.replace(integral_only=False), TwinSettings(policy=name))
+    gap = 2e-6 / stage.p
+    ends = {}
+    for only in (True, False):
+        axis = stage.replace(integral_only=only)
+        run = simulate(axis, 10.0, reference=1e-4, gap=gap, tolerance=2e-6, sample_rate=1000.0)
+        ends[only] = float(np.abs(run.reference - run.position)[5000:].max())
+    assert ends[True] <= 2e-6
+    assert ends[False] > 1e-5

@@ -14,6 +14,7 @@ from servotwin.edge.parameters import FallbackSet
 from servotwin.edge.settings import Supervision
 from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.messages import Setting
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
@@ -69,6 +70,13 @@ def test_the_edge_watches_in_the_machines_own_units() -> None:
     assert found.watch is not None
     assert (found.watch.slot_s, found.watch.window_s, found.watch.settling_s) == pytest.approx((0.08, 16.0, 24.0))
     assert (found.watch.error_floor, found.watch.effort_floor) == pytest.approx((1e-11, 2.0))
+
+
+def test_the_command_of_a_stepper_is_no_evidence() -> None:
+    """It is its position: a stage that works far from its zero would leave every band."""
+    found = supervision_of(Axis.preset("stepper-stage"), TwinSettings(), FallbackSet(Setting(1e-6))).watch
+    assert found is not None
+    assert found.effort_floor == math.inf
 
 
 def test_what_a_file_states_counts() -> None:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.control.retuning import answer, friction_feedforward
+from servotwin.control.retuning import friction_feedforward, rest_gain
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
 from servotwin.plant.plants import Plant
@@ -209,7 +209,7 @@ def arrival_error(setting: Design, model: Plant, input_bias: Array, friction: Ar
     # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the
     # motor against what it answers to the error; what is fed forward for it pushes to one side.
     held = model.command_of(friction + model.own_friction) + abs(friction_feedforward(law))
-    steady = (np.abs(input_bias + law.feedforward) + held) / abs(answer(law))
+    steady = (np.abs(input_bias + law.feedforward) + held) / rest_gain(law)
     return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
 
 

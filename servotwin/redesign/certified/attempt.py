@@ -11,7 +11,7 @@ import numpy as np
 
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
-from servotwin.control.retuning import answer, filter_time, integrates, unfed
+from servotwin.control.retuning import answer, filter_time, integrates, only_integrates, rest_gain, unfed
 from servotwin.errors import InvalidInput
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
@@ -25,7 +25,7 @@ from servotwin.redesign.certified.certificate import (
     LoopMargins,
     RampResult,
 )
-from servotwin.redesign.certified.margins import margins_in_every_zone, widened
+from servotwin.redesign.certified.margins import margins_in_every_zone, own_answer, slow_response, widened
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
@@ -99,7 +99,7 @@ class Question:
         begin, end = (edge / (2.0 * math.pi * time) for edge in _NOISE_BAND)
         end = end if law.sample_rate is None else 0.5 * law.sample_rate
         effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
-        authority = abs(answer(self.servo.controller)) * self.uncertainty.step[1]
+        authority = own_answer(self.servo) * self.uncertainty.step[1]
         return self.demands.effort_weight * self.trial.unit * effort / authority
 
 
@@ -167,7 +167,7 @@ class Attempt:
             ramp=self._ramp,
             rate=law.sample_rate,
             delay=0 if law.sample_rate is None else known.delay,
-            error_per_volt=0.0 if integrates(law) else 1.0 / abs(answer(law)),
+            error_per_volt=0.0 if integrates(law) else 1.0 / rest_gain(law),
             lag=_lag(question.servo, setting.controller),
         )
 
@@ -205,7 +205,7 @@ class Attempt:
         beyond, servo, known = question.demands.beyond, question.servo, question.uncertainty
         if beyond.machines == 0:
             return None
-        force = servo.torque_of(beyond.friction * abs(answer(servo.controller)) * known.step[0])
+        force = servo.torque_of(beyond.friction * own_answer(servo) * known.step[0])
         force = max(known.friction[1], force) if servo.takes_friction else known.friction[1]
         wide = widened(known, question.demands)
         ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))
@@ -243,17 +243,17 @@ def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> 
 def _lag(servo: Plant, law: AnyController) -> float:
     """s: steady error behind a ramp, per speed, of a machine whose motor integrates.
 
-    The integral of a filtered PID takes it to zero; that of a cascade integrates the speed's error and need not.
+    The integral of a filtered PID takes it to zero, unless it moves the motor itself; that of a cascade integrates the
+    speed's error and need not.
     """
     running = law_of(law)
-    plant = servo.plant()
-    corners = np.abs(plant.poles())
-    slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
-    gain = complex(plant.response(slow))
+    slow, gain = slow_response(servo)
     if isinstance(running, LinearLaw):
         reference, motor, load = law_response(running, slow)
         followed = gain * reference / (1.0 - gain * (motor / servo.p + load))
         return float(abs((1.0 - followed) / slow))
+    if only_integrates(running):
+        return 1.0 / abs(gain * running.Ki)
     if integrates(law):
         return 0.0
     return abs(1.0 / (slow * abs(gain)) - running.velocity_feedforward) / abs(answer(law))

@@ -18,12 +18,12 @@ from time import perf_counter
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import answer, integrates
+from servotwin.control.retuning import answer, integrates, only_integrates
 from servotwin.plant.plants import Plant, check_load_encoder
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
-from servotwin.redesign.certified.margins import integral_shares, laws_within, widened, with_margins
+from servotwin.redesign.certified.margins import integral_shares, laws_within, own_answer, widened, with_margins
 from servotwin.redesign.certified.screening import Screening, is_plain, stops_widest
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
@@ -158,7 +158,7 @@ def _any_of(kinds: Sequence[Callable[[Design], bool]]) -> Callable[[Design], boo
 def known_bias(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> float:
     """V: an input bias up to this counts as known, since the error that it leaves is a small share of the smallest
     step."""
-    return demands.known * abs(answer(servo.controller)) * uncertainty.step[0]
+    return demands.known * own_answer(servo) * uncertainty.step[0]
 
 
 def is_disturbed(servo: Plant, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
@@ -193,14 +193,15 @@ def candidates_of(
     InvalidInput
         No scaled controller is within the bounds on Ms.
     """
-    integral = integral_shares(servo.controller, demands) if disturbed else (0.0,)
+    integral = integral_shares(servo.controller, demands, disturbed)
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]
     plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0] + servo.own_friction, demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
     plain += _zones_in_gap(servo, within, zone, demands)
-    if not (0.0 < zone <= demands.tolerance and noisy and isinstance(servo.controller, Controller)):
+    opens = isinstance(servo.controller, Controller) and not only_integrates(servo.controller)
+    if not (0.0 < zone <= demands.tolerance and noisy and opens):
         return plain
     laws = [each.controller for each in plain if not each.tolerance]
     return plain + [

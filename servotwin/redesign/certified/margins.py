@@ -14,7 +14,15 @@ from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
-from servotwin.control.retuning import answer, integrates, scaled, unfed, without_integral
+from servotwin.control.retuning import (
+    answer,
+    integrates,
+    only_integrates,
+    scaled,
+    strength,
+    unfed,
+    without_integral,
+)
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.law_set import LawSet
@@ -131,13 +139,13 @@ def laws_within(
     Raises
     ------
     InvalidInput
-        There is none, or the servo's controller has no proportional action.
+        There is none, or the servo's controller has neither proportional action nor integral action alone.
     """
     own = servo.controller
-    if isinstance(own, Controller) and own.Kp == 0.0:
+    if isinstance(own, Controller) and own.Kp == 0.0 and not only_integrates(own):
         raise InvalidInput(
-            "controller kp = 0: verified settings have scaled proportional gains, and this controller has none; give "
-            'one, or another policy than "certified"'
+            "controller kp = 0: verified settings have scaled gains, proportional or integral alone, and this "
+            'controller has neither; give one, or another policy than "certified"'
         )
     plants = plant_set(servo, uncertainty, own.sample_rate)
     delays = delays_of(own, uncertainty)
@@ -172,7 +180,9 @@ def laws_within(
 def _scaled_laws(
     own: AnyController, demands: Demands, shapes: tuple[tuple[float, float], ...], integral: tuple[float, ...]
 ) -> list[AnyController]:
-    laws = [scaled(own, scale, shape, share) for share in integral for shape in shapes for scale in demands.scales]
+    # An edge allows less integral action than the own one, by default not more.
+    scales = [each for each in demands.scales if each <= 1.0] if only_integrates(own) else demands.scales
+    laws = [scaled(own, scale, shape, share) for share in integral for shape in shapes for scale in scales]
     return list(dict.fromkeys(laws))
 
 
@@ -181,9 +191,9 @@ def _lively(
 ) -> list[AnyController]:
     """Laws that pass and are of `always`, or have at least half of the gain of the fastest that passes: the others are
     slower, at every gap of the presets."""
-    fastest = next((law for law in sorted(laws, key=lambda law: -abs(answer(law))) if passes(law)), None)
-    least = math.inf if fastest is None else _WORTH_TRYING * abs(answer(fastest))
-    return [law for law in laws if (abs(answer(law)) >= least or law in always) and passes(law)]
+    fastest = next((law for law in sorted(laws, key=lambda law: -abs(strength(law))) if passes(law)), None)
+    least = math.inf if fastest is None else _WORTH_TRYING * abs(strength(fastest))
+    return [law for law in laws if (abs(strength(law)) >= least or law in always) and passes(law)]
 
 
 def with_notch(servo: Plant) -> Controller | Cascade | None:
@@ -208,11 +218,33 @@ def with_notch(servo: Plant) -> Controller | Cascade | None:
     return own.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
-def integral_shares(own: AnyController, demands: Demands) -> tuple[float, ...]:
-    """Factors on the own integral action that are tried.
+def own_answer(servo: Plant) -> float:
+    """Size of the command (V) with which the servo's own controller answers a constant error of one metre.
 
-    That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it.
+    Of a controller that only integrates it is the command that moves the load by one metre.
     """
+    law = servo.controller
+    return 1.0 / abs(slow_response(servo)[1]) if only_integrates(law) else abs(answer(law))
+
+
+def slow_response(servo: Plant) -> tuple[float, complex]:
+    """A frequency far below all corners of a plant (rad/s), and its response there (m/V)."""
+    plant = servo.plant()
+    corners = np.abs(plant.poles())
+    slow = 1e-4 * float(corners[corners > 1e-9 * corners.max()].min())
+    return slow, complex(plant.response(slow))
+
+
+def integral_shares(own: AnyController, demands: Demands, disturbed: bool = True) -> tuple[float, ...]:
+    """Factors on the own integral action that are tried, where friction or a bias act or not.
+
+    That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it. One
+    that is all of a controller is scaled like other gains.
+    """
+    if only_integrates(own):
+        return (1.0,)
+    if not disturbed:
+        return (0.0,)
     return demands.integral if isinstance(own, Controller) else _LAW_INTEGRAL
 
 
@@ -245,9 +277,12 @@ def _stable(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...]) ->
 
 
 def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> LoopMargins:
-    """`loop_margins`, for a dead zone that stops the integral only the worse of those with and without the integral."""
+    """`loop_margins`, for a dead zone that stops the integral only the worse of those with and without the integral.
+
+    Without an integral that is all of a law there is no loop.
+    """
     acting = loop_margins(servo, uncertainty, unfed(law))
-    if not law.integral_only:
+    if not law.integral_only or only_integrates(law):
         return acting
     stopped = loop_margins(servo, uncertainty, without_integral(unfed(law)))
     most = {name: max(getattr(acting, name), getattr(stopped, name)) for name in ("Ms", "Ms_worst")}

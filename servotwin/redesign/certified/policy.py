@@ -21,6 +21,7 @@ from servotwin.redesign.certified.certificate import Certificate, Demands, NotVe
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.fallback import fallback_certificate
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
+from servotwin.redesign.certified.margins import own_answer
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
@@ -105,7 +106,7 @@ class CertifiedPolicy:
     @property
     def smallest_answer(self) -> float:
         """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
-        return abs(answer(self.servo.controller)) * self.uncertainty.step[0]
+        return own_answer(self.servo) * self.uncertainty.step[0]
 
     @property
     def bias_floor(self) -> float:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.control.controller import Controller
-from servotwin.control.retuning import answer, friction_feedforward, integrates
+from servotwin.control.retuning import friction_feedforward, integrates, rest_gain
 from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined
 from servotwin.redesign.certified.attempt import ROUNDED, Question
 from servotwin.redesign.certified.uncertainty import draw
@@ -56,7 +56,7 @@ def leaves_too_much(question: Question, setting: Design) -> bool:
     known, servo, law = question.uncertainty, question.servo, setting.controller
     bias = max(abs(end + law.feedforward) for end in known.input_bias)
     held = max(0.0, servo.command_of(known.friction[1] + servo.own_friction) - abs(friction_feedforward(law)))
-    left = (bias + held) / abs(answer(law))
+    left = (bias + held) / rest_gain(law)
     return not integrates(law) and left > ROUNDED * question.largest_error(setting)
 
 

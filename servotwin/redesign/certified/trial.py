@@ -8,12 +8,13 @@ from functools import lru_cache
 
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import answer, unfed
+from servotwin.control.retuning import strength, unfed
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,
+    integral_shares,
     laws_within,
     nominal_margins,
     plant_set,
@@ -78,7 +79,7 @@ def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial
 
 @lru_cache(maxsize=16)
 def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
-    laws = laws_within(servo, uncertainty, demands, (0.0,))
+    laws = laws_within(servo, uncertainty, demands, integral_shares(servo.controller, demands, disturbed=False))
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
     loop = nominal_margins(servo, unfed(_reference(servo.controller, laws)))
@@ -101,4 +102,4 @@ def _speed(loop: Margins, servo: Plant, slowest: float) -> float:
 
 def _reference(own: AnyController, laws: tuple[AnyController, ...]) -> AnyController:
     """The candidate whose gain is the nearest to the servo's own: the crossover is its."""
-    return min(laws, key=lambda law: abs(answer(law) / answer(own) - 1.0) if answer(own) else 0.0)
+    return min(laws, key=lambda law: abs(strength(law) / strength(own) - 1.0) if strength(own) else 0.0)
