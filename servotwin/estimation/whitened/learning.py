@@ -202,10 +202,10 @@ def learn_and_fit(
         fits = [problem.descend(np.array([*point, *factors]), (True, True)) for point in points]
         fits.sort(key=lambda one: one.cost)
         factors, points = fits[0].factors, [one.point for one in fits[:2]]
-    aligned: AlignedFit | None = None
+    before: AlignedFit | None = None
     for _ in range(_TURNS):
         here = adapted(servo, factors)
-        aligned = align_and_fit(theta_m, position, rate, here, points, settings, aligned)
+        before = aligned = align_and_fit(theta_m, position, rate, here, points, settings, before)
         whitened = aligned.whitened
         problem = FreeProblem(whitened.reduction, whitened.noise, servo, machine, aligned.largest)
         free = problem.descend(np.array([*whitened.point, *factors]), (True, True))
