@@ -28,7 +28,7 @@ from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.actuator import ACTUATORS
-from servotwin.plant.axis_file import LOADS, TRANSMISSIONS, controller_keys
+from servotwin.plant.axis_file import LOADS, SENSOR_KEYS, TRANSMISSIONS, controller_keys, sensor_key
 from servotwin.plant.linear_law_file import linear_law
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
@@ -88,19 +88,31 @@ def _kinds(words: str, makers: Mapping[str, Maker]) -> TableSpec:
     return TableSpec(help=words, kinds={f'kind = "{kind}"': TableSpec((maker,)) for kind, maker in makers.items()})
 
 
-def _axis(controller: TableSpec) -> TableSpec:
-    """File of an axis with some controller."""
+def _axis(controller: TableSpec, sensors: TableSpec) -> TableSpec:
+    """File of an axis with some controller and sensors."""
     return TableSpec(
         tables={
             "actuator": _kinds("The actuator.", ACTUATORS),
             "transmission": _kinds("Transmission; the gap counts at the motor.", TRANSMISSIONS),
             "load": _kinds("The load.", LOADS),
-            "sensors": TableSpec((Sensors,), "Encoders; ideal where the table is absent."),
+            "sensors": sensors,
             "controller": controller,
         }
     )
 
 
+_SENSORS = TableSpec(
+    help="Encoders; ideal where the table is absent.",
+    kinds={
+        f"load {motion}": TableSpec((Sensors,), names={name: sensor_key(name, motion) for name in SENSOR_KEYS})
+        for motion in LOADS
+    },
+)
+_SENSORS_SHOWN = TableSpec(
+    (Sensors,),
+    "Encoders; ideal where the table is absent. With a rotary load `position_resolution_m` is "
+    "`position_resolution_rad`.",
+)
 _CONTROLLERS = TableSpec(
     help="The controller that runs; its keys have the units of command and position.",
     kinds={
@@ -124,11 +136,11 @@ _EITHER = {
     'kind = "cascade"': _controller_of("N m", "linear", Cascade),
     'kind = "linear"': _controller_of("N m", "linear", linear_law),
 }
-AXIS_SHOWN = _axis(TableSpec(help=_SHOWN_HELP, kinds=_EITHER))
+AXIS_SHOWN = _axis(TableSpec(help=_SHOWN_HELP, kinds=_EITHER), _SENSORS_SHOWN)
 """File of an axis for the reference, with one controller for all units."""
 FILES = {
     "servo": ("Servo: `servo.toml`", TableSpec((Servo,))),
-    "axis": ("Axis made of parts: `axis.toml`", _axis(_CONTROLLERS)),
+    "axis": ("Axis made of parts: `axis.toml`", _axis(_CONTROLLERS, _SENSORS)),
     "scenario": (
         "Scenario of a co-simulation: `scenario.toml`",
         TableSpec(

@@ -174,7 +174,7 @@ def read_parts(table: Table, folder: Path) -> Parts:
             )
     load: Load = read_kind(tables["load"], LOADS, Path())
     law = _read_controller(tables["controller"], folder, actuator.unit, motion, transmission.p)
-    encoders = table.table("sensors").renamed({_sensor_key(name, motion): name for name in _SENSOR_KEYS})
+    encoders = table.table("sensors").renamed({sensor_key(name, motion): name for name in SENSOR_KEYS})
     sensors: Sensors = read(encoders, Sensors)
     encoders.done()
     table.done()
@@ -259,7 +259,7 @@ def values_of_parts(axis: Parts) -> Values:
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
         "transmission": {"kind": kind, **_transmission_values(axis.transmission, kind)},
         "load": {"kind": motion, **values_of(axis.load, LOADS[motion])},
-        "sensors": {_sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
+        "sensors": {sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
         "controller": controller,
     }
 
@@ -268,10 +268,12 @@ def _kind_of_law(controller: AnyController) -> str:
     return LINEAR_LAW if isinstance(controller, LinearLaw) else CASCADE
 
 
-_SENSOR_KEYS = ("position_resolution_m",)
+SENSOR_KEYS = ("position_resolution_m",)
+"""Keys of the sensors that have other names with a rotary load."""
 
 
-def _sensor_key(name: str, motion: str) -> str:
+def sensor_key(name: str, motion: str) -> str:
+    """Name of a key of the sensors with a load of a kind."""
     return "position_resolution_rad" if motion == ROTARY and name == "position_resolution_m" else name
 
 

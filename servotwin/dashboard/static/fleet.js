@@ -143,13 +143,15 @@ export class FleetPage {
     const step = { ArrowDown: 1, ArrowUp: -1, PageDown: 10, PageUp: -10, End: Infinity, Home: -Infinity }[event.key];
     if (link && step) {
       event.preventDefault();
+      this.sorted ??= this.select();  // none since the rows changed
       const place = this.sorted.findIndex((row) => row.servo === link.textContent) + step;
       this.focusRow(Math.max(0, Math.min(this.sorted.length - 1, place)));
     } else if (typing === this.search && event.key === "ArrowDown") this.focusRow(0);
   }
 
   focusRow(index) {
-    const row = this.sorted?.[index];
+    this.sorted ??= this.select();
+    const row = this.sorted[index];
     if (!row) return;
     const height = this.rowHeight(), top = this.body.getBoundingClientRect().top + scrollY + index * height;
     if (top < scrollY + 7 * 16 || top + height > scrollY + innerHeight) scrollTo(0, top - innerHeight / 2);
