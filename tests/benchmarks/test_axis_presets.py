@@ -44,7 +44,7 @@ def test_no_window_between_two_levels_sees_the_gap_move(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "steps"),
-    [("ball-screw", 2), ("stepper-stage", 2), *(pytest.param(n, 3, marks=pytest.mark.exploration) for n in ESTIMATED)],
+    [("ball-screw", 2), *(pytest.param(n, 3, marks=pytest.mark.exploration) for n in ESTIMATED if n != "stepper-stage")],
 )
 def test_a_preset_s_twin_finds_its_gap(name: str, steps: int) -> None:
     """Steps of a machine that is not quite its model, worn to five times its healthy gap."""
@@ -53,6 +53,15 @@ def test_a_preset_s_twin_finds_its_gap(name: str, steps: int) -> None:
     accepted = found["estimates"]
     assert "ok" in found["statuses"], found["reasons"]
     assert all(each["near"] and each["inside"] for each in accepted), accepted
+
+
+@pytest.mark.slow
+def test_steps_of_a_stepper_between_two_places_do_not_tell_gap_from_ratio() -> None:
+    """They leave a gap possible that is off by more than is accepted, for another ratio and delay."""
+    (machine,) = preset_machines("stepper-stage", 1, 20261123)
+    found = measured(replace(machine, worn=(5.0, 5.0), steps=2))
+    assert found["statuses"] == ["unidentifiable"]
+    assert "the gap is known to" in found["reasons"][0]
 
 
 def test_a_preset_without_a_load_encoder_is_refused() -> None:

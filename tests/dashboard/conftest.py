@@ -45,7 +45,7 @@ def open_page(browser, twin):
 
         def note(message):
             if message.type in ("error", "warning") and not any(each in message.text for each in expected):
-                faults.append(message.text)
+                faults.append(f"{message.text} ({message.location.get('url', '')})")
 
         page.on("console", note)
         if login:

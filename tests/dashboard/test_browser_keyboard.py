@@ -40,7 +40,7 @@ def walk(page):
 
 
 def test_login_and_every_control_of_the_fleet_with_the_keyboard(open_page, twin):
-    page = open_page(login="", expected=("status of 401",))
+    page = open_page(login="", expected=("status of 401", "status of 404"))
     page.goto(twin.url)
     page.wait_for_selector("#token")
     assert walk(page) == ([], [])
@@ -59,6 +59,7 @@ def test_login_and_every_control_of_the_fleet_with_the_keyboard(open_page, twin)
     page.wait_for_selector(".chips button[aria-pressed=true] >> text=without a gap")
     page.locator(".chips button", has_text="all").focus()
     page.keyboard.press("Space")
+    page.wait_for_selector(".chips button[aria-pressed=true] >> text=all")
     page.locator(".rows a[tabindex='0']").focus()
     for key in ("End", "PageUp", "Home", "PageDown"):
         page.keyboard.press(key)
