@@ -10,11 +10,15 @@ import pytest
 
 from servotwin.cli.configuration import texts
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import AXES
 
 ROOT = Path(__file__).parents[2]
 PACKAGED = [
     *(("scenario", path) for path in sorted((ROOT / "servotwin/cosim/scenarios").glob("*.toml"))),
-    *(("servo", path) for path in sorted((ROOT / "servotwin/plant/presets").glob("*.toml"))),
+    *(
+        ("axis" if path.stem in AXES else "servo", path)
+        for path in sorted((ROOT / "servotwin/plant/presets").glob("*.toml"))
+    ),
 ]
 
 
