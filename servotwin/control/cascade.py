@@ -6,6 +6,7 @@ from typing import Annotated, Any
 
 from servotwin.config.keys import check, key, replaced, settings
 from servotwin.control.controller import notch_step
+from servotwin.control.law_keys import RateLimit, ReleaseTime, SampleRate, VoltageLimit
 from servotwin.control.linear_law import INPUTS, LOAD, MOTOR, LinearLaw
 from servotwin.errors import InvalidInput
 
@@ -104,16 +105,9 @@ class Cascade:
             "opens."
         ),
     ] = True
-    voltage_limit: Annotated[
-        float | None, key("voltage_limit_v", above=0.0, help="Largest command, either sign; no limit where absent.")
-    ] = None
-    rate_limit: Annotated[
-        float | None,
-        key("rate_limit_v_per_s", above=0.0, help="Largest rate of change of the command; no limit where absent."),
-    ] = None
-    sample_rate: Annotated[
-        float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
-    ] = None
+    voltage_limit: VoltageLimit = None
+    rate_limit: RateLimit = None
+    sample_rate: SampleRate = None
     tracking_time: Annotated[
         float | None,
         key(
@@ -123,10 +117,7 @@ class Cascade:
         ),
     ] = None
     feedforward: Annotated[float, key("feedforward_v", help="Command added at all times.")] = 0.0
-    release_time: Annotated[
-        float,
-        key("release_time_s", above=0.0, help="Time constant with which the offset after a change of law fades."),
-    ] = 0.5
+    release_time: ReleaseTime = 0.5
 
     def __post_init__(self) -> None:
         check(self)

@@ -6,6 +6,7 @@ from typing import Annotated, TypedDict, Unpack
 
 from servotwin.config.keys import check, items_of, key, replaced, settings
 from servotwin.control.law import LawParameters
+from servotwin.control.law_keys import RateLimit, ReleaseTime, SampleRate, VoltageLimit
 from servotwin.errors import InvalidInput
 from servotwin.runtime.notebook import html_table
 
@@ -71,16 +72,9 @@ class Controller:
         float | None,
         key(above=0.0, help="Cut-off of a first-order low-pass on the measurement (section 4.3); none where absent."),
     ] = None
-    voltage_limit: Annotated[
-        float | None, key("voltage_limit_v", above=0.0, help="Largest output, either sign; no limit where absent.")
-    ] = None
-    rate_limit: Annotated[
-        float | None,
-        key("rate_limit_v_per_s", above=0.0, help="Largest rate of change of the voltage; no limit where absent."),
-    ] = None
-    sample_rate: Annotated[
-        float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
-    ] = None
+    voltage_limit: VoltageLimit = None
+    rate_limit: RateLimit = None
+    sample_rate: SampleRate = None
     tracking_time: Annotated[
         float | None,
         key(
@@ -96,14 +90,7 @@ class Controller:
             help="Voltage added at all times, inside the dead zone too; it cancels a bias of the plant's input.",
         ),
     ] = 0.0
-    release_time: Annotated[
-        float,
-        key(
-            "release_time_s",
-            above=0.0,
-            help="Time constant with which the voltage offset after a change of parameters (`LawState.offset`) fades.",
-        ),
-    ] = 0.5
+    release_time: ReleaseTime = 0.5
     integral_only: Annotated[
         bool,
         key(

@@ -93,7 +93,7 @@ def autocorrelation(series: Array, lags: int) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Left:
-    """What a fit leaves.
+    """Residual of a fit.
 
     Attributes
     ----------
@@ -150,7 +150,7 @@ def _of_whitened(result: WhitenedFit, window: Window) -> _Left:
 
 
 def _of_search(found: Search, window: Window, at_motor: bool) -> _Left:
-    """What the fit of an axis's own method leaves: output error, or motor side."""
+    """Residual of the fit by an axis's own method: output error, or motor side."""
     left = -found.best.raw
     white = -found.best.residual[: left.size]  # what comes after it is prior knowledge, and no sample
     of, predicted = "motor" if at_motor else "position", 1.0 - found.noise.unpredicted

@@ -44,7 +44,7 @@ class Stretches:
     def __init__(self, most: int) -> None:
         self._most = most
         self._length = max(_LEAST, min(_STRETCH, most // _STRETCHES))
-        self._parts: list[_Part] = []
+        self._parts: list[_Stretch] = []
         self._begun: list[Array] = []  # tables that do not fill a stretch yet
         self._every = 1  # of so many stretches one stays
         self._group = 0  # stretches of which the last one that stays was chosen
@@ -56,14 +56,14 @@ class Stretches:
         joined = np.concatenate([*self._begun, table])
         full = len(joined) // self._length * self._length
         for begin in range(0, full, self._length):
-            self._take(_Part(joined[begin : begin + self._length].copy(), True))
+            self._take(_Stretch(joined[begin : begin + self._length].copy(), True))
         self._begun = [joined[full:]]
         while self._held() > self._most:
             self._halve()
 
     def thinned(self) -> Thinned:
         """All samples that stayed."""
-        parts = [*self._parts, *(_Part(table, True) for table in self._begun if len(table))]
+        parts = [*self._parts, *(_Stretch(table, True) for table in self._begun if len(table))]
         if not parts:
             return Thinned(np.empty((0, 0)), np.zeros(0, dtype=np.bool_))
         alone = np.repeat([not part.whole for part in parts], [len(part.table) for part in parts])
@@ -72,7 +72,7 @@ class Stretches:
     def _held(self) -> int:
         return sum(len(part.table) for part in self._parts) + sum(map(len, self._begun))
 
-    def _take(self, part: _Part) -> None:
+    def _take(self, part: _Stretch) -> None:
         """Append the next stretch, or choose between it and the one that stays of its group so far."""
         if self._group == 0:
             self._parts.append(part)
@@ -86,14 +86,14 @@ class Stretches:
             self._append_joined([*self._cut_alone(), *last])
         self._group = (self._group + 1) % self._every
 
-    def _replaces(self, kept: _Part, other: _Part, chance: float) -> bool:
+    def _replaces(self, kept: _Stretch, other: _Stretch, chance: float) -> bool:
         """True where another stretch is to stay in place of one."""
         drawn = bool(self._random.random() < chance)
         if min(kept.way, other.way) > _RESTS * max(kept.way, other.way):
             return drawn
         return other.way > kept.way
 
-    def _cut_alone(self) -> list[_Part]:
+    def _cut_alone(self) -> list[_Stretch]:
         """Take away the parts at the end that are not whole."""
         place = len(self._parts)
         while place and not self._parts[place - 1].whole:
@@ -101,13 +101,13 @@ class Stretches:
         cut, self._parts = self._parts[place:], self._parts[:place]
         return cut
 
-    def _append_joined(self, parts: list[_Part]) -> None:
+    def _append_joined(self, parts: list[_Stretch]) -> None:
         """Append parts, neighbours that are not whole as what is remembered of them."""
         for part in parts:
             if not part.whole:
                 before = self._cut_alone()
                 joined = np.concatenate([*(each.table for each in before), part.table])
-                part = _Part(remembered(joined), False)
+                part = _Stretch(remembered(joined), False)
                 self.dropped += len(joined) - len(part.table)
             self._parts.append(part)
 
@@ -130,7 +130,7 @@ class Stretches:
         return last if open_group else (self._every + last) % (2 * self._every)
 
 
-class _Part(NamedTuple):
+class _Stretch(NamedTuple):
     """Neighbouring samples, (n, c): a whole stretch at the full rate, or what is remembered of several."""
 
     table: Array

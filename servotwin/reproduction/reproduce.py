@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import groupby
-from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Protocol, TypeVar
 
@@ -28,6 +25,7 @@ from servotwin.reproduction.figures import DrawnFigure, FigureSpec
 from servotwin.reproduction.report import report
 from servotwin.reproduction.runs import Runs
 from servotwin.runtime import files
+from servotwin.runtime.interrupts import ignore_interrupts, interrupts_blocked
 
 _R = TypeVar("_R", covariant=True)
 TaskResult = DrawnFigure | tuple[ClaimResult, ...]
@@ -198,33 +196,14 @@ def _perform(tasks: Sequence[ReproductionTask[_R]], workers: int) -> Iterator[_R
     if workers == 1 or len(tasks) < 2:
         yield from (task.run() for task in tasks)
         return
-    with _interrupts_blocked():
-        pool = multiprocessing.get_context("spawn").Pool(min(workers, len(tasks)), _ignore_interrupts)
+    with interrupts_blocked():
+        pool = multiprocessing.get_context("spawn").Pool(min(workers, len(tasks)), ignore_interrupts)
     with pool:
         yield from pool.imap_unordered(_run, tasks)
 
 
 def _run(task: ReproductionTask[_R]) -> _R:
     return task.run()
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block interrupts; a process started meanwhile never gets one, not even before `_ignore_interrupts` runs."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    resource_tracker.ensure_running()  # its start would let interrupts through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _ignore_interrupts() -> None:
-    """Leave an interrupt to the process that started the pool."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 _COLORS = {Verdict.REPRODUCED: "green", Verdict.NOT_AS_STATED: "red", Verdict.CANNOT_BE_CHECKED: "dim"}

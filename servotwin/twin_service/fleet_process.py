@@ -35,7 +35,7 @@ _NICENESS = 5
 
 
 class ChangesQuestion(NamedTuple):
-    """What changed since a position.
+    """Changes since a position.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""The presets of the shelf with their twins in the loop, as they are measured, and a short loop of each."""
+"""The axis presets with their twins in the loop, as they are measured, and a short loop of each."""
 
 from __future__ import annotations
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import logging
 import os
 import re
-import signal
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
-from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 from joblib import Parallel, delayed, parallel_config
@@ -18,6 +16,7 @@ from joblib.externals.loky.backend import resource_tracker as loky_tracker
 
 from servotwin.errors import InvalidInput
 from servotwin.runtime.extras import require
+from servotwin.runtime.interrupts import ignore_interrupts, interrupts_blocked
 
 CONNECT_TIMEOUT = 5.0
 _ADDRESS = re.compile(r"((tcp|tls|ws|wss)://)?([^\s/:\[\]]+|\[[0-9a-fA-F:.]+\]):[0-9]{1,5}")
@@ -56,7 +55,7 @@ def shared(function: Callable[[_T], _R], tasks: Iterable[_T]) -> Generator[tuple
     tasks : iterable
         Picklable.
     """
-    with _interrupts_blocked():
+    with interrupts_blocked(loky_tracker.ensure_running):
         outcomes = Parallel(batch_size=1, return_as="generator_unordered")(
             delayed(_performed)(function, task) for task in tasks
         )
@@ -77,7 +76,7 @@ def _performed(function: Callable[[_T], _R], task: _T) -> tuple[_T, _R]:
 def _processes(workers: int) -> Iterator[None]:
     try:
         with (
-            parallel_config(backend="loky", n_jobs=workers, initializer=_ignore_interrupts),
+            parallel_config(backend="loky", n_jobs=workers, initializer=ignore_interrupts),
             warnings.catch_warnings(),
         ):
             # loky replaces workers whose caches have grown; nothing is wrong then.
@@ -127,23 +126,3 @@ def _connected(address: str) -> Any:
         client.close()
         raise InvalidInput(f"--scheduler {address}: has no workers; start some with dask worker {address}")
     return client
-
-
-@contextmanager
-def _interrupts_blocked() -> Iterator[None]:
-    """Block interrupts; processes started meanwhile inherit that, so only this process handles one."""
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
-    for tracker in (resource_tracker, loky_tracker):
-        tracker.ensure_running()  # its start would let interrupts through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-def _ignore_interrupts() -> None:
-    """Leave an interrupt to the process that started the pool."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
