@@ -44,7 +44,10 @@ def test_no_window_between_two_levels_sees_the_gap_move(name: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "steps"),
-    [("ball-screw", 2), *(pytest.param(n, 3, marks=pytest.mark.exploration) for n in ESTIMATED if n != "stepper-stage")],
+    [
+        ("ball-screw", 2),
+        *(pytest.param(n, 3, marks=pytest.mark.exploration) for n in ESTIMATED if n != "stepper-stage"),
+    ],
 )
 def test_a_preset_s_twin_finds_its_gap(name: str, steps: int) -> None:
     """Steps of a machine that is not quite its model, worn to five times its healthy gap."""
