@@ -106,4 +106,4 @@ def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) 
         assert stored() == {("b1-aa", 0), ("b2-bb", 0), ("b2-bb", 1)}
         with edge(first, "b3-cc") as again:  # an operator starts the right one again: what waited is not lost
             until(lambda: ("b1-aa", 1) in stored())
-            until(lambda: again.status.get("conflict") is not True)  # the file is of the edge before until it is written
+            until(lambda: again.status.get("conflict") is not True)  # until then that of the edge before
