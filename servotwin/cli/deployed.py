@@ -48,7 +48,7 @@ def twin(
         TwinAction | None,
         typer.Argument(
             help="check: check the whole store, also while the twin runs, and end. "
-            "test-alarm: post a test to the webhook of [service.webhook], and end."
+            "test-alarm: post a test to the webhook of the file (table service.webhook), and end."
         ),
     ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),

@@ -308,7 +308,7 @@ def _std(found: LoadFit, slower: LoadFit, counts: float) -> float:
 
 
 def _curves(found: LoadFit, ratio: float) -> FittedCurves:
-    """What the fit leaves of the next samples, and the motor's lead; other gaps were tried at two places only."""
+    """Residual of the next samples, and the motor's lead; no costs, as other gaps were tried at two places only."""
     problem, none = found.problem, np.empty(0)
     driven = found.scale * problem.drive + float(found.fit.values[OFFSET])
     time = problem.recording.time[0] + problem.interval * np.arange(driven.size)

@@ -17,7 +17,7 @@ from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.doubt import gap_doubt
-from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around, profile_interval
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
@@ -34,6 +34,7 @@ from servotwin.estimation.whitened.gate import (
     travel_needed,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
+from servotwin.estimation.whitened.profile import profile_interval
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift, fastest, model_shift, observer_shift
 from servotwin.estimation.window import Window

@@ -6,8 +6,7 @@ taken off in whole samples, and the fit repeated.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,8 +16,6 @@ from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares, spread
 from servotwin.estimation.core.response import response
 from servotwin.estimation.core.whitening import Autoregression, burg, with_noise_restored
-from servotwin.estimation.estimate import Interval
-from servotwin.estimation.whitened.free_model import same_way
 from servotwin.estimation.whitened.reduction import (
     CONSTANT,
     GAP,
@@ -31,8 +28,6 @@ from servotwin.estimation.whitened.reduction import (
     factor_for,
 )
 from servotwin.estimation.whitened.search import (
-    PLACE_ONLY,
-    PLACES,
     SearchResult,
     continued,
     descend,
@@ -156,11 +151,11 @@ def refine(
     """
     if nearby is None:
         begun = _in_white_noise(reduction, points, largest, tolerance)
-        point, noise, evaluations = begun.point, Autoregression.white(1.0), begun.evaluations
+        first, point, noise, evaluations = 0, begun.point, Autoregression.white(1.0), begun.evaluations
     else:
-        point, noise, evaluations = points[0], nearby.noise, 0
+        first, point, noise, evaluations = passes - 1, points[0], nearby.noise, 0
         reduction = replace(reduction, rate=nearby.reduction.rate)
-    for number in range(0 if nearby is None else passes - 1, passes):
+    for number in range(first, passes):
         table = reduction.table(point)
         noise = estimate_noise(reduction, table, noise, order, number >= _PLAIN)
         reduction = reduction.growing(noise, table)
@@ -341,71 +336,3 @@ def plain_fit(window: Window, servo: Servo, gap: float) -> SearchResult:
     reduction = Reduction.of(window.theta_m, window.position, response(servo, window.sample_rate), skew=False)
     span = float(np.ptp(window.theta_m))
     return descend(reduction.coarse(), Point(gap, 0.0), 2.0 * span, _PRECISION * span)
-
-
-_CHI_SQUARED_95 = 3.841458820694124
-_CLOSE, _TRIALS = 0.1, 12  # of the allowed rise, at the end of the search; most trials
-_FURTHER = 3.0  # times as far, at most, the next trial lies
-_WELL_WITHIN = 1.0 / _FURTHER**2  # of what is allowed: any less makes no difference to the next trial
-_NEAR = 0.1  # of the gap: closer by, the best place is next to that of the fit, if the spread is not wider
-
-
-def profile_interval(result: WhitenedFit, std: float, calibration: float, largest: float, tolerance: float) -> Interval:
-    """95 % interval of the gap, rad; 0 or inf where the likelihood has no end on that side.
-
-    Parameters
-    ----------
-    found : WhitenedFit
-    std : float
-        rad: first trial; inf is allowed.
-    calibration : float
-        Factor of the standard deviation.
-    largest : float
-        rad: gaps above this are not told from each other.
-    tolerance : float
-        rad, of the search for the screw's start.
-    """
-    allowed = _CHI_SQUARED_95 * calibration**2 * max(1.0, result.variance)
-
-    def rise(gap: float) -> float:
-        """Rise of the best cost with this gap, in units of what is allowed; well within, an upper bound."""
-        near = abs(gap - result.point.gap) < min(3.0 * std, _NEAR * result.point.gap)
-        places = (result.point.place,) if near else (*same_way(result.point, gap), *PLACES)
-        lowest = math.inf
-        for place in dict.fromkeys(places):
-            fit = descend(result.misfit, Point(gap, place), largest, tolerance, 12, PLACE_ONLY)
-            lowest = min(lowest, (fit.slopes.cost - result.fit.slopes.cost) / allowed)
-            if lowest <= _WELL_WITHIN:
-                break
-        return lowest
-
-    first = min(1.96 * std, 0.5 * largest)
-    return _end(rise, result.point.gap, -first, 0.0), _end(rise, result.point.gap, first, largest)
-
-
-def _end(rise: Callable[[float], float], middle: float, step: float, limit: float) -> float:
-    """Find the gap at which `rise` reaches 1 on one side; the far limit counts as 0 or inf.
-
-    If the trials do not suffice, the nearest point known to lie outside.
-    """
-    beyond = math.inf if limit > 0.0 else 0.0
-    room = abs(limit - middle)
-    inside, outside, size = 0.0, math.inf, abs(step)
-    for _ in range(_TRIALS):
-        at_limit = size >= room
-        size = min(size, room)
-        level = max(0.0, rise(middle + math.copysign(size, step)))
-        if abs(level - 1.0) < _CLOSE:
-            break
-        if level < 1.0:
-            if at_limit:
-                return beyond
-            inside = size
-        else:
-            outside = size
-        size *= min(max(1.0 / math.sqrt(max(level, 1e-9)), 0.2), _FURTHER)
-        if not inside < size < outside:
-            size = 0.5 * (inside + outside)
-    else:
-        size = min(outside, room)
-    return middle + math.copysign(size, step)

@@ -36,7 +36,7 @@ CYCLIC = 2e-3 * math.pi  # rad, usual size of an error once per turn: a thousand
 _WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: within these, the motion is linear in them
 _FIRST_DAMPING, _FIRST_LINEAR, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-6, 1e8, 1e-9
 _EVALUATIONS = 12  # of a fit
-_GAIN = 1e-6  # of the residual's variance, promised by a step: a thirtieth of one standard deviation of anything
+_GAIN = 1e-6  # of the residual's variance, promised by a step: a thousandth of one standard deviation of anything
 _SINGULAR = 1e-10  # of a column's length
 _ANY = (0.0, math.inf, math.inf)
 
