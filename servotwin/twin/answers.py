@@ -14,12 +14,7 @@ from servotwin.messages import (
     Message,
 )
 from servotwin.messages.acts import Act, ActKind
-from servotwin.twin.evidence import (
-    ActRecord,
-    Record,
-    VerificationRecord,
-    WithdrawalRecord,
-)
+from servotwin.twin.evidence import ActRecord, Record, VerificationRecord, WithdrawalRecord
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.oversight import judge_act
