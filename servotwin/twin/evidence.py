@@ -126,12 +126,12 @@ class ActRecord(NamedTuple):
     later: bool = False
 
 
-Message = Update | Request | LearntResponse | Receipt | Fallback | Answer | Hello
+MessageRecord = Update | Request | LearntResponse | Receipt | Fallback | Answer | Hello
 """A message that is its own record: an update or a request sent, a receipt received."""
 
 Record = (
     GlanceRecord | GapEstimateRecord | DisturbanceRecord | TrendRecord | MachineRecord | MotorRecord | AlarmRecord
     | RedesignRecord | ExcitationRecord | VerificationRecord | WithdrawalRecord | VerificationRequest
-    | ProposalRecord | ActRecord | Message
+    | ProposalRecord | ActRecord | MessageRecord
 )  # fmt: skip
 """Evidence of one step."""

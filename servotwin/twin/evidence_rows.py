@@ -41,7 +41,7 @@ from servotwin.twin.evidence import (
     GapEstimateRecord,
     GlanceRecord,
     MachineRecord,
-    Message,
+    MessageRecord,
     MotorRecord,
     ProposalRecord,
     Record,
@@ -159,7 +159,7 @@ def _row(record: Record) -> EvidenceRecord | None:
     raise TypeError(f"{type(record).__name__} is not a record of evidence")
 
 
-def _row_of_message(message: Message) -> EvidenceRecord:
+def _row_of_message(message: MessageRecord) -> EvidenceRecord:
     """Make the row of a message that was sent or received."""
     match message:
         case Update():
