@@ -43,6 +43,12 @@ class PageService:
     ----------
     readers : StoreExecutor
         What people read may take long: edges and acknowledgements do not wait behind it.
+    fleet, changes, feed : FleetReader, ChangeReader, FleetFeed
+        Rows of the fleet's page, those that have changed, and the stream of them.
+    live_intake : LiveIntake
+        Takes what edges stream while someone watches.
+    what_if : WhatIfProcess
+        Simulates what a page asks for.
     """
 
     def __init__(
@@ -50,9 +56,9 @@ class PageService:
     ) -> None:
         self._config, self._store, self._monotonic = twin.service, store, clocks.monotonic
         self.readers = StoreExecutor(_READERS, "readers")
-        self._fleet = FleetReader(store, presence, clocks.wall)
-        self._changes = ChangeReader(self._fleet, self.readers, _readable_elsewhere(store))
-        self.feed = FleetFeed(self._changes, presence, self._config.watchers, shared)
+        self.fleet = FleetReader(store, presence, clocks.wall)
+        self.changes = ChangeReader(self.fleet, self.readers, _readable_elsewhere(store))
+        self.feed = FleetFeed(self.changes, presence, self._config.watchers, shared)
         self._live_views = LiveViews(self._monotonic, presence, self._config.watchers, self._config.long_polls)
         self.live_intake = LiveIntake(claims, self._live_views, self._monotonic)
         self.what_if = WhatIfProcess(twin.start, self._monotonic)
@@ -61,7 +67,7 @@ class PageService:
         """Routes of the dashboard, of live views, what-ifs and Parquet files."""
         machine_metrics = self._config.machine_metrics
         parts = (
-            DashboardApi(operators, self._store, self.readers, self._fleet, self.feed, machine_metrics),
+            DashboardApi(operators, self._store, self.readers, self.fleet, self.feed, machine_metrics),
             WhatIfApi(operators, self._store, self.readers, self.what_if, self._monotonic),
             LiveApi(gate, operators, self.live_intake, self._live_views),
             ParquetApi(operators, self._store, self.readers, self.what_if),
@@ -76,7 +82,7 @@ class PageService:
     async def stop(self) -> None:
         """Stop the processes that read and simulate."""
         await self.what_if.stop()
-        await self._changes.stop()
+        await self.changes.stop()
 
     def close(self) -> None:
         """Close the threads that read, after all requests."""
