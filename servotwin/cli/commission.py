@@ -15,6 +15,7 @@ from rich.table import Table
 from servotwin.commissioning.commission import CommissionedAxis, commission
 from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
@@ -127,7 +128,7 @@ def axis_text(found: CommissionedAxis, axis: Axis) -> str:
     known, names = found.uncertainty, ", ".join(Path(log.recording.source).name for log in found.logs)
     lines = [
         f"# Identified by servotwin commission from {names}.",
-        *(f"# {line}" for line in _lines(found, fit)),
+        *(f"# {line} (95 %)" for line in _lines(found, fit)),
         "# For the twin, at the motor (95 %): [twin.uncertainty]",
         *(
             [f"#   {', '.join(f'{name}_percent = {100.0 * getattr(known, name):.3g}' for name in 'mkc')},"]
@@ -145,12 +146,17 @@ def axis_text(found: CommissionedAxis, axis: Axis) -> str:
 
 def headline(found: CommissionedAxis) -> str:
     """The result in one line."""
-    return ", ".join(_lines(found, found.best))
+    return ", ".join(_lines(found, found.best)) + " (± 95 %)"
 
 
 def _lines(found: CommissionedAxis, fit: ParameterFit) -> list[str]:
     units = _units(found)
-    return [f"{_WORDS[name]} {fit[name]:.6g} +- {fit.half_width(name):.2g} {units[name]}" for name in fit.names]
+    return [f"{_WORDS[name]} {_number(fit, name)} {units[name]}" for name in fit.names]
+
+
+def _number(fit: ParameterFit, name: str) -> str:
+    """A parameter with half of its 95 % interval."""
+    return f"{fit[name]:.6g} ± {fit.half_width(name):.2g}"
 
 
 def _units(found: CommissionedAxis) -> dict[str, str]:
@@ -189,7 +195,7 @@ def _print(console: Console, found: CommissionedAxis) -> None:
 
 def _table(found: CommissionedAxis) -> Table:
     units, drive = _units(found), found.drive
-    table = Table("parameter", "inverse dynamics", "simulated loop", "unit", box=None, pad_edge=False)
+    table = Table("parameter (± 95 %)", "inverse dynamics", "simulated loop", "unit", box=None, pad_edge=False)
     refined = drive.refinement
     pairs = [
         (drive.symmetric, None if refined is None else refined.symmetric),
@@ -199,8 +205,8 @@ def _table(found: CommissionedAxis) -> Table:
         for name in first.names:
             if first is drive.asymmetric and name == "inertia":
                 continue
-            shown = "-" if second is None else f"{second[name]:.6g} +- {second.half_width(name):.2g}"
-            table.add_row(_WORDS[name], f"{first[name]:.6g} +- {first.half_width(name):.2g}", shown, units[name])
+            shown = "-" if second is None else _number(second, name)
+            table.add_row(_WORDS[name], _number(first, name), shown, units[name])
     errors = [f"{100.0 * first.relative_error:.2f}" for first, _ in pairs]
     table.add_row(
         "left by the model", errors[0], "" if refined is None else f"{100 * refined.symmetric.relative_error:.2f}", "%"
@@ -281,28 +287,29 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
         lost, unit = log.lost_motion, log.recording.unit
         low, high = lost.interval_load
         lines.append(
-            f"lost motion at the load: {lost.at_load:.4g} {unit} ({low:.4g} .. {high:.4g}): {lost.status.value}; "
+            f"lost motion at the load: {lost.at_load:.4g} {unit} (95 %: {low:.4g} .. {high:.4g}): {lost.status.value}; "
             "it is the gap and the wind-up by friction together"
         )
         if lost.ratio < 0.0:
             lines.append("the motor's encoder counts against the load's: its positions are turned")
     if shaft is None:
         return lines
-    late = f"the load's encoder is {1e3 * shaft.delay:.3g} +- {2e3 * shaft.delay_std:.2g} ms late"
+    delay = f"{1e3 * shaft.delay:.3g} ± {1e3 * NORMAL_95 * shaft.delay_std:.2g} ms (95 %)"
+    late = f"the load's encoder is {delay} late"
     if not math.isfinite(shaft.resonance):
         return [
             *lines,
             f"shaft: no elasticity below {shaft.highest:.3g} Hz, to which the encoders are coherent; {late}",
         ]
     lines.append(
-        f"shaft: resonance {shaft.resonance:.4g} +- {2.0 * shaft.resonance_std:.2g} Hz with the motor held, "
-        f"damping ratio {shaft.damping:.2g}, coherent up to {shaft.highest:.3g} Hz; {late}"
+        f"shaft: resonance {shaft.resonance:.4g} ± {NORMAL_95 * shaft.resonance_std:.2g} Hz (95 %) with the motor "
+        f"held, damping ratio {shaft.damping:.2g}, coherent up to {shaft.highest:.3g} Hz; {late}"
     )
     if split is not None:
         load, motor = split["load_inertia"], split["motor_inertia"]
         lines.append(
-            f"shaft: {load:.4g} +- {split.half_width('load_inertia'):.2g} behind and {motor:.4g} before it "
-            f"({_units(found)['inertia']}), stiffness {shaft.stiffness(load):.4g}, "
+            f"shaft: {load:.4g} ± {split.half_width('load_inertia'):.2g} (95 %) behind and {motor:.4g} before it, "
+            f"{_units(found)['inertia']}; stiffness {shaft.stiffness(load):.4g}, "
             f"damping {shaft.shaft_damping(load):.4g}"
         )
     else:

@@ -357,16 +357,15 @@ def _binned(keys: Any, gaps: Any) -> list[tuple[str, str, str]]:
 
 
 def _change(before: _Answer, after: _Answer) -> str:
-    """The difference of two logs' gaps, or lost motions, and if it is more than their uncertainty."""
+    """The difference of two logs' gaps, or lost motions, with half of its 95 % interval."""
     (_, old), (second, new) = before, after
     if not (math.isfinite(old.lost.std_load) and math.isfinite(new.lost.std_load)):
         return "no change can be told: the lost motion of the two logs is only bounded"
     name = _compared((before, after))
     (one, its), (other, of_it) = _value(old, name), _value(new, name)
-    change, std = other - one, math.hypot(_half(its), _half(of_it)) / NORMAL_95
-    times = abs(change) / std if std else math.inf
-    said = "more than chance explains" if times > NORMAL_95 else "no more than chance explains"
-    return f"change of the {name}: {change:+.4g} {second.recording.load_unit} ({times:.1f} standard deviations: {said})"
+    change, half = other - one, math.hypot(_half(its), _half(of_it))
+    said = "more than chance explains" if abs(change) > half else "no more than chance explains"
+    return f"change of the {name}: {change:+.4g} ± {half:.2g} {second.recording.load_unit} (95 %): {said}"
 
 
 def _half(interval: Interval) -> float:

@@ -332,7 +332,7 @@ def test_the_change_between_two_logs(tmp_path, made):
     result = CliRunner().invoke(app, ["identify", str(first), str(second)])
     assert result.exit_code == 0, result.output
     assert "change of the lost motion: +0.001" in " ".join(result.output.split())
-    assert "deviations: more than chance explains" in " ".join(result.output.split())
+    assert "(95 %): more than chance explains" in " ".join(result.output.split())
 
 
 def test_a_foreign_log_is_converted_without_its_defects(tmp_path, made):
