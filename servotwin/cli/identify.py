@@ -223,11 +223,11 @@ def _trend_lines(identification: Identification, options: IdentifyOptions) -> li
     if identification.until_limit is not None:
         early, late = identification.until_limit.interval
         median = (
-            f"median {identification.until_limit.median:.4g} s"
+            f"{identification.until_limit.median:.4g} s"
             if math.isfinite(identification.until_limit.median)
             else "perhaps never"
         )
-        lines.append(f"{options.gap_limit_deg:g} deg are reached in: {median} (95 %: {early:.4g} .. {late:.4g} s)")
+        lines.append(f"time until {options.gap_limit_deg:g} deg: {median} (median; 95 %: {early:.4g} .. {late:.4g} s)")
     return lines
 
 

@@ -20,6 +20,7 @@ from servotwin.plant.plants import Plant, resolve_plant
 from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
+_EVENTS = 12  # shown of an orbit
 _SAME = 1e-6
 
 
@@ -141,14 +142,15 @@ def _in_unit(unit: ShownUnit, positions: Mapping[str, tuple[float | None, float 
 
 
 def _dead_zone(tolerance: float | None, unit: ShownUnit) -> str:
-    return f"dead zone ±{tolerance:g} {unit.name}" if tolerance else "no dead zone"
+    return f"dead zone of {tolerance:g} {unit.name} either way" if tolerance else "no dead zone"
 
 
 def _print(console: Console, computed: Findings, unit: ShownUnit) -> None:
     result = computed.result
     orbit = result.orbit
     console.print(f"[bold]{result.status.value}[/]{': ' if result.reason else ''}{result.reason}")
-    table = Table("", "frequency\nHz", f"position\n± {unit.name}", "motor\n± deg", "", box=None, pad_edge=False)
+    heads = "frequency\nHz", f"amplitude of\nposition, {unit.name}", "amplitude of\nmotor, deg"
+    table = Table("", *heads, "", box=None, pad_edge=False)
     if orbit is not None:
         table.add_row("exact, after the step", *_cells(orbit, unit))
     for one, near in computed.predictions:
@@ -180,11 +182,14 @@ def _stability(stable: bool) -> str:
 
 def _print_orbit(console: Console, orbit: Orbit) -> None:
     if orbit.half_multipliers is not None:
-        console.print(f"multipliers of half a period: {_sizes(orbit.half_multipliers)}", highlight=False)
-    console.print(f"multipliers of the period: {_sizes(orbit.multipliers)}", highlight=False)
-    events = ", ".join(f"{event.kind} {event.side:+d} at {event.phase:.4f}" for event in orbit.events)
-    console.print(f"events by phase: {events}", highlight=False)
-    console.print(f"closes in the event simulation to {orbit.residual:.1e} of its range", style="dim", highlight=False)
+        console.print(f"Floquet multipliers of half a period: {_sizes(orbit.half_multipliers)}", highlight=False)
+    console.print(f"Floquet multipliers of the period: {_sizes(orbit.multipliers)}", highlight=False)
+    shown = [f"{event.kind} {event.side:+d} at {event.phase:.4f}" for event in orbit.events[:_EVENTS]]
+    more = len(orbit.events) - len(shown)
+    events = ", ".join([*shown, f"and {more} more (--json lists all)"] if more else shown)
+    console.print(f"events, as shares of the period: {events}", highlight=False)
+    check = f"check: one period of the event simulation closes the orbit to {orbit.residual:.1e} of its range"
+    console.print(check, style="dim", highlight=False)
 
 
 def _sizes(values: Any) -> str:

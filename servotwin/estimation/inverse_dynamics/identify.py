@@ -135,7 +135,7 @@ def _refined(
     """The law that ran, the refinement, and why there is none."""
     if recording.reference is None:
         given = _fitted_law(recording, gains) if gains.complete else None
-        return given, None, ("without a reference the loop cannot be simulated beside the log",)
+        return given, None, ("without a reference the loop cannot be simulated",)
     law = _fitted_law(recording, gains)
     if not law.explains:
         checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
