@@ -395,7 +395,7 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
             "asymmetric": fit(refined.asymmetric),
             "position_error": refined.simulated.position_error,
             "force_error": refined.simulated.force_error,
-            "settled": refined.settled,
+            "converged": refined.converged,
         },
         "controller": _law_dict(drive.law),
         "shaft": _shaft_dict(found),

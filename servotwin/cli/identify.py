@@ -20,9 +20,9 @@ from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant, check_load_encoder, plant_of, resolve_plant
 from servotwin.plant.scales import scales
-from servotwin.plant.shown import command_unit, position_unit
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 

@@ -16,8 +16,8 @@ from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predict
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.analysis.limit_cycles.shaft import Prediction
 from servotwin.errors import InvalidInput
+from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, position_unit
 from servotwin.plant.plants import Plant, resolve_plant
-from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
 _EVENTS = 12  # shown of an orbit
@@ -88,7 +88,7 @@ def print_limit_cycle(
     _print(console, computed, unit)
 
 
-def as_dict(computed: Findings, unit: ShownUnit = MILLIMETRES) -> dict[str, Any]:
+def as_dict(computed: Findings, unit: DisplayUnit = MILLIMETRES) -> dict[str, Any]:
     """Make the JSON object: plain numbers, with units in the keys; `unit` is that of positions."""
     return {
         "status": computed.result.status.value,
@@ -109,7 +109,7 @@ def as_dict(computed: Findings, unit: ShownUnit = MILLIMETRES) -> dict[str, Any]
     }
 
 
-def _orbit(orbit: Orbit | None, unit: ShownUnit) -> dict[str, Any] | None:
+def _orbit(orbit: Orbit | None, unit: DisplayUnit) -> dict[str, Any] | None:
     if orbit is None:
         return None
     half = orbit.half_multipliers
@@ -128,7 +128,9 @@ def _orbit(orbit: Orbit | None, unit: ShownUnit) -> dict[str, Any] | None:
     }
 
 
-def _in_unit(unit: ShownUnit, positions: Mapping[str, tuple[float | None, float | None]]) -> tuple[float | None, float]:
+def _in_unit(
+    unit: DisplayUnit, positions: Mapping[str, tuple[float | None, float | None]]
+) -> tuple[float | None, float]:
     """Tolerance and step, in the unit of a machine; refused in another."""
     for other, given in positions.items():
         for option, value in zip(("tolerance", "step"), given, strict=True):
@@ -141,11 +143,11 @@ def _in_unit(unit: ShownUnit, positions: Mapping[str, tuple[float | None, float 
     return tolerance, 1.0 if step is None else step
 
 
-def _dead_zone(tolerance: float | None, unit: ShownUnit) -> str:
+def _dead_zone(tolerance: float | None, unit: DisplayUnit) -> str:
     return f"dead zone of {tolerance:g} {unit.name} either way" if tolerance else "no dead zone"
 
 
-def _print(console: Console, computed: Findings, unit: ShownUnit) -> None:
+def _print(console: Console, computed: Findings, unit: DisplayUnit) -> None:
     result = computed.result
     orbit = result.orbit
     console.print(f"[bold]{result.status.value}[/]{': ' if result.reason else ''}{result.reason}")
@@ -171,7 +173,7 @@ def _print(console: Console, computed: Findings, unit: ShownUnit) -> None:
         console.print(f"no describing function: {computed.no_prediction}", style="dim", highlight=False)
 
 
-def _cells(orbit: Orbit, unit: ShownUnit) -> tuple[str, ...]:
+def _cells(orbit: Orbit, unit: DisplayUnit) -> tuple[str, ...]:
     angle = math.degrees(orbit.motor_amplitude)
     return f"{orbit.frequency:.9f}", f"{orbit.amplitude * unit.factor:.9f}", f"{angle:.4f}", _stability(orbit.stable)
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.shown import command_unit, position_unit
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.report import style
 from servotwin.runtime import files
 

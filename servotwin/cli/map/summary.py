@@ -12,7 +12,7 @@ from rich.table import Table
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.shown import command_unit, position_unit
+from servotwin.plant.display_units import command_unit, position_unit
 
 ROWS = 21
 _LABELS = {

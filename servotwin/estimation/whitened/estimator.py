@@ -17,12 +17,11 @@ from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.doubt import gap_doubt
-from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     contacts_seen,
-    freed,
     judge,
     least_lead,
     lower_bound,
@@ -32,6 +31,7 @@ from servotwin.estimation.whitened.gate import (
     static_lost_motion,
     sure_of_contact,
     travel_needed,
+    with_free_model,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
 from servotwin.estimation.whitened.profile import profile_interval
@@ -170,7 +170,7 @@ class WindowFit:
         aligned, ramp = evidence.aligned, fastest(evidence.aligned.whitened.reduction, self.second)
         if self.learnt is not None:
             return self.learnt.doubt(ramp, self.settings.calibration)
-        problem, fitted = freed(aligned, self.servo), aligned.whitened
+        problem, fitted = with_free_model(aligned, self.servo), aligned.whitened
         at = np.array([*fitted.point, *problem.prior.mean])
         return gap_doubt(problem, at, max(1.0, fitted.variance), aligned.delay, ramp, learnt=False)
 
@@ -208,7 +208,7 @@ def fit(
     if machine is not None:
         learnt = learn_and_fit(angle, position, rate, servo, _start(prior), settings, machine)
         return WindowFit(window, learnt.servo, prior, settings, blank, angle, learnt.aligned, learnt, second)
-    _, points = look_around(angle, position, rate, servo, _start(prior), settings)
+    _, points = coarse_search(angle, position, rate, servo, _start(prior), settings)
     aligned = align_and_fit(angle, position, rate, servo, points, settings)
     return WindowFit(window, servo, prior, settings, blank, angle, aligned, second=second)
 

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import ClassVar, Protocol
 
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.control.retuning import answer, integrates
+from servotwin.control.retuning import integrates, static_gain
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
@@ -21,7 +21,7 @@ from servotwin.redesign.certified.certificate import Certificate, Demands, NotVe
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.fallback import fallback_certificate
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
-from servotwin.redesign.certified.margins import own_answer
+from servotwin.redesign.certified.margins import own_static_gain
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
@@ -106,7 +106,7 @@ class CertifiedPolicy:
     @property
     def smallest_answer(self) -> float:
         """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
-        return own_answer(self.servo) * self.uncertainty.step[0]
+        return own_static_gain(self.servo) * self.uncertainty.step[0]
 
     @property
     def bias_floor(self) -> float:
@@ -402,7 +402,9 @@ def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
     The simulated machines are a sample: the real one may need half as long again as the slowest of them.
     """
     error = max(certificate.within, certificate.tail) + noise
-    effort = certificate.effort + abs(answer(certificate.setting.controller)) * (NEAR * certificate.step[1] + noise)
+    effort = certificate.effort + abs(static_gain(certificate.setting.controller)) * (
+        NEAR * certificate.step[1] + noise
+    )
     return Band(error, error, effort, math.ceil(1.5 * certificate.settling_worst))
 
 

@@ -19,7 +19,7 @@ P = 1e-3
 def test_a_simulated_loop_gives_its_parameters_and_its_gains(integral_time):
     drive = identify_drive([simulated(integral_time)], p=P)
     assert drive.refinement is not None
-    assert drive.refinement.settled
+    assert drive.refinement.converged
     assert drive.refinement.simulated.position_error < 1e-5
     for name, true in PARAMETERS.items():
         assert drive.refinement.symmetric[name] == pytest.approx(true, rel=1e-3), name
