@@ -16,7 +16,7 @@ from rich.table import Table
 from benchmarks import report
 from benchmarks.decisions import KNOWN_BIAS, LEARNT, NARROW, UNKNOWN_BIAS, WHOLE, WIDE
 from servotwin.control.controller import Controller
-from servotwin.control.retuning import unfed, without_integral
+from servotwin.control.retuning import law_for_margins, without_integral
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess
@@ -159,7 +159,7 @@ def _row(preset: str, servo: Servo, name: str, known: Uncertainty, count: int, s
 
 def worst_peak(servo: Servo, known: Uncertainty, law: Controller, count: int, seed: int) -> float:
     """Largest Ms of a law, its integral acting and stopped, on fresh plants with every delay; inf: unstable."""
-    laws = [unfed(law)]
+    laws = [law_for_margins(law)]
     if law.integral_only:
         laws.append(without_integral(laws[0]))
     fresh = draw_independently(servo, known, count, seed)

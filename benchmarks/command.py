@@ -63,7 +63,7 @@ def bench(
     host = machine()
     console.print(f"{host['cpu']}, {host['cores']} cores, {host['python']}", highlight=False)
     if json is not None:
-        files.write_and_say(json, dumps(results, host, date, options.quick), console.print)
+        files.write_and_print(json, dumps(results, host, date, options.quick), console.print)
     return results
 
 

@@ -29,7 +29,7 @@ from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within, wind_up
 from servotwin.logs.recordings import read_recording
 from servotwin.plant.axis import Axis
-from servotwin.plant.shown import position_unit
+from servotwin.plant.display_units import position_unit
 from servotwin.plant.signals import Array, PiecewiseCubic
 from servotwin.simulation import simulate
 

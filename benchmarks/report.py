@@ -31,7 +31,7 @@ def text(schema: str, date: str, **parts: Any) -> str:
 def write(output: Path | None, document: str, console: Console) -> None:
     """Write the document and print its path, if there is an output."""
     if output is not None:
-        files.write_and_say(output, document, console.print)
+        files.write_and_print(output, document, console.print)
 
 
 def _plain(value: Any) -> Any:

@@ -32,7 +32,7 @@ from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.link_child import LinkChild, link_command
 from servotwin.edge_process.monitoring import TickHistogram, summarise
 from servotwin.edge_process.outlet import PipeOutlet
-from servotwin.edge_process.run import set_realtime_priority, tame_garbage_collector
+from servotwin.edge_process.run import configure_garbage_collector, set_realtime_priority
 from servotwin.edge_process.shared_samples import MakeRecorder, SampleMemory
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Band, Setting
@@ -142,7 +142,7 @@ def measured(
     role = ControlRole(edge, drive)
     child.check(edge.clock())
     time.sleep(1.0)  # until it listens: its start is not what is measured
-    tame_garbage_collector()
+    configure_garbage_collector()
     hurried = set_realtime_priority(priority)
     drive.connect()
     while role.step():

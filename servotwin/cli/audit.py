@@ -16,7 +16,7 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Requ
 
 import msgspec
 
-from servotwin.cli.audit_report import SERVOS, JsonObject, lines_of, servo_line
+from servotwin.cli.audit_report import JsonObject, lines_of, servo_lines
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear, is_encrypted
@@ -137,9 +137,8 @@ def servos(source: Source, json: bool) -> None:
     if json:
         print(msgspec.json.format(msgspec.json.encode(rows)).decode())
         return
-    print(SERVOS)
-    for each in rows:
-        print(servo_line(each))
+    for line in servo_lines(rows):
+        print(line)
 
 
 def _all_pages(page: Callable[[str], list[JsonObject]]) -> list[JsonObject]:

@@ -13,8 +13,6 @@ from servotwin.messages import Cause
 DEG = 180.0 / math.pi
 HOUR = 3600.0
 _STATUS_HEADS = f"{'gap ± 95 %, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'pending':>7}"
-SERVOS = f"{'servo':24}  {_STATUS_HEADS}  last message, UTC"
-"""Head of the table of `servo_line`."""
 HEAD = f"{'received, UTC':19}  {'window':>6}  {'gap ± 95 %, deg':>15}  {'error, um':>9}  {'version':>7}  what followed"
 _OPEN = "a setting was found and waits to be sent"
 _UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
@@ -53,13 +51,19 @@ def lines_of(
         yield line
 
 
-def servo_line(servo: JsonObject) -> str:
-    """One row of the table of servos."""
+def servo_lines(servos: Sequence[JsonObject]) -> Iterator[str]:
+    """Head and rows of the table of servos."""
+    width = max(map(len, ["servo", *(servo["servo"] for servo in servos)]))
+    yield f"{'servo':{width}}  {_STATUS_HEADS}  last message, UTC"
+    yield from (_servo_line(servo, width) for servo in servos)
+
+
+def _servo_line(servo: JsonObject, width: int) -> str:
     version = "-" if servo["version"] is None else servo["version"]
     received = "never" if servo["last_message"] is None else _time(servo["last_message"])
     receipt = servo["receipt"][:12] or "-"
     status = f"{_gap(servo) or '-':>15}  {_status(servo)[:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>7}"
-    return f"{servo['servo']:24}  {status}  {received}"
+    return f"{servo['servo']:{width}}  {status}  {received}"
 
 
 def _status(servo: JsonObject) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.progress import Progress
 
 from servotwin.errors import InvalidInput
-from servotwin.store.soundness import Soundness, check_bodies, check_pages, newest_message
+from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message
 from servotwin.store.store import Store
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import service_of
@@ -44,7 +44,7 @@ def _check_bodies(store: Store) -> int:
     return checked
 
 
-def _require_sound(store: Store, result: Soundness) -> None:
+def _require_sound(store: Store, result: IntegrityReport) -> None:
     if result.faults:
         raise InvalidInput(
             f"store {store.name}: is damaged ({'; '.join(result.faults)}); end the twin, move the file away and "

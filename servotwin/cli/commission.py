@@ -15,6 +15,7 @@ from rich.table import Table
 from servotwin.commissioning.commission import CommissionedAxis, commission
 from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
@@ -24,6 +25,7 @@ from servotwin.logs.drive_recordings import DriveColumns, DriveLog
 from servotwin.plant.axis import Axis
 from servotwin.runtime import files
 
+_DECIMALS = 8  # smaller numbers are shown with a power of ten
 _WORDS = {
     "inertia": "inertia",
     "viscous": "viscous friction",
@@ -124,10 +126,13 @@ def _texts(options: CommissionOptions, found: CommissionedAxis) -> dict[Path, st
 def axis_text(found: CommissionedAxis, axis: Axis) -> str:
     """The axis file, with how sure its numbers are in comments."""
     fit, unit = found.best, found.logs[0].recording.force_unit
-    known, names = found.uncertainty, ", ".join(Path(log.recording.source).name for log in found.logs)
+    known, names = (
+        found.uncertainty,
+        ", ".join(Path(log.recording.source.removeprefix("log ")).name for log in found.logs),
+    )
     lines = [
         f"# Identified by servotwin commission from {names}.",
-        *(f"# {line}" for line in _lines(found, fit)),
+        *(f"# {line} (95 %)" for line in _lines(found, fit)),
         "# For the twin, at the motor (95 %): [twin.uncertainty]",
         *(
             [f"#   {', '.join(f'{name}_percent = {100.0 * getattr(known, name):.3g}' for name in 'mkc')},"]
@@ -145,12 +150,21 @@ def axis_text(found: CommissionedAxis, axis: Axis) -> str:
 
 def headline(found: CommissionedAxis) -> str:
     """The result in one line."""
-    return ", ".join(_lines(found, found.best))
+    return ", ".join(_lines(found, found.best)) + " (± 95 %)"
 
 
 def _lines(found: CommissionedAxis, fit: ParameterFit) -> list[str]:
     units = _units(found)
-    return [f"{_WORDS[name]} {fit[name]:.6g} +- {fit.half_width(name):.2g} {units[name]}" for name in fit.names]
+    return [f"{_WORDS[name]} {_number(fit, name)} {units[name]}" for name in fit.names]
+
+
+def _number(fit: ParameterFit, name: str) -> str:
+    """A parameter with half of its 95 % interval, both to the interval's second digit."""
+    value, half = fit[name], fit.half_width(name)
+    decimals = 1 - math.floor(math.log10(half)) if 0.0 < half < math.inf else _DECIMALS + 1
+    if decimals > _DECIMALS:
+        return f"{value:.6g} ± {half:.2g}"
+    return " ± ".join(f"{round(each, decimals):.{max(0, decimals)}f}" for each in (value, half))
 
 
 def _units(found: CommissionedAxis) -> dict[str, str]:
@@ -170,15 +184,15 @@ def _print(console: Console, found: CommissionedAxis) -> None:
     for log, band in zip(found.logs, drive.bands, strict=True):
         recording = log.recording
         name = recording.source.removeprefix("log ")
-        parts = ", ".join(f"{part} {column}" for part, column in log.columns.items())
+        parts = ", ".join(f"{part}: {column}" for part, column in log.columns.items())
         console.print(
             f"{name}: {recording.duration:.4g} s at {recording.rate:g} Hz ({parts})", markup=False, highlight=False
         )
         for defect, count in log.found.items():
             console.print(f"  {count} {defect}", style="dim", highlight=False)
         console.print(
-            f"  the motion's band ends at {band.motion:.3g} Hz; filtered at {band.corner:.3g} Hz, every "
-            f"{band.decimation}. sample",
+            f"  motion up to {band.motion:.3g} Hz; low-pass at {band.corner:.3g} Hz, then one sample in "
+            f"{band.decimation}",
             style="dim",
             highlight=False,
         )
@@ -189,7 +203,7 @@ def _print(console: Console, found: CommissionedAxis) -> None:
 
 def _table(found: CommissionedAxis) -> Table:
     units, drive = _units(found), found.drive
-    table = Table("parameter", "inverse dynamics", "simulated loop", "unit", box=None, pad_edge=False)
+    table = Table("parameter (± 95 %)", "inverse dynamics", "simulated loop", "unit", box=None, pad_edge=False)
     refined = drive.refinement
     pairs = [
         (drive.symmetric, None if refined is None else refined.symmetric),
@@ -199,13 +213,16 @@ def _table(found: CommissionedAxis) -> Table:
         for name in first.names:
             if first is drive.asymmetric and name == "inertia":
                 continue
-            shown = "-" if second is None else f"{second[name]:.6g} +- {second.half_width(name):.2g}"
-            table.add_row(_WORDS[name], f"{first[name]:.6g} +- {first.half_width(name):.2g}", shown, units[name])
+            shown = "-" if second is None else _number(second, name)
+            table.add_row(_WORDS[name], _number(first, name), shown, units[name])
     errors = [f"{100.0 * first.relative_error:.2f}" for first, _ in pairs]
     table.add_row(
-        "left by the model", errors[0], "" if refined is None else f"{100 * refined.symmetric.relative_error:.2f}", "%"
+        "command not explained",
+        errors[0],
+        "" if refined is None else f"{100 * refined.symmetric.relative_error:.2f}",
+        "%",
     )
-    table.add_row("  with a friction for each direction", errors[1],
+    table.add_row("... with a friction for each way", errors[1],
                   "" if refined is None else f"{100 * refined.asymmetric.relative_error:.2f}", "%")  # fmt: skip
     return table
 
@@ -214,7 +231,7 @@ def _law(law: FittedLaw, found: CommissionedAxis) -> str:
     """The controller that ran, in units of the command."""
     recording, scale = found.logs[0].recording, abs(found.force_per_command or 1.0)
     unit, command = recording.unit, recording.command_unit or "command"
-    left = f"{100 * law.left:.2g} % of the command is left"
+    left = f"all but {100 * law.left:.2g} % of the command is explained"
     if isinstance(law, FittedPid):
         return (
             f"controller: PID, {law.Kp / scale:.5g} {command}/{unit}, {law.Ki / scale:.5g} {command}/({unit} s), "
@@ -249,7 +266,7 @@ def _remarks(found: CommissionedAxis) -> list[str]:
     if drive.refinement is not None:
         simulated = drive.refinement.simulated
         lines.append(
-            f"simulated loop beside the log: position off by {100 * simulated.position_error:.2g} %, "
+            f"simulated loop against the log: position off by {100 * simulated.position_error:.2g} %, "
             f"force by {100 * simulated.force_error:.2g} %"
         )
     lines += _shaft_lines(found)
@@ -281,32 +298,33 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
         lost, unit = log.lost_motion, log.recording.unit
         low, high = lost.interval_load
         lines.append(
-            f"lost motion at the load: {lost.at_load:.4g} {unit} ({low:.4g} .. {high:.4g}): {lost.status.value}; "
-            "it is the gap and the wind-up by friction together"
+            f"lost motion at the load: {lost.at_load:.4g} {unit} (95 %: {low:.4g} .. {high:.4g}), the gap and the "
+            f"wind-up by friction together{'' if lost.ok else f': {lost.status.value}'}"
         )
         if lost.ratio < 0.0:
             lines.append("the motor's encoder counts against the load's: its positions are turned")
     if shaft is None:
         return lines
-    late = f"the load's encoder is {1e3 * shaft.delay:.3g} +- {2e3 * shaft.delay_std:.2g} ms late"
+    delay = f"{1e3 * shaft.delay:.3g} ± {1e3 * NORMAL_95 * shaft.delay_std:.2g} ms (95 %)"
+    late = f"the load's encoder is {delay} late"
     if not math.isfinite(shaft.resonance):
         return [
             *lines,
-            f"shaft: no elasticity below {shaft.highest:.3g} Hz, to which the encoders are coherent; {late}",
+            f"shaft: the encoders are coherent up to {shaft.highest:.3g} Hz and show no elasticity; {late}",
         ]
     lines.append(
-        f"shaft: resonance {shaft.resonance:.4g} +- {2.0 * shaft.resonance_std:.2g} Hz with the motor held, "
-        f"damping ratio {shaft.damping:.2g}, coherent up to {shaft.highest:.3g} Hz; {late}"
+        f"shaft: resonance {shaft.resonance:.4g} ± {NORMAL_95 * shaft.resonance_std:.2g} Hz (95 %) with the motor "
+        f"held, damping ratio {shaft.damping:.2g}, coherent up to {shaft.highest:.3g} Hz; {late}"
     )
     if split is not None:
         load, motor = split["load_inertia"], split["motor_inertia"]
         lines.append(
-            f"shaft: {load:.4g} +- {split.half_width('load_inertia'):.2g} behind and {motor:.4g} before it "
-            f"({_units(found)['inertia']}), stiffness {shaft.stiffness(load):.4g}, "
+            f"shaft: {load:.4g} ± {split.half_width('load_inertia'):.2g} (95 %) behind and {motor:.4g} before it, "
+            f"{_units(found)['inertia']}; stiffness {shaft.stiffness(load):.4g}, "
             f"damping {shaft.shaft_damping(load):.4g}"
         )
     else:
-        lines.append("shaft: not used, its stiffness is not known: gap and elasticity look alike in this log")
+        lines.append("shaft: taken as rigid: in this log its elasticity cannot be told from the gap")
     return lines
 
 
@@ -377,7 +395,7 @@ def as_dict(found: CommissionedAxis) -> dict[str, Any]:
             "asymmetric": fit(refined.asymmetric),
             "position_error": refined.simulated.position_error,
             "force_error": refined.simulated.force_error,
-            "settled": refined.settled,
+            "converged": refined.converged,
         },
         "controller": _law_dict(drive.law),
         "shaft": _shaft_dict(found),

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+_Config = Annotated[Path, typer.Option("--config", "--twin", help="The twin's file.")]
+
 
 def edge(file: Annotated[Path, typer.Argument(help="The servo's edge.toml.")]) -> None:
     """Run one servo's edge until a signal ends it. On the edge's computer: python -m servotwin.edge_process."""
@@ -47,8 +49,8 @@ def twin(
     action: Annotated[
         TwinAction | None,
         typer.Argument(
-            help="check: check the whole store, also while the twin runs, and end. "
-            "test-alarm: post a test to the webhook of the file (table service.webhook), and end."
+            help="Instead of serving. check: check the whole store, even while the twin runs. "
+            "test-alarm: post a test to the webhook in the file's table service.webhook."
         ),
     ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
@@ -73,34 +75,36 @@ def twin(
 
 
 def enroll(
-    name: Annotated[str | None, typer.Argument(help="The servo's name, or the operator's; not with --csv.")] = None,
-    twin: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+    name: Annotated[str | None, typer.Argument(help="Name of the servo, operator or engineer; not with --csv.")] = None,
+    config: _Config = Path("twin.toml"),
     csv: Annotated[
         Path | None,
         typer.Option(
-            help="Enroll a servo for each row, all or none. Columns: name, and edge, role, sample_rate_hz, drive, url, "
-            "noise_um, ca; where one is absent, the option of that name holds."
+            help="Enroll a servo for each row, all or none. Columns: name, and optionally edge, role, sample_rate_hz, "
+            "drive, url, noise_um, ca, which default to the options of those names."
         ),
     ] = None,
-    edge: Annotated[Path | None, typer.Option(help="Folder of the edge; the servo's name by default.")] = None,
+    edge: Annotated[Path | None, typer.Option(help="Folder of the edge; by default the servo's name.")] = None,
     role: Annotated[
         str, typer.Option(help="control: the edge runs the controller; supervise: the drive does.")
     ] = "supervise",
     sample_rate_hz: Annotated[float, typer.Option(help="Sample rate of the edge, Hz.")] = 5000.0,
     drive: Annotated[
-        Path | None, typer.Option(help="TOML file with the table drive; a simulated drive by default.")
+        Path | None, typer.Option(help="TOML file with the table drive; by default a simulated drive.")
     ] = None,
     url: Annotated[
-        str | None, typer.Option(help="Address at which the edge reaches the twin; the twin's own by default.")
+        str | None, typer.Option(help="Address at which the edge reaches the twin; by default the twin's own.")
     ] = None,
-    operator: Annotated[Path | None, typer.Option(help="Enroll an operator instead; file for the token.")] = None,
+    operator: Annotated[
+        Path | None, typer.Option(help="Enroll an operator, who may read, and write the token to this file.")
+    ] = None,
     engineer: Annotated[
         Path | None,
-        typer.Option(help="Enroll an engineer instead, who may hold, approve and roll back; file for the token."),
+        typer.Option(help="Enroll an engineer, who may also hold, approve and roll back; file for the token."),
     ] = None,
     again: Annotated[bool, typer.Option("--again", help="Replace an existing token.")] = False,
     noise_um: Annotated[
-        float, typer.Option(min=0.0, help="Noise on the measured position that the watch allows, rms, um.")
+        float, typer.Option(min=0.0, help="Rms noise of the measured position that the edge's watch tolerates, um.")
     ] = 0.0,
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the edge checks the twin's.")] = None,
 ) -> None:
@@ -115,7 +119,7 @@ def enroll(
         raise InvalidInput("give --operator or --engineer: a name has one role")
     if operator is not None or engineer is not None:
         file = operator or engineer or Path()
-        written = enrolment.enroll_operator(twin, name or "", file, again, engineer=engineer is not None)
+        written = enrolment.enroll_operator(config, name or "", file, again, engineer=engineer is not None)
     else:
         request = enrolment.Enrolment(
             servo=name or "",
@@ -129,21 +133,21 @@ def enroll(
             ca=ca,
         )
         if csv is not None:
-            written = enroll_all(twin, csv, read_enrolments(csv, request))
+            written = enroll_all(config, csv, read_enrolments(csv, request))
         else:
-            written = enrolment.enroll(twin, request)
+            written = enrolment.enroll(config, request)
     for path in written:
         print(f"written: {path}")
 
 
 def revoke(
-    name: Annotated[str, typer.Argument(help="The servo's name, or the operator's.")],
-    twin: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+    name: Annotated[str, typer.Argument(help="Name of the servo, operator or engineer.")],
+    config: _Config = Path("twin.toml"),
 ) -> None:
     """Revoke a token: the twin refuses it within a second; stored data stays."""
     from servotwin.up import enrolment
 
-    print(f"written: {enrolment.revoke(twin, name)}")
+    print(f"written: {enrolment.revoke(config, name)}")
 
 
 def servos(

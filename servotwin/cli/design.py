@@ -11,19 +11,21 @@ _Enter = Annotated[float | None, typer.Option(help="Error at which the loop open
 _Leave = Annotated[float | None, typer.Option(help="Error above which the loop closes again, in tolerances.")]
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")]
 _Duration = Annotated[
-    float | None, typer.Option(help="Length of every run, s; 120 of the servo's own by default.", show_default=False)
+    float | None,
+    typer.Option(help="Length of every run, s; by default 120 units of the servo's time scale.", show_default=False),
 ]
 _Window = Annotated[
     float | None,
     typer.Option(
-        help="Last part of a run, in which it must rest, s; 40 of the servo's own by default.", show_default=False
+        help="Last part of a run, in which it must rest, s; by default 40 units of the servo's time scale.",
+        show_default=False,
     ),
 ]
 _Stillness = Annotated[
     float | None,
     typer.Option(
-        help="Rest: half the peak-to-peak is below this, um; by default 1 on the preset paper with a gap of 10 deg, "
-        "and as much of another screw and gap.",
+        help="A run rests if half its peak-to-peak is below this, um; by default 1 for the preset paper with a gap of "
+        "10 deg, in proportion to pitch and gap.",
         show_default=False,
     ),
 ]
@@ -36,16 +38,16 @@ def limit_cycle(
     tolerance_mm: Annotated[
         float | None, typer.Option(help="Half-width of the dead zone, mm; none by default.")
     ] = None,
-    tolerance_deg: Annotated[float | None, typer.Option(help="The same of a rotary axis, deg.")] = None,
+    tolerance_deg: Annotated[float | None, typer.Option(help="The same for a rotary axis, deg.")] = None,
     step_mm: Annotated[
         float | None, typer.Option(help="Reference step from rest, mm; the result may depend on it; 1 by default.")
     ] = None,
-    step_deg: Annotated[float | None, typer.Option(help="The same of a rotary axis, deg; 1 by default.")] = None,
+    step_deg: Annotated[float | None, typer.Option(help="The same for a rotary axis, deg; 1 by default.")] = None,
     enter: _Enter = None,
     leave: _Leave = None,
     json: _Json = False,
 ) -> None:
-    """Compute the exact limit cycle, stable or not, beside the describing function's prediction."""
+    """Compute the exact limit cycle and its stability, and compare it with the describing function's prediction."""
     from servotwin.cli.limit_cycle import print_limit_cycle
 
     positions = {"mm": (tolerance_mm, step_mm), "deg": (tolerance_deg, step_deg)}
@@ -63,7 +65,7 @@ def tune(
     ] = "Ms",
     delay_ms: Annotated[float, typer.Option(help="Delay in series with the plant, ms.")] = 0.0,
     b: Annotated[float, typer.Option(help="Setpoint weight of the proportional term.")] = 1.0,
-    c: Annotated[float | None, typer.Option(help="Setpoint weight of the derivative term; as b by default.")] = None,
+    c: Annotated[float | None, typer.Option(help="Setpoint weight of the derivative term; by default b.")] = None,
     json: _Json = False,
 ) -> None:
     """Find gains for a crossover and a phase margin, and compare them with the present controller."""
@@ -85,35 +87,39 @@ def tune(
 
 def map_(
     servo: _Servo = "paper",
-    out: Annotated[Path, typer.Option(help="Folder of the map and of its finished pieces.")] = Path("servotwin-map"),
+    out: Annotated[Path, typer.Option(help="Folder of the map; the same command continues an interrupted one.")] = Path(
+        "servotwin-map"
+    ),
     tolerance: Annotated[
-        str | None, typer.Option(help="Dead zone / (p b), b half the gap: LOW:HIGH:COUNT[:log] or VALUE,VALUE,...")
+        str | None, typer.Option(help="Dead zone / (p b), with half gap b: LOW:HIGH:COUNT[:log] or VALUE,VALUE,...")
     ] = None,
     amplitude: Annotated[str | None, typer.Option(help="Reference step / (p b), in the same form.")] = None,
     gap_deg: Annotated[str | None, typer.Option(help="Instead of --tolerance and --amplitude: total gap, deg.")] = None,
     estimate_deg: Annotated[
-        str | None, typer.Option(help="With --gap-deg: estimate of the gap, deg; the true gap by default.")
+        str | None, typer.Option(help="With --gap-deg: estimate of the gap, deg; by default the true gap.")
     ] = None,
     k_dz: Annotated[str | None, typer.Option(help="With --gap-deg: dead zone / (p estimate).")] = None,
     amplitude_mm: Annotated[str | None, typer.Option(help="With --gap-deg: reference step, mm.")] = None,
-    amplitude_deg: Annotated[str | None, typer.Option(help="The same of a rotary axis, deg.")] = None,
+    amplitude_deg: Annotated[str | None, typer.Option(help="The same for a rotary axis, deg.")] = None,
     enter: _Enter = None,
     leave: _Leave = None,
     members: Annotated[int, typer.Option(help="Initial states in each cell.")] = 16,
-    motion: Annotated[float, typer.Option(help="Extent of the motion in which half of them start.")] = 1.0,
+    motion: Annotated[
+        float, typer.Option(help="Size of the initial motion; every second state is in motion, 0: none.")
+    ] = 1.0,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
     duration: _Duration = None,
     window: _Window = None,
     still_um: _Stillness = None,
     still_mdeg: Annotated[
-        float | None, typer.Option(help="The same of a rotary axis, thousandths of a degree.")
+        float | None, typer.Option(help="The same for a rotary axis, thousandths of a degree.")
     ] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler whose workers do the work: tcp://host:8786.")
     ] = None,
 ) -> None:
-    """Compute a stability map: the dead zones that settle each step, from many initial states."""
+    """Compute a stability map: for which dead zones and steps the loop settles, from many initial states."""
     from servotwin.cli.map.command import stability_map
     from servotwin.cli.map.options import MapOptions
 
@@ -141,31 +147,32 @@ def map_(
 
 def certify(
     file: Annotated[Path, typer.Argument(help="A twin's file, or a scenario's TOML.")],
-    model: Annotated[str | None, typer.Option(help="One of its models; all that name a table by default.")] = None,
+    model: Annotated[str | None, typer.Option(help="One of its models; by default all that name a table.")] = None,
     out: Annotated[
-        Path | None, typer.Option(help="File of the table; the one that the key `table` names by default.")
+        Path | None, typer.Option(help="File of the table; by default the one that the key `table` names.")
     ] = None,
     finest_deg: Annotated[
-        float | None, typer.Option(help="Width of the narrowest cells of gaps; 4 by default.", show_default=False)
+        float | None,
+        typer.Option(help="Width of the narrowest cells in the gap, deg; by default 4.", show_default=False),
     ] = None,
     bias_mv: Annotated[
         str | None,
         typer.Option(
-            help="Largest input bias beside the feedforward: VALUE,VALUE,...; 1,10,50 in the servo's own volts by "
-            "default.",
+            help="Largest input bias that the feedforward leaves: VALUE,VALUE,...; by default 1,10,50 in the servo's "
+            "own volts.",
             show_default=False,
         ),
     ] = None,
     noise_um: Annotated[
         str | None,
         typer.Option(
-            help="Noise for which settings are ranked, rms: VALUE,...; none and a tenth of the smallest stated step by "
-            "default.",
+            help="Rms noise for which settings are ranked: VALUE,...; by default none, and a tenth of the smallest "
+            "stated step.",
             show_default=False,
         ),
     ] = None,
 ) -> None:
-    """Verify settings beforehand, for twins that look them up; an interrupted run continues where it stopped."""
+    """Verify a table of settings, for twins that look them up. The same command continues an interrupted run."""
     from servotwin.cli.certify import certify as run
     from servotwin.cli.certify import grid_of
 

@@ -20,9 +20,9 @@ from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant, check_load_encoder, plant_of, resolve_plant
 from servotwin.plant.scales import scales
-from servotwin.plant.shown import command_unit, position_unit
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
@@ -192,24 +192,23 @@ def show(options: IdentifyOptions, as_json: bool) -> None:
 
 
 def _table(identification: Identification) -> Table:
-    table = Table("window, s", "gap, deg", "std, deg", "95 % interval, deg", "status", box=None, pad_edge=False)
+    table = Table("window, s", "gap, deg", "95 % interval, deg", "status", box=None, pad_edge=False)
     for window, estimate in zip(identification.windows, identification.estimates, strict=True):
         end = window.start + window.duration
         color = "green" if estimate.ok else "yellow"
         table.add_row(f"{window.start:.2f} .. {end:.2f}", *_cells(estimate), f"[{color}]{estimate.status.value}[/]")
         for reason in estimate.reasons:
-            table.add_row("", "", "", "", f"[dim]{reason}[/]")
+            table.add_row("", "", "", f"[dim]{reason}[/]")
     return table
 
 
-def _cells(estimate: GapEstimate) -> tuple[str, str, str]:
-    """Gap, standard deviation and interval, or a bound; without either the prior is not shown as a result."""
+def _cells(estimate: GapEstimate) -> tuple[str, str]:
+    """Gap and interval, or a bound; without either the prior is not shown as a result."""
     if estimate.ok:
         low, high = map(math.degrees, estimate.interval)
-        gap, std = math.degrees(estimate.gap), math.degrees(estimate.std_total)
-        return f"{gap:.3f}", f"{std:.3f}", f"{low:.3f} .. {high:.3f}"
+        return f"{math.degrees(estimate.gap):.3f}", f"{low:.3f} .. {high:.3f}"
     bounded = estimate.status is GapStatus.LOWER_BOUND
-    return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-", "-")
+    return (f"> {math.degrees(estimate.gap):.3f}" if bounded else "-", "-")
 
 
 def _trend_lines(identification: Identification, options: IdentifyOptions) -> list[str]:
@@ -224,11 +223,11 @@ def _trend_lines(identification: Identification, options: IdentifyOptions) -> li
     if identification.until_limit is not None:
         early, late = identification.until_limit.interval
         median = (
-            f"median {identification.until_limit.median:.4g} s"
+            f"{identification.until_limit.median:.4g} s"
             if math.isfinite(identification.until_limit.median)
             else "perhaps never"
         )
-        lines.append(f"{options.gap_limit_deg:g} deg are reached in: {median} (95 %: {early:.4g} .. {late:.4g} s)")
+        lines.append(f"time until {options.gap_limit_deg:g} deg: {median} (median; 95 %: {early:.4g} .. {late:.4g} s)")
     return lines
 
 

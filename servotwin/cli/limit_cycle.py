@@ -16,10 +16,11 @@ from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predict
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.analysis.limit_cycles.shaft import Prediction
 from servotwin.errors import InvalidInput
+from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, position_unit
 from servotwin.plant.plants import Plant, resolve_plant
-from servotwin.plant.shown import MILLIMETRES, ShownUnit, position_unit
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
+_EVENTS = 12  # shown of an orbit
 _SAME = 1e-6
 
 
@@ -87,7 +88,7 @@ def print_limit_cycle(
     _print(console, computed, unit)
 
 
-def as_dict(computed: Findings, unit: ShownUnit = MILLIMETRES) -> dict[str, Any]:
+def as_dict(computed: Findings, unit: DisplayUnit = MILLIMETRES) -> dict[str, Any]:
     """Make the JSON object: plain numbers, with units in the keys; `unit` is that of positions."""
     return {
         "status": computed.result.status.value,
@@ -108,7 +109,7 @@ def as_dict(computed: Findings, unit: ShownUnit = MILLIMETRES) -> dict[str, Any]
     }
 
 
-def _orbit(orbit: Orbit | None, unit: ShownUnit) -> dict[str, Any] | None:
+def _orbit(orbit: Orbit | None, unit: DisplayUnit) -> dict[str, Any] | None:
     if orbit is None:
         return None
     half = orbit.half_multipliers
@@ -127,7 +128,9 @@ def _orbit(orbit: Orbit | None, unit: ShownUnit) -> dict[str, Any] | None:
     }
 
 
-def _in_unit(unit: ShownUnit, positions: Mapping[str, tuple[float | None, float | None]]) -> tuple[float | None, float]:
+def _in_unit(
+    unit: DisplayUnit, positions: Mapping[str, tuple[float | None, float | None]]
+) -> tuple[float | None, float]:
     """Tolerance and step, in the unit of a machine; refused in another."""
     for other, given in positions.items():
         for option, value in zip(("tolerance", "step"), given, strict=True):
@@ -140,15 +143,16 @@ def _in_unit(unit: ShownUnit, positions: Mapping[str, tuple[float | None, float 
     return tolerance, 1.0 if step is None else step
 
 
-def _dead_zone(tolerance: float | None, unit: ShownUnit) -> str:
-    return f"dead zone ±{tolerance:g} {unit.name}" if tolerance else "no dead zone"
+def _dead_zone(tolerance: float | None, unit: DisplayUnit) -> str:
+    return f"dead zone of {tolerance:g} {unit.name} either way" if tolerance else "no dead zone"
 
 
-def _print(console: Console, computed: Findings, unit: ShownUnit) -> None:
+def _print(console: Console, computed: Findings, unit: DisplayUnit) -> None:
     result = computed.result
     orbit = result.orbit
     console.print(f"[bold]{result.status.value}[/]{': ' if result.reason else ''}{result.reason}")
-    table = Table("", "frequency\nHz", f"position\n± {unit.name}", "motor\n± deg", "", box=None, pad_edge=False)
+    heads = "frequency\nHz", f"amplitude of\nposition, {unit.name}", "amplitude of\nmotor, deg"
+    table = Table("", *heads, "", box=None, pad_edge=False)
     if orbit is not None:
         table.add_row("exact, after the step", *_cells(orbit, unit))
     for one, near in computed.predictions:
@@ -169,7 +173,7 @@ def _print(console: Console, computed: Findings, unit: ShownUnit) -> None:
         console.print(f"no describing function: {computed.no_prediction}", style="dim", highlight=False)
 
 
-def _cells(orbit: Orbit, unit: ShownUnit) -> tuple[str, ...]:
+def _cells(orbit: Orbit, unit: DisplayUnit) -> tuple[str, ...]:
     angle = math.degrees(orbit.motor_amplitude)
     return f"{orbit.frequency:.9f}", f"{orbit.amplitude * unit.factor:.9f}", f"{angle:.4f}", _stability(orbit.stable)
 
@@ -180,11 +184,14 @@ def _stability(stable: bool) -> str:
 
 def _print_orbit(console: Console, orbit: Orbit) -> None:
     if orbit.half_multipliers is not None:
-        console.print(f"multipliers of half a period: {_sizes(orbit.half_multipliers)}", highlight=False)
-    console.print(f"multipliers of the period: {_sizes(orbit.multipliers)}", highlight=False)
-    events = ", ".join(f"{event.kind} {event.side:+d} at {event.phase:.4f}" for event in orbit.events)
-    console.print(f"events by phase: {events}", highlight=False)
-    console.print(f"closes in the event simulation to {orbit.residual:.1e} of its range", style="dim", highlight=False)
+        console.print(f"Floquet multipliers of half a period: {_sizes(orbit.half_multipliers)}", highlight=False)
+    console.print(f"Floquet multipliers of the period: {_sizes(orbit.multipliers)}", highlight=False)
+    shown = [f"{event.kind} {event.side:+d} at {event.phase:.4f}" for event in orbit.events[:_EVENTS]]
+    more = len(orbit.events) - len(shown)
+    events = ", ".join([*shown, f"and {more} more (--json lists all)"] if more else shown)
+    console.print(f"events, as shares of the period: {events}", highlight=False)
+    check = f"check: one period of the event simulation closes the orbit to {orbit.residual:.1e} of its range"
+    console.print(check, style="dim", highlight=False)
 
 
 def _sizes(values: Any) -> str:

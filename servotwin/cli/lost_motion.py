@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -273,13 +273,14 @@ def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
     console.print(model_line(found, unit, recording.motor_unit), highlight=False)
     console.print(_models(found, unit), highlight=False)
     if len(lost.local) > 1:
-        console.print(_local(lost, unit, float(log.recording.time[0])), highlight=False)
+        for table in _local(lost, unit, float(log.recording.time[0])):
+            console.print(table, highlight=False)
 
 
 def read_line(log: RecordedLog) -> str:
     """Say how many samples of which columns were used."""
     time = log.recording.time
-    parts = ", ".join(f"{part} {name}" for part, name in log.columns.items())
+    parts = ", ".join(f"{part}: {name}" for part, name in log.columns.items())
     return f"{time.size} samples in {time[-1] - time[0]:.4g} s ({parts})"
 
 
@@ -289,7 +290,7 @@ def model_line(found: TransmissionGap, unit: str, motor_unit: str) -> str:
     cyclic = "".join(f", cyclic error every {period:.4g} {motor_unit}" for period in lost.cycles)
     return (
         f"model: {lost.model}; {abs(lost.ratio):.6g} {unit} per {motor_unit}, lag {1e3 * lost.lag:.3g} ms"
-        f"{cyclic if 'cyclic' in lost.model else ''}, rms left {lost.rms:.3g} {unit}"
+        f"{cyclic if 'cyclic' in lost.model else ''}, residual {lost.rms:.3g} {unit} rms"
     )
 
 
@@ -304,7 +305,7 @@ def headline(found: TransmissionGap, unit: str, motor_unit: str) -> str:
         (low, high), most = lost.interval_load, found.interval_load[1]
         return (
             f"lost motion {lost.at_load:.4g} {unit} at the load, {lost.at_motor:.4g} {motor_unit} at the motor "
-            f"(95 %: {low:.4g} .. {high:.4g} {unit}), gap at most {most:.4g} {unit}: {status}"
+            f"(95 %: {low:.4g} .. {high:.4g} {unit}); the gap is at most {most:.4g} {unit}: {status}"
         )
     low, high = found.interval_load
     return (
@@ -314,8 +315,8 @@ def headline(found: TransmissionGap, unit: str, motor_unit: str) -> str:
 
 
 def _models(found: TransmissionGap, unit: str) -> Table:
-    lost = f"lost motion, {unit}"
-    table = Table("model", lost, f"error on unseen strokes, {unit}", "evidence", box=None, pad_edge=False)
+    heads = "model", f"lost motion\n{unit}", f"error on unseen\nstrokes, {unit}", "evidence"
+    table = Table(*heads, box=None, pad_edge=False)
     for row in model_rows(found):
         name = f"[bold]{row[0]}[/]" if row[0] == found.lost.model else row[0]
         table.add_row(name, *row[1:])
@@ -332,17 +333,16 @@ def model_rows(found: TransmissionGap) -> list[list[str]]:
     ]  # fmt: skip
 
 
-def _local(found: LostMotion, unit: str, begin: float) -> Table:
+def _local(found: LostMotion, unit: str, begin: float) -> Iterator[Table]:
     """Median lost motion of parts of the travel and of the time; dates count from the first sample, `begin` (s)."""
     gaps = np.array([each.gap for each in found.local]) * abs(found.ratio)
-    lost = f"lost motion, {unit}"
-    table = Table(f"position, {unit}", lost, "reversals", "time, s", lost, "reversals", box=None)
     first = begin if begin > _DATED else 0.0
-    places = _binned(np.array([each.position for each in found.local]), gaps)
-    times = _binned(np.array([each.time - first for each in found.local]), gaps)
-    for place, time in zip(places, times, strict=True):
-        table.add_row(*place, *time)
-    return table
+    positions, times = np.array([(each.position, each.time - first) for each in found.local]).T
+    for head, keys in ((f"position, {unit}", positions), ("time, s", times)):
+        table = Table(head, f"median lost motion, {unit}", "reversals", box=None, pad_edge=False)
+        for row in _binned(keys, gaps):
+            table.add_row(*row)
+        yield table
 
 
 def _binned(keys: Any, gaps: Any) -> list[tuple[str, str, str]]:
@@ -357,16 +357,15 @@ def _binned(keys: Any, gaps: Any) -> list[tuple[str, str, str]]:
 
 
 def _change(before: _Answer, after: _Answer) -> str:
-    """The difference of two logs' gaps, or lost motions, and if it is more than their uncertainty."""
+    """The difference of two logs' gaps, or lost motions, with half of its 95 % interval."""
     (_, old), (second, new) = before, after
     if not (math.isfinite(old.lost.std_load) and math.isfinite(new.lost.std_load)):
         return "no change can be told: the lost motion of the two logs is only bounded"
     name = _compared((before, after))
     (one, its), (other, of_it) = _value(old, name), _value(new, name)
-    change, std = other - one, math.hypot(_half(its), _half(of_it)) / NORMAL_95
-    times = abs(change) / std if std else math.inf
-    said = "more than chance explains" if times > NORMAL_95 else "no more than chance explains"
-    return f"change of the {name}: {change:+.4g} {second.recording.load_unit} ({times:.1f} standard deviations: {said})"
+    change, half = other - one, math.hypot(_half(its), _half(of_it))
+    said = "more than chance explains" if abs(change) > half else "no more than chance explains"
+    return f"change of the {name}: {change:+.4g} ± {half:.2g} {second.recording.load_unit} (95 %): {said}"
 
 
 def _half(interval: Interval) -> float:

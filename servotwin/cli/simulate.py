@@ -10,6 +10,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import servotwin as st
 from servotwin.cosim import Loop
+from servotwin.cosim.scenario import PRESETS, preset_text
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import check_output, read_log, write_log
@@ -22,7 +23,7 @@ def record(scenario: Path, output: Path, console: Console | None = None) -> Path
     Parameters
     ----------
     scenario : Path
-        A scenario's TOML.
+        A scenario's TOML, or the name of a packaged one.
     output : Path
         NAME.parquet (needs the extra `parquet`), NAME.npz or NAME.csv (12 significant digits, metadata in the first row
         of a last column).
@@ -102,6 +103,8 @@ def recording(loop: Loop, scenario_text: str) -> SignalTable:
 
 
 def _read(path: Path) -> tuple[str, st.Scenario]:
+    if str(path) in PRESETS and not path.exists():
+        return preset_text(str(path)), st.Scenario.preset(str(path))
     scenario = st.Scenario.load(path)
     return path.read_text(encoding="utf-8"), scenario
 

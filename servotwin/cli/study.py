@@ -16,12 +16,15 @@ CommandColumn = Annotated[str | None, typer.Option("--command", help="Column of 
 TimeColumn = Annotated[str | None, typer.Option("--time", help="Column of the time.")]
 SampleRate = Annotated[
     float | None,
-    typer.Option("--rate", help="Sample rate, Hz, of a log without times; its own times do not count then."),
+    typer.Option("--rate", help="Sample rate, Hz; replaces the log's own times."),
 ]
 MotorUnit = Annotated[
-    str | None, typer.Option("--motor-unit", help="Where the header does not say it, such as deg or mm.")
+    str | None,
+    typer.Option("--motor-unit", help="Unit of --motor, such as deg or mm, if the header does not state it."),
 ]
-LoadUnit = Annotated[str | None, typer.Option("--load-unit", help="Where the header does not say it, such as mm.")]
+LoadUnit = Annotated[
+    str | None, typer.Option("--load-unit", help="Unit of --load, such as mm, if the header does not state it.")
+]
 _LOGS = "Recordings: .csv, .txt, .npz, .parquet, .mat, .h5, .mf4, .tdms, .mcap ..."
 
 
@@ -45,14 +48,16 @@ def reproduce(
     preset: Annotated[str, typer.Option(help="Preset of the figures; claims are measured in all three.")] = "paper",
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; one per core by default.")] = None,
 ) -> None:
-    """Reproduce every figure and claim of the paper beside our measurements."""
+    """Reproduce every figure and claim of the paper, and compare them with our measurements."""
     from servotwin.reproduction.reproduce import reproduce as run
 
     run(out, only=tuple(only or ()), preset=preset, workers=workers)
 
 
 def simulate(
-    scenario: Annotated[Path, typer.Argument(help="A scenario's TOML.")],
+    scenario: Annotated[
+        Path, typer.Argument(help="A scenario's TOML, or fig15, fig15-sampled, fig16, calm or certified.")
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="run.parquet, run.npz or run.csv.")],
 ) -> None:
     """Run one scenario and write its signals."""
@@ -72,7 +77,7 @@ def convert(
     motor_unit: MotorUnit = None,
     load_unit: LoadUnit = None,
 ) -> None:
-    """Convert a recorded log to another format; any other than servotwin's own is cleaned of what is damaged."""
+    """Convert a recorded log to another format. Damaged samples of foreign logs are repaired or left out."""
     from servotwin.cli.simulate import convert as run
     from servotwin.cli.simulate import convert_recording
     from servotwin.logs.log import holds_signals
@@ -97,37 +102,38 @@ def identify(
     load_unit: LoadUnit = None,
     page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
     servo: Annotated[
-        str | None, typer.Option(help="A preset's name or a servo's TOML; the log's own by default.")
+        str | None, typer.Option(help="Model of the machine: a preset or a servo's TOML; by default the log's own.")
     ] = None,
     axis: Annotated[
         str | None,
-        typer.Option(help="With --motor and --load: an axis's file or preset, whose wind-up by friction is no gap."),
+        typer.Option(help="An axis's file or preset: its wind-up by friction is subtracted from the lost motion."),
     ] = None,
     stiff: Annotated[
         bool,
-        typer.Option("--stiff", help="Instead of --axis: nothing between the encoders winds up, lost motion is gap."),
+        typer.Option("--stiff", help="Instead of --axis: nothing winds up, so that the lost motion is the gap."),
     ] = False,
     dynamics: Annotated[
-        bool, typer.Option("--dynamics", help="Fit the load's dynamics beside the gap, also where it does not swing.")
+        bool,
+        typer.Option("--dynamics", help="Fit the load's dynamics together with the gap, even if it does not swing."),
     ] = False,
     dates: Annotated[
-        str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; their time stamps by default.")
+        str | None, typer.Option(help="Dates of the logs, such as 2026-03-01,2026-06-01; by default their time stamps.")
     ] = None,
     start: Annotated[
         float | None, typer.Option(help="Start of a single window, s, instead of a window at each step.")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(help="Length of that window, s; to the end of the log by default.")
+        float | None, typer.Option(help="Length of that window, s; by default to the end of the log.")
     ] = None,
     window: Annotated[
-        float | None, typer.Option(help="Length of the windows at the steps, s; the log's, or 1.")
+        float | None, typer.Option(help="Length of the windows at the steps, s; by default the log's, or 1.")
     ] = None,
-    pre_trigger: Annotated[float | None, typer.Option(help="Part of a window before the step, s.")] = None,
+    pre_trigger: Annotated[float | None, typer.Option(help="Length of the part before the step, s.")] = None,
     method: Annotated[str, typer.Option(help="whitened or paper.")] = "whitened",
     wear_deg: Annotated[
         float | None, typer.Option(help="Typical growth of the gap, deg, in the time of --wear-over-s.")
     ] = None,
-    wear_over_s: Annotated[float | None, typer.Option(help="Time of that growth, s; 0.2 deg/s by default.")] = None,
+    wear_over_s: Annotated[float | None, typer.Option(help="Time of that growth, s; by default 0.2 deg/s.")] = None,
     gap_limit_deg: Annotated[float | None, typer.Option(help="Predict when the gap reaches this limit, deg.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
@@ -177,49 +183,53 @@ def commission(
     time: TimeColumn = None,
     rate: SampleRate = None,
     motor_unit: MotorUnit = None,
-    reference_unit: Annotated[str | None, typer.Option(help="Where it is not that of the position.")] = None,
+    reference_unit: Annotated[str | None, typer.Option(help="Unit of --reference if the position has another.")] = None,
     load_unit: LoadUnit = None,
-    command_unit: Annotated[str | None, typer.Option(help="Where the header does not say it: N, 'N m', A, V.")] = None,
+    command_unit: Annotated[
+        str | None, typer.Option(help="Unit of --command (N, 'N m', A or V) if the header does not state it.")
+    ] = None,
     scale: Annotated[
         float | None, typer.Option(help="Force (rotary: torque) at the load per unit of the command, N or N m.")
     ] = None,
     inertia: Annotated[
-        float | None, typer.Option(help="Instead: known mass (rotary: inertia) of all that moves, kg or kg m^2.")
+        float | None, typer.Option(help="Instead of --scale: total moving mass, kg (rotary: inertia, kg m^2).")
     ] = None,
     lead_mm: Annotated[float | None, typer.Option(help="Travel of a linear load per turn of the motor, mm.")] = None,
     ratio: Annotated[float | None, typer.Option(help="Turns of the motor per turn of a rotary load.")] = None,
     position_gain: Annotated[
-        float | None, typer.Option(help="Of the controller that ran, 1/s; fitted by default.")
+        float | None, typer.Option(help="Position gain of the cascade that ran, 1/s; fitted by default.")
     ] = None,
     velocity_gain: Annotated[
-        float | None, typer.Option(help="Command per speed of the position, per m/s or rad/s; fitted by default.")
+        float | None, typer.Option(help="Its velocity gain: command per m/s or rad/s; fitted by default.")
     ] = None,
-    integral_time: Annotated[float | None, typer.Option(help="Of the velocity loop, s; fitted by default.")] = None,
-    speed_filter: Annotated[float | None, typer.Option(help="Of the measured speed, s; fitted by default.")] = None,
+    integral_time: Annotated[
+        float | None, typer.Option(help="Integral time of its velocity loop, s; fitted by default.")
+    ] = None,
+    speed_filter: Annotated[
+        float | None, typer.Option(help="Time constant of its speed filter, s; fitted by default.")
+    ] = None,
     kp: Annotated[
-        float | None, typer.Option(help="Of a PID that ran: command per m or rad of the position; fitted by default.")
+        float | None, typer.Option(help="Kp of the PID that ran: command per m or rad; fitted by default.")
     ] = None,
-    ki: Annotated[float | None, typer.Option(help="Of that PID: command per m s or rad s.")] = None,
-    kd: Annotated[float | None, typer.Option(help="Of that PID: command per m/s or rad/s.")] = None,
-    derivative_filter: Annotated[float | None, typer.Option(help="Of that PID's derivative, s.")] = None,
+    ki: Annotated[float | None, typer.Option(help="Ki of that PID: command per m s or rad s.")] = None,
+    kd: Annotated[float | None, typer.Option(help="Kd of that PID: command per m/s or rad/s.")] = None,
+    derivative_filter: Annotated[float | None, typer.Option(help="Time constant of its derivative filter, s.")] = None,
     feedback: Annotated[
         str,
-        typer.Option(help="Encoder of the axis that its position loop reads: motor, or load, which the twin needs."),
+        typer.Option(help="Encoder of the new axis's position loop: motor, or load, which the twin needs."),
     ] = "motor",
-    applied: Annotated[
-        bool, typer.Option("--applied", help="The command is what the drive gave, also at its limit.")
-    ] = False,
+    applied: Annotated[bool, typer.Option("--applied", help="The logged command is after the drive's limit.")] = False,
     crossover: Annotated[
         float | None,
         typer.Option(
-            help="Tune the axis's cascade to this crossover of its velocity loop, rad/s; the one that ran by default."
+            help="Tune the axis's cascade to this velocity-loop crossover, rad/s; by default it keeps the fitted gains."
         ),
     ] = None,
     scenario: Annotated[
-        Path | None, typer.Option(help="Scenario with a twin that knows how sure the parameters are, scenario.toml.")
+        Path | None, typer.Option(help="Write a scenario whose twin has the uncertainty of the fit, scenario.toml.")
     ] = None,
     largest_gap: Annotated[
-        float | None, typer.Option(help="Gap at the load to which it grows in the scenario, mm (rotary: deg).")
+        float | None, typer.Option(help="Final gap at the load in that scenario, mm (rotary: deg).")
     ] = None,
     page: Annotated[Path | None, typer.Option(help="Page or picture of the fit: .html, .png or .svg.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
@@ -258,7 +268,7 @@ def commission(
 
 def dataset(
     name: Annotated[str, typer.Argument(help="Name of a public set: emps, or bros-1 to bros-3.")],
-    folder: Annotated[Path | None, typer.Option(help="Where it is kept; the user's cache by default.")] = None,
+    folder: Annotated[Path | None, typer.Option(help="Where to store it; by default the user's cache.")] = None,
 ) -> None:
     """Fetch a public set of measured data, once, and print the path of its file."""
     from servotwin.datasets import DATASETS, fetch
@@ -269,7 +279,7 @@ def dataset(
 
 
 def bench(context: typer.Context) -> None:
-    """Measure speed and accuracy beside other solvers; part of the source checkout: python -m benchmarks."""
+    """Compare speed and accuracy with other solvers (in a source checkout only)."""
     try:
         from benchmarks.cli import app
     except ModuleNotFoundError as error:

@@ -20,10 +20,10 @@ from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.axis_file import file_values
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.loop import gain_units
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant, resolve_plant
-from servotwin.plant.shown import command_unit, position_unit
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3

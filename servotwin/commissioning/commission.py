@@ -61,13 +61,13 @@ class CommissionedAxis:
     def best(self) -> ParameterFit:
         """The refined fit, or the first where there is no refinement."""
         refined = self.drive.refinement
-        return self.drive.symmetric if refined is None or not refined.settled else refined.symmetric
+        return self.drive.symmetric if refined is None or not refined.converged else refined.symmetric
 
     @property
     def asymmetric(self) -> ParameterFit:
         """The fit with a friction for each direction, of the same kind."""
         refined = self.drive.refinement
-        return self.drive.asymmetric if refined is None or not refined.settled else refined.asymmetric
+        return self.drive.asymmetric if refined is None or not refined.converged else refined.asymmetric
 
 
 def commission(

@@ -211,7 +211,7 @@ class LinearLaw:
         return any(row[column] != 0.0 for row in (*self.B, self.D)) or name == f"y_{self.on}"
 
     @property
-    def answer(self) -> float:
+    def static_gain(self) -> float:
         """Command at rest per error of the position, the states in `holds` left at zero."""
         resting = self.rest((1.0, 0.0, 0.0), dict.fromkeys(self.holds, 0.0))
         return self.gain * (sum(c * x for c, x in zip(self.C, resting, strict=True)) + self.D[0])

@@ -12,13 +12,13 @@ from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
 
 
-def answer(law: AnyController) -> float:
+def static_gain(law: AnyController) -> float:
     """Command at rest per error of the position (V/m) without integral action."""
     if isinstance(law, Controller):
         return law.Kp
     if isinstance(law, Cascade):
         return (law.velocity_gain or 1.0) * law.position_gain / law.ratio
-    return law.answer
+    return law.static_gain
 
 
 def integrates(law: AnyController) -> bool:
@@ -37,13 +37,13 @@ def only_integrates(law: AnyController) -> bool:
 
 def strength(law: AnyController) -> float:
     """Gain by which laws of one kind are compared: that at rest, or Ki of one that only integrates."""
-    return law.Ki if isinstance(law, Controller) and only_integrates(law) else answer(law)
+    return law.Ki if isinstance(law, Controller) and only_integrates(law) else static_gain(law)
 
 
 def rest_gain(law: AnyController) -> float:
     """Size of the command at rest per error of the position (V/m), before any integral action adds to it; infinite for
     a law that only integrates."""
-    return math.inf if only_integrates(law) else abs(answer(law))
+    return math.inf if only_integrates(law) else abs(static_gain(law))
 
 
 def without_integral(law: AnyController) -> AnyController:
@@ -88,7 +88,7 @@ def scaled(own: AnyController, scale: float, shape: tuple[float, float], share: 
     )
 
 
-def unfed(law: AnyController) -> AnyController:
+def law_for_margins(law: AnyController) -> AnyController:
     """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
     plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)
     if isinstance(plain, Controller):

@@ -142,11 +142,7 @@ class Scenario:
     @classmethod
     def preset(cls, name: str) -> Scenario:
         """Load one of the packaged scenarios: "fig15", "fig15-sampled", "fig16", "calm", "certified"."""
-        if name not in PRESETS:
-            hint = did_you_mean(name, PRESETS)
-            raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
-        text = resources.files("servotwin.cosim").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")
-        return cls.from_table(parse_toml(text, f"{name}.toml"), Path())
+        return cls.from_table(parse_toml(preset_text(name), f"{name}.toml"), Path())
 
     @classmethod
     def from_table(cls, table: Table, folder: Path) -> Scenario:
@@ -245,3 +241,17 @@ class Scenario:
                 f"controller sample_rate = {law!r} Hz does not divide: it and the recording's {rate!r} Hz must be "
                 "whole multiples of one another"
             )
+
+
+def preset_text(name: str) -> str:
+    """TOML of a packaged scenario.
+
+    Raises
+    ------
+    InvalidInput
+        There is none of that name.
+    """
+    if name not in PRESETS:
+        hint = did_you_mean(name, PRESETS)
+        raise InvalidInput(f"scenario {name!r} does not exist{hint}; give one of {', '.join(PRESETS)}")
+    return resources.files("servotwin.cosim").joinpath("scenarios", f"{name}.toml").read_text(encoding="utf-8")

@@ -16,10 +16,10 @@ from servotwin.dashboard.window_view import envelope_indices
 from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains
 from servotwin.messages.checks import InvalidMessage
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.margins import sensitivity_peak
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
-from servotwin.plant.shown import command_unit, position_unit
 from servotwin.plant.signals import Array, Step
 from servotwin.simulation.run import Run
 from servotwin.simulation.simulate import simulate

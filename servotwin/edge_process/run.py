@@ -121,7 +121,7 @@ def until(stop: StopSignal, edge: EdgeRuntime, drive: Drive, role_of: Callable[[
     """Connect, run, and connect again where the drive was lost, until the run is over or a signal comes."""
     role: _Role | None = None
     troubles = TroubleLog()
-    tame_garbage_collector()
+    configure_garbage_collector()
     set_realtime_priority(edge.config.priority)
     while not stop.requested:
         try:
@@ -159,7 +159,7 @@ def _is_ignored(number: signal.Signals) -> bool:
     return number is signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
 
-def tame_garbage_collector() -> None:
+def configure_garbage_collector() -> None:
     """Freeze existing objects and collect rarely: the loop makes no cycles, and a collection would delay a sample."""
     gc.collect()
     gc.freeze()

@@ -13,11 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton, AutomatonStack, shared_flows, speeds, structure_key
+from servotwin.hybrid.buffer_pool import BufferPool
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import DONE, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.members import AutomatonFamily, Figures, MemberResults, MemberStarts, WorkerMemory, run_members
 from servotwin.hybrid.output import empty_outputs, new_output_workspace
-from servotwin.hybrid.stock import Stock
 from servotwin.hybrid.tables import NODES_FINE, divisors, empty_tables
 from servotwin.hybrid.trajectory import ZenoError
 
@@ -219,7 +219,7 @@ class _Job(NamedTuple):
     tail: int
 
 
-_STOCK: Stock[tuple[WorkerMemory, RunRecord]] = Stock(most=8)
+_STOCK: BufferPool[tuple[WorkerMemory, RunRecord]] = BufferPool(most=8)
 
 
 def _run_parts(job: _Job, parts: Iterator[tuple[int, int]]) -> list[int]:

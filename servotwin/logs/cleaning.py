@@ -9,7 +9,7 @@ import numpy as np
 
 from servotwin.logs.outliers import frozen, outliers
 from servotwin.logs.stamps import in_order, spread
-from servotwin.logs.wrapping import bridged, check_followed, pauses, unwrapped, unwrapped_turns
+from servotwin.logs.wrapping import check_followed, pauses, unwrapped, unwrapped_turns, with_turns_in_pauses
 from servotwin.plant.signals import Array
 
 _Mask = np.ndarray[Any, np.dtype[np.bool_]]
@@ -93,7 +93,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             table[:, place], count = unwrapped(table[:, place], turns[name])
             if count:
                 check_followed(name, table[:, place], turns[name])
-                table[:, place], lost = bridged(table[:, 0], table[:, place], turns[name])
+                table[:, place], lost = with_turns_in_pauses(table[:, 0], table[:, place], turns[name])
                 parted += lost
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):

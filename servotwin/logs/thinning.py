@@ -102,12 +102,12 @@ class Stretches:
         return cut
 
     def _append_joined(self, parts: list[_Stretch]) -> None:
-        """Append parts, neighbours that are not whole as what is remembered of them."""
+        """Append parts, of neighbours that are not whole only the play extremes."""
         for part in parts:
             if not part.whole:
                 before = self._cut_alone()
                 joined = np.concatenate([*(each.table for each in before), part.table])
-                part = _Stretch(remembered(joined), False)
+                part = _Stretch(play_extremes(joined), False)
                 self.dropped += len(joined) - len(part.table)
             self._parts.append(part)
 
@@ -131,7 +131,7 @@ class Stretches:
 
 
 class _Stretch(NamedTuple):
-    """Neighbouring samples, (n, c): a whole stretch at the full rate, or what is remembered of several."""
+    """Neighbouring samples, (n, c): a whole stretch at the full rate, or the play extremes of several."""
 
     table: Array
     whole: bool
@@ -142,7 +142,7 @@ class _Stretch(NamedTuple):
         return float(np.ptp(self.table[:, 1]))
 
 
-def remembered(table: Array) -> Array:
+def play_extremes(table: Array) -> Array:
     """Rows of which a play with any gap keeps a memory: the extremes of the motor, and those behind them in turn.
 
     Later and larger motions wipe out what was before: of rows (n, c) with the motor in the second column the earlier

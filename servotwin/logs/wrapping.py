@@ -52,7 +52,7 @@ def pauses(time: Array) -> list[int]:
     return [int(row) + 1 for row in np.flatnonzero(intervals > _DROPOUT * usual)]
 
 
-def bridged(time: Array, angle: Array, turn: float) -> tuple[Array, list[float]]:
+def with_turns_in_pauses(time: Array, angle: Array, turn: float) -> tuple[Array, list[float]]:
     """An unwrapped angle with the turns that it made in pauses, and the times behind those whose turns are not known.
 
     In a pause it goes on with the mean of the speeds before and behind it. By how much that is wrong shows wherever

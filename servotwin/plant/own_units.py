@@ -12,8 +12,8 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.axis_file import controller_keys
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant
-from servotwin.plant.shown import command_unit, position_unit
 
 INPUT_BIAS_KEYS = ("input_bias_v", "input_bias_n_m", "input_bias_rad_per_s", "input_bias_rad")
 """Keys of an input bias, in the unit of each actuator's command."""

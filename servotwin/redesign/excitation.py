@@ -16,7 +16,7 @@ from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
-from servotwin.plant.shown import MILLIMETRES, ShownUnit
+from servotwin.plant.display_units import MILLIMETRES, DisplayUnit
 
 _ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a little shorter than requested
 _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
@@ -202,13 +202,13 @@ class ExcitationPolicy:
     pitch : float
         m/rad, travel per angle of the screw.
     settings : ExcitationSettings
-    unit : ShownUnit
+    unit : DisplayUnit
         Unit of the moves in the reasons.
     """
 
     pitch: float
     settings: ExcitationSettings
-    unit: ShownUnit = MILLIMETRES
+    unit: DisplayUnit = MILLIMETRES
 
     def decide(self, state: ExcitationState, window: WindowSummary) -> Decision:
         """Decide after one more window."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.control.controller import Controller
-from servotwin.control.retuning import answer
+from servotwin.control.retuning import static_gain
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
 from servotwin.plant.plants import Plant, check_homogeneous, check_load_encoder
@@ -93,7 +93,7 @@ def check_verifiable(servo: Plant) -> None:
         raise InvalidInput(
             f"controller sample_rate = None: settings of a {type(law).__name__} are verified at its rate; give it in Hz"
         )
-    if not math.isfinite(answer(law)) or answer(law) == 0.0:
+    if not math.isfinite(static_gain(law)) or static_gain(law) == 0.0:
         raise InvalidInput(
             f"controller {law!r}: has no proportional action, without which no setting is verified; "
             "integrators belong in holds"

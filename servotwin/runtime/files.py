@@ -82,7 +82,7 @@ def write_text(path: Path, text: str) -> Path:
     return path
 
 
-def write_and_say(path: Path, text: str, say: Callable[..., None]) -> None:
+def write_and_print(path: Path, text: str, say: Callable[..., None]) -> None:
     """Write a text file atomically and print its path; `say` is the `print` of a rich console."""
     write_text(path, text)
     say(f"written: {path}", soft_wrap=True, highlight=False)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant
-from servotwin.plant.shown import command_unit, position_unit
 from servotwin.runtime.notebook import html_table
 from servotwin.simulation.inputs import RunInputs, quantised
 from servotwin.simulation.views import Panel, arrow_table, pandas_table, stacked_figure

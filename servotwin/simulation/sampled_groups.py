@@ -16,11 +16,11 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.control.laws import Law, filtered_pid
 from servotwin.hybrid.automaton import Array, shared_flows, speeds, structure_key
+from servotwin.hybrid.buffer_pool import BufferPool
 from servotwin.hybrid.ensemble import on_threads
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, RunRecord, grown, new_record
 from servotwin.hybrid.lifted import BLOCK
-from servotwin.hybrid.stock import Stock
 from servotwin.hybrid.tables import divisors, empty_tables
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
@@ -231,7 +231,7 @@ class _Memory(NamedTuple):
     record: RunRecord
 
 
-_STOCK: Stock[_Memory] = Stock(most=16)
+_STOCK: BufferPool[_Memory] = BufferPool(most=16)
 
 
 def run_groups(runs: Sequence[GroupRun], span: SampledSpan, threads: int | None) -> None:

@@ -19,7 +19,7 @@ from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.evidence import ActRecord, Record, VerificationRecord, WithdrawalRecord
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
-from servotwin.twin.oversight import judge_act, sent_again
+from servotwin.twin.oversight import decide_act, sent_again
 from servotwin.twin.state import TwinState, noted_setting
 
 # Protocol from which on an edge sends a hello for every boot, and another where it is asked for windows of every boot.
@@ -48,7 +48,7 @@ class StepResult(NamedTuple):
 
 def take_act(model: TwinModel, state: TwinState, act: Act, now: float) -> StepResult:
     """Carry out an engineer's act, and keep it with what became of it."""
-    judged = judge_act(state.oversight, act, state.newest, state.known, model.policy)
+    judged = decide_act(state.oversight, act, state.newest, state.known, model.policy)
     proposal, refused = judged.approved, judged.refused
     if proposal is not None and proposal.update.data_time <= state.versions.data_time:
         proposal, refused = None, "a newer version was sent meanwhile"

@@ -46,7 +46,7 @@ def context_of(servo: Plant, settings: TwinSettings) -> tuple[str, str]:
     The JSON is one object of texts: the name of each part, and its value in full.
     """
     model = {_AXIS: repr(servo.dumps())} if isinstance(servo, Axis) else dict(flattened(_MODEL, servo))
-    parts = {**surroundings(), **model, **dict(flattened(_SETTINGS, settings))}
+    parts = {**environment(), **model, **dict(flattened(_SETTINGS, settings))}
     text = json.dumps(parts, sort_keys=True, indent=0)
     return hashlib.sha256(text.encode()).hexdigest()[:32], text
 
@@ -65,7 +65,7 @@ def parts_of(context: str) -> dict[str, str]:
         raise InvalidInput(f"the context is not understood: {error}") from None
 
 
-def differing(then: Mapping[str, str], now: Mapping[str, str]) -> tuple[str, ...]:
+def differences(then: Mapping[str, str], now: Mapping[str, str]) -> tuple[str, ...]:
     """Parts in which two contexts differ, each with both values."""
     keys = (key for key in sorted({*then, *now}) if then.get(key) != now.get(key))
     return tuple(f"{key} {then.get(key, 'unknown')} then, {now.get(key, 'unknown')} now" for key in keys)
@@ -106,7 +106,7 @@ def described(parts: Mapping[str, str]) -> tuple[Plant, TwinSettings]:
 
 
 @lru_cache(maxsize=1)
-def surroundings() -> Mapping[str, str]:
+def environment() -> Mapping[str, str]:
     """Versions, sources and machine of this process; the last decides in which order sums of floats are taken."""
     processor = import_module("llvmlite.binding").get_host_cpu_name()
     return {

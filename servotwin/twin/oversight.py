@@ -65,7 +65,7 @@ class Oversight(Struct, frozen=True):
         return message.start >= waiting.data_time + _STABLE * (waiting.not_after - waiting.data_time)
 
 
-class Judgement(NamedTuple):
+class ActDecision(NamedTuple):
     """Oversight after an act; the reason for which it was refused; the proposal that it approved."""
 
     oversight: Oversight
@@ -73,9 +73,9 @@ class Judgement(NamedTuple):
     approved: Proposal | None = None
 
 
-def judge_act(
+def decide_act(
     oversight: Oversight, act: Act, newest: tuple[str, float] | None, known: dict[int, Setting], policy: Policy
-) -> Judgement:
+) -> ActDecision:
     """Carry out an act on the oversight of a twin.
 
     Parameters
@@ -90,22 +90,22 @@ def judge_act(
     """
     match act.act:
         case ActKind.HOLD:
-            return Judgement(replace(oversight, held=act.sentence, proposal=None, again=None))
+            return ActDecision(replace(oversight, held=act.sentence, proposal=None, again=None))
         case ActKind.RELEASE:
-            return Judgement(replace(oversight, held="", again=None), "" if oversight.held else "nobody holds it")
+            return ActDecision(replace(oversight, held="", again=None), "" if oversight.held else "nobody holds it")
         case ActKind.ASK_FIRST:
-            return Judgement(replace(oversight, ask_first=True))
+            return ActDecision(replace(oversight, ask_first=True))
         case ActKind.ASK_NO_MORE:
-            return Judgement(replace(oversight, ask_first=False, proposal=None))
+            return ActDecision(replace(oversight, ask_first=False, proposal=None))
         case ActKind.ROLL_BACK:
             why = _no_way_back(act, known, policy)
             back = replace(oversight, held=act.sentence, proposal=None, again=act)
-            return Judgement(oversight, why) if why else Judgement(back)
+            return ActDecision(oversight, why) if why else ActDecision(back)
         case ActKind.APPROVE:
             why = _not_approvable(oversight, act, newest)
             if why:
-                return Judgement(oversight, why)
-            return Judgement(replace(oversight, proposal=None), approved=oversight.proposal)
+                return ActDecision(oversight, why)
+            return ActDecision(replace(oversight, proposal=None), approved=oversight.proposal)
 
 
 def _no_way_back(act: Act, known: dict[int, Setting], policy: Policy) -> str:

@@ -10,7 +10,7 @@ from servotwin import messages
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import InvalidMessage, WindowMessage
-from servotwin.twin.context import context_of, described, differing, parts_of
+from servotwin.twin.context import context_of, described, differences, parts_of
 from servotwin.twin.estimating import DecodedWindow, estimator_of
 from servotwin.twin.evidence_rows import StoredEstimate, plain
 from servotwin.twin.model_registry import ServoModel
@@ -67,7 +67,7 @@ def replay(window: bytes, body: bytes, context: str, model: ServoModel | None = 
     estimate = DecodedWindow.of(message).estimate(estimator_of(servo, settings), expected)
     again = plain(estimate)
     return ReplayResult(
-        estimate, again == bytes(stored.estimate), differing(then, now), _changed(stored.estimate, again)
+        estimate, again == bytes(stored.estimate), differences(then, now), _changed(stored.estimate, again)
     )
 
 

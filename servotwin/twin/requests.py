@@ -11,8 +11,8 @@ from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
+from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
-from servotwin.plant.shown import position_unit
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
 from servotwin.twin.settings import TwinSettings
 

@@ -126,7 +126,7 @@ def due(message: WindowMessage, state: TriageState, settings: TriageSettings) ->
     return ""
 
 
-def in_vain(message: WindowMessage, state: TriageState) -> str:
+def without_result(message: WindowMessage, state: TriageState) -> str:
     """Reason to skip a window without a glance: the last estimates of such windows were not accepted; empty: none.
 
     Otherwise every window would be estimated of a loop that shows one contact only, with the encoder's offset unknown.
@@ -162,7 +162,7 @@ def glance(
     machine : FactorPrior, optional
         The machine's numbers over the servo's, as learnt; None: the servo is exact.
     """
-    settings, skipped = settings or TriageSettings(), in_vain(message, state)
+    settings, skipped = settings or TriageSettings(), without_result(message, state)
     if skipped:
         return _without_result(skipped, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:

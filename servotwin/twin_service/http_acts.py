@@ -13,8 +13,8 @@ from servotwin.dashboard.oversight import machine_oversight
 from servotwin.messages import InvalidMessage, Refusal
 from servotwin.messages.acts import MAX_ACT_BYTES, Act, ActKind, encode_act
 from servotwin.store.engine import StoreBusy, StoreUnavailable
+from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
-from servotwin.store.soundness import message_digest
 from servotwin.store.store import Store
 from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
 from servotwin.twin_service.http_edge import SERVO_PATH

@@ -22,8 +22,8 @@ from servotwin.messages import (
 )
 from servotwin.messages.codec import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
+from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
-from servotwin.store.soundness import message_digest
 from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 

@@ -12,7 +12,7 @@ from itertools import islice
 
 from servotwin.messages import Resend, WindowMessage, encode
 from servotwin.store.engine import StoreUnavailable
-from servotwin.store.soundness import missing_windows
+from servotwin.store.integrity import missing_windows
 from servotwin.store.store import Store
 from servotwin.twin_service.limits import MAX_SERVOS
 from servotwin.twin_service.monitoring import Metrics

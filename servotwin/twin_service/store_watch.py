@@ -1,4 +1,4 @@
-"""Watch over the store's soundness: at the start, and in the background all the time."""
+"""Watch over the store's integrity: at the start, and in the background all the time."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import TypeVar
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
 from servotwin.store.engine import StoreDamaged, StoreUnavailable, sqlite_file
+from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message
 from servotwin.store.records import Incoming, PutResult, WorkResult
-from servotwin.store.soundness import Soundness, check_bodies, check_pages, newest_message
 from servotwin.store.store import Store
 from servotwin.twin_service.store_executor import StoreExecutor
 
@@ -79,7 +79,7 @@ class StoreWatch:
         try:
             return await write(record)
         except StoreDamaged as error:
-            self._found(Soundness((str(error),), False))
+            self._found(IntegrityReport((str(error),), False))
             raise
 
     async def start(self) -> None:
@@ -144,7 +144,7 @@ class StoreWatch:
         self.rounds += 1
         return 0
 
-    def _found(self, result: Soundness) -> None:
+    def _found(self, result: IntegrityReport) -> None:
         if result.faults and not self.fault:
             self.fault, self._store.damaged = result.faults[0], True
             log.error("store damaged: it is not written any more", extra={"why": "; ".join(result.faults)})

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from servotwin.cli.audit_report import HEAD, _sent_update, lines_of
+from servotwin.cli.audit_report import HEAD, _sent_update, lines_of, servo_lines
 from servotwin.messages import Cause
 
 SERVO = {
@@ -66,6 +66,13 @@ def test_the_head_summarises_the_servo() -> None:
         "servo ax-1: no gap known, no version sent",
         "  windows: 42 stored, 1 messages pending",
     ]
+
+
+def test_the_names_column_is_as_wide_as_the_longest_name() -> None:
+    head, short, long = servo_lines([SERVO, {**SERVO, "servo": "gantry-left-y", "gap": None}])
+    assert head.startswith("servo          gap ± 95 %, deg  status")
+    assert short.startswith("ax-1             7.500 ± 0.039  ok")
+    assert long.startswith("gantry-left-y                -  ok")
 
 
 def test_a_version_from_its_window_to_its_effect() -> None:

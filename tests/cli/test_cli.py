@@ -65,6 +65,7 @@ def test_version():
     result = run("--version")
     assert result.exit_code == 0
     assert result.output.startswith("servotwin 0.")
+    assert "--no-version" not in run("--help").output
 
 
 @pytest.mark.parametrize(

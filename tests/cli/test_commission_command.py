@@ -76,6 +76,8 @@ def test_the_axis_is_the_machine_of_the_log(log, tmp_path):
     assert axis.controller.velocity_gain == pytest.approx(GAINS["velocity_gain"] * p * p, rel=1e-3)
     assert axis.at_motor
     assert "next experiment" in result.output
+    assert "parameter (± 95 %)" in result.output
+    assert "standard deviation" not in result.output
 
 
 def test_the_twin_of_the_scenario_knows_how_sure_the_parameters_are(files):

@@ -76,7 +76,9 @@ def test_the_table_shows_gap_interval_and_trend(folder):
     rows = [line for line in result.output.splitlines() if line.rstrip().endswith(" ok")]
     assert len(rows) == 4
     assert rows[0].split()[:4] == ["0.00", "..", "1.00", "4.001"]
-    for words in ("4 OK", "gap at 15.50 s: 4.3", "wear: 0.", "10 deg are reached in: median"):
+    assert "95 % interval, deg" in result.output
+    assert "std" not in result.output
+    for words in ("4 OK", "gap at 15.50 s: 4.3", "wear: 0.", "time until 10 deg: "):
         assert words in result.output
 
 

@@ -3,6 +3,7 @@
 import csv
 import json
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from pyarrow import parquet
 
 import servotwin as st
 from servotwin.cli import simulate as record
+from servotwin.cosim.scenario import preset_text
 from servotwin.errors import InvalidInput
 from servotwin.logs.formats import FORMATS
 from servotwin.logs.log import check_output, read_log
@@ -135,3 +137,12 @@ def test_a_csv_of_the_version_before_is_read_the_same(written, tmp_path):
     assert before.metadata == now.metadata
     assert before.metadata["seed"] == 7
     assert np.array_equal(before.whole.position, now.whole.position)
+
+
+def test_a_packaged_scenario_is_named_without_a_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text, scenario = record._read(Path("fig15"))
+    assert (text, scenario.duration) == (preset_text("fig15"), 200.0)
+    (tmp_path / "fig15").write_text("servo = 3")
+    with pytest.raises(InvalidInput, match="servo"):
+        record._read(Path("fig15"))

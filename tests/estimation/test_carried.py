@@ -130,8 +130,8 @@ def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
     """However sure it is: an offset that is right does not change what is left over."""
     window, true = noisy(stretch(5.0, 1.2), 1), whitened.fit
 
-    def lost(window, servo, prior, settings, machine, looked=None):
-        fitted = true(window, servo, prior, settings, machine, looked)
+    def lost(window, servo, prior, settings, machine, first=None):
+        fitted = true(window, servo, prior, settings, machine, first)
         right = fitted.concluded()
         wrong = replace(right, gap=right.gap + DEG, rms=100.0 * right.rms)
         return fitted if settings.offset is None else SimpleNamespace(servo=servo, concluded=lambda: wrong)
@@ -183,7 +183,7 @@ def test_a_loop_reports_bias_and_reason_for_every_window():
 
 
 def test_the_machine_s_numbers_are_fitted_once_where_one_contact_needs_the_carried_offset(monkeypatch):
-    """A look at the machine as it is known decides which fit is made; a window of two contacts is fitted as without an
+    """A fit of the gap alone decides whether the offset is needed; a window of two contacts is fitted as without an
     offset, bit for bit."""
     fits = []
     monkeypatch.setattr(offset, "fit", lambda *given: fits.append(given) or whitened.fit(*given))

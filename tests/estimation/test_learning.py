@@ -17,7 +17,7 @@ from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.learning.machine import LearningSettings, LearntMachine, nameplate, updated
 from servotwin.estimation.whitened import estimate_carrying
 from servotwin.estimation.whitened.free_model import FactorPrior, FreeProblem, adapted, contact_evidence
-from servotwin.estimation.whitened.learning import look_around
+from servotwin.estimation.whitened.learning import coarse_search
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -47,7 +47,7 @@ def machine_window(gap_deg=10.0, noise=1e-6, seed=1, factors=TRUTH, start=5.0):
 def problem_of(case, prior=ROUGH, noise=1e-6):
     settings = whitened.WhitenedSettings()
     window = case.window
-    slow, points = look_around(window.theta_m, window.position, window.sample_rate, MODEL, 0.0, settings)
+    slow, points = coarse_search(window.theta_m, window.position, window.sample_rate, MODEL, 0.0, settings)
     return FreeProblem(slow, Autoregression.white(noise), MODEL, prior, 2.0 * float(np.ptp(slow.theta_m))), points
 
 

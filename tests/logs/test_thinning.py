@@ -7,7 +7,7 @@ from recordings import recording
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.logs.gathering import THINNED, Gathering
-from servotwin.logs.thinning import Stretches, remembered
+from servotwin.logs.thinning import Stretches, play_extremes
 from servotwin.plant.backlash import play
 
 
@@ -16,7 +16,7 @@ from servotwin.plant.backlash import play
 def test_a_play_ends_where_it_ends_on_all_samples(seed):
     random = np.random.default_rng(seed)
     motor = np.cumsum(random.standard_normal(400)) + 0.3 * random.standard_normal(400)
-    table = remembered(np.column_stack([np.arange(400.0), motor]))
+    table = play_extremes(np.column_stack([np.arange(400.0), motor]))
     assert len(table) < 60
     assert np.all(np.diff(table[:, 0]) > 0.0)
     assert table[-1, 0] == 399.0
@@ -26,8 +26,8 @@ def test_a_play_ends_where_it_ends_on_all_samples(seed):
 
 def test_a_machine_at_rest_leaves_two_samples():
     chatter = np.where(np.arange(1000) % 3 == 1, 1e-3, 0.0)
-    assert len(remembered(np.column_stack([np.arange(1000.0), chatter]))) == 2
-    assert len(remembered(np.zeros((1000, 2)))) == 1
+    assert len(play_extremes(np.column_stack([np.arange(1000.0), chatter]))) == 2
+    assert len(play_extremes(np.zeros((1000, 2)))) == 1
 
 
 def test_stretches_stay_whole_and_the_more_lively_of_two_stays():

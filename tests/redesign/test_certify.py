@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from servotwin.control.controller import Controller
 from servotwin.control.law import start, tick
-from servotwin.control.retuning import unfed
+from servotwin.control.retuning import law_for_margins
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
@@ -249,7 +249,7 @@ def test_a_zone_that_stops_the_integral_is_held_to_the_margins_with_and_without_
     uncertainty = widened(Uncertainty(), Demands())
     law = OWN.replace(Ki=0.1 * OWN.Ki, integral_only=True)
     both = margins_in_every_zone(SERVO, uncertainty, law)
-    each = [loop_margins(SERVO, uncertainty, unfed(law).replace(Ki=ki)) for ki in (law.Ki, 0.0)]
+    each = [loop_margins(SERVO, uncertainty, law_for_margins(law).replace(Ki=ki)) for ki in (law.Ki, 0.0)]
     assert both.Ms_worst == max(one.Ms_worst for one in each)
     assert both.phase_margin_worst == min(one.phase_margin_worst for one in each)
     assert both.Ms == max(one.Ms for one in each)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servotwin.control.retuning import unfed
+from servotwin.control.retuning import law_for_margins
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.attempt import Question
@@ -106,5 +106,5 @@ def test_the_largest_steps_refuse_what_the_usual_ones_do_not_show() -> None:
 
 def test_margins_do_not_depend_on_it() -> None:
     law = SERVO.controller.replace(Ki=0.0, friction_feedforward=0.05)
-    assert unfed(law) == unfed(law.replace(friction_feedforward=0.0))
-    assert loop_margins(SERVO, KNOWN, law) == loop_margins(SERVO, KNOWN, unfed(law))
+    assert law_for_margins(law) == law_for_margins(law.replace(friction_feedforward=0.0))
+    assert loop_margins(SERVO, KNOWN, law) == loop_margins(SERVO, KNOWN, law_for_margins(law))

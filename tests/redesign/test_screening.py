@@ -16,7 +16,7 @@ from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import ROUNDED, Question
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import _shortlist, candidates_of
-from servotwin.redesign.certified.screening import Screening, is_plain, leaves_too_much, stops_widest
+from servotwin.redesign.certified.screening import Screening, exceeds_error_limit, has_widest_integral_zone, is_plain
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw
 from servotwin.redesign.design import Design
@@ -116,11 +116,11 @@ def test_after_the_first_the_settings_that_settle_most_surely_are_verified() -> 
     question, _ = question_and_candidates()
     near, far, plain = (kind[:8] for kind in settings_of_each_kind())
     screening = Screening(question)
-    tried = list(_shortlist(screening, iter([*near, *far, *plain]), stops_widest([*near, *far, *plain]), 3))
+    tried = list(_shortlist(screening, iter([*near, *far, *plain]), has_widest_integral_zone([*near, *far, *plain]), 3))
     assert tried == [*near[:3], *far[:3], *plain[:3]]
     assert screening.only is not None
     assert not screening.only(near[0])
-    mixed = list(_shortlist(Screening(question), iter([*plain, *far]), stops_widest(far), 3))
+    mixed = list(_shortlist(Screening(question), iter([*plain, *far]), has_widest_integral_zone(far), 3))
     assert mixed == [*plain[:3], *far[:3]]
 
 
@@ -131,8 +131,8 @@ def test_what_friction_leaves_at_most_counts_and_not_where_a_few_machines_stop()
     demands = replace(DEMANDS, tail=25e-6)
     question = Question(SERVO, known, demands, trial_for(SERVO, UNCERTAINTY, DEMANDS), noise=0.0)
     calm, lively = (Design(SERVO.controller.replace(Kp=s * SERVO.controller.Kp, Ki=0.0)) for s in (1.0, 1.2))
-    assert leaves_too_much(question, calm)
-    assert not leaves_too_much(question, lively)
+    assert exceeds_error_limit(question, calm)
+    assert not exceeds_error_limit(question, lively)
     assert Screening(question).fails(calm)
     integral = Design(SERVO.controller.replace(Ki=0.01 * SERVO.controller.Ki))
-    assert not leaves_too_much(question, integral)
+    assert not exceeds_error_limit(question, integral)

@@ -12,7 +12,7 @@ from exploration import extent
 from scipy import stats
 
 from servotwin.commissioning.guarding import guarding
-from servotwin.control.retuning import unfed
+from servotwin.control.retuning import law_for_margins
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -194,7 +194,7 @@ def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     assert after.certificate is not None
     assert after.setting is not None
     stated = loop_margins(
-        SERVO, widened(policy.uncertainty, policy.demands), unfed(after.certificate.setting.controller)
+        SERVO, widened(policy.uncertainty, policy.demands), law_for_margins(after.certificate.setting.controller)
     )
     assert stated.Ms_worst > 2.2
     assert after.certificate.cost < before.certificate.cost

@@ -23,7 +23,7 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin import context as contexts
-from servotwin.twin.context import context_of, described, differing, parts_of
+from servotwin.twin.context import context_of, described, differences, parts_of
 from servotwin.twin.evidence_rows import plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.replay import replay
@@ -119,7 +119,7 @@ def test_another_version_is_named(part):
 
 
 def test_a_part_that_one_side_does_not_know_is_named():
-    assert differing({"a": "1", "b": "2"}, {"b": "2", "c": "3"}) == ("a 1 then, unknown now", "c unknown then, 3 now")
+    assert differences({"a": "1", "b": "2"}, {"b": "2", "c": "3"}) == ("a 1 then, unknown now", "c unknown then, 3 now")
 
 
 def test_an_edited_source_shows(tmp_path, monkeypatch):

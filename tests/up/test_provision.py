@@ -24,8 +24,8 @@ from servotwin.edge_process.config import token_of
 from servotwin.edge_process.config_file import load
 from servotwin.link.seal import verifier_of
 from servotwin.messages import encode
+from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind
-from servotwin.store.soundness import message_digest
 from servotwin.store.store import open_store
 from servotwin.twin_service.auth import read_tokens
 from servotwin.up import enrolment

@@ -15,7 +15,7 @@ from servotwin.analysis.maps.axes import RatioAxes, Values, axis_names, axis_val
 from servotwin.analysis.maps.measures import MEASURES, Measures
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.shown import command_unit, position_unit
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.runtime import files
 
 _ANGLES = ("gap", "estimate")

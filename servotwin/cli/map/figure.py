@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.shown import command_unit, position_unit
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.report import style
 from servotwin.runtime import files
 
@@ -122,7 +122,7 @@ def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Fig
         "share of the runs that settle",
         f"over every {up.label.partition(' (')[0].partition(' /')[0]}",
         f"worst error at the end ({name})",
-        f"worst swing at the end (± {name})",
+        f"worst swing at the end, half peak-to-peak ({name})",
         "worst 5 % settling time (s); white: never",
         _effort(result),
     )

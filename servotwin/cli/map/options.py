@@ -12,8 +12,8 @@ from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
+from servotwin.plant.display_units import DisplayUnit, position_unit
 from servotwin.plant.plants import resolve_plant
-from servotwin.plant.shown import ShownUnit, position_unit
 
 _MAX_VALUES = 4096
 _MAX_PANELS = 36
@@ -74,7 +74,7 @@ class MapOptions:
             still=self._still(position_unit(servo).small),
         )
 
-    def _still(self, unit: ShownUnit) -> float | None:
+    def _still(self, unit: DisplayUnit) -> float | None:
         """Largest half peak-to-peak of a rest, m or rad."""
         given = {"um": self.still_um, "mdeg": self.still_mdeg}
         for name, value in given.items():
@@ -85,7 +85,7 @@ class MapOptions:
         value = given[unit.name]
         return None if value is None else unit.si_of(value)
 
-    def _axes(self, position: ShownUnit) -> Axes:
+    def _axes(self, position: DisplayUnit) -> Axes:
         ratios = {"--tolerance": self.tolerance, "--amplitude": self.amplitude}
         physical = {"--gap-deg": self.gap_deg, "--estimate-deg": self.estimate_deg, "--k-dz": self.k_dz}
         steps = {"--amplitude-mm": self.amplitude_mm, "--amplitude-deg": self.amplitude_deg}
@@ -106,7 +106,7 @@ class MapOptions:
         tolerance = parsed("--tolerance", self.tolerance or TOLERANCE)
         return RatioAxes(tolerance, parsed("--amplitude", self.amplitude or AMPLITUDE))
 
-    def _physical(self, name: str, step: str, position: ShownUnit) -> PhysicalAxes:
+    def _physical(self, name: str, step: str, position: DisplayUnit) -> PhysicalAxes:
         return PhysicalAxes(
             parsed("--gap-deg", self.gap_deg or "10", math.pi / 180.0),
             parsed("--k-dz", self.k_dz or "1"),

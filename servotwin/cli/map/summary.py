@@ -12,7 +12,7 @@ from rich.table import Table
 from servotwin.analysis.maps.axes import RatioAxes
 from servotwin.analysis.maps.result import StabilityMap
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.shown import command_unit, position_unit
+from servotwin.plant.display_units import command_unit, position_unit
 
 ROWS = 21
 _LABELS = {
@@ -35,7 +35,7 @@ def heads(result: StabilityMap) -> tuple[str, ...]:
     """Heads of the table's columns of measures, in the units of the servo."""
     unit, command = position_unit(result.settings.servo).name, command_unit(result.settings.servo)
     shares = "all settle\n% of cells", "settled\n% of runs"
-    return (*shares, f"error\n{unit}", f"swing\n± {unit}", "settling\ns", f"effort\n{command} rms")
+    return (*shares, f"error\n{unit}", f"swing\n{unit}", "settling\ns", f"effort\n{command} rms")
 
 
 def _table_axis(result: StabilityMap) -> int:
@@ -74,10 +74,19 @@ def sentences(result: StabilityMap) -> tuple[str, ...]:
         f"{s.count} cells with {s.members} initial states each, {s.run_time:g} s a run;"
         f" settled: half the peak-to-peak of the last {s.last_part:g} s"
         f" below {unit.factor * s.stillness:g} {unit.name}{_scale(result)}.",
-        f"Every run settles in {np.mean(settled == 1.0):.1%} of the cells, none in {np.mean(settled == 0.0):.1%};"
-        f" {np.mean(settled):.1%} of all runs settle.",
-        f"In {slow} cells the last {s.short_part:g} s alone would call more runs settled: they rest, then move on.",
+        f"Every run settles in {_percent(settled == 1.0)} of the cells, none in {_percent(settled == 0.0)};"
+        f" {_percent(settled)} of all runs settle.",
+        *(
+            [f"In {slow} cells more runs rest in the last {s.short_part:g} s alone: they rest, then move on."]
+            if slow
+            else []
+        ),
+        "In the table error, swing (half the peak-to-peak) and settling are the worst of all runs.",
     )
+
+
+def _percent(values: Array) -> str:
+    return f"{100.0 * float(np.mean(values)):.1f} %"
 
 
 def _scale(result: StabilityMap) -> str:
@@ -88,8 +97,8 @@ def _scale(result: StabilityMap) -> str:
     # None of these scales with the gap.
     limits = law.voltage_limit is not None or servo.command_limit is not None
     if limits or law.feedforward or servo.motor_friction or servo.guide.friction or servo.guide.force:
-        return f"{at}, for which alone this map is made"
-    return f"{at}, {result.settings.stillness / (0.5 * result.settings.servo.p * axes.gap):.3g} p b at any"
+        return f"{at}; the map holds for this gap only"
+    return f"{at} ({result.settings.stillness / (0.5 * result.settings.servo.p * axes.gap):.3g} p b for any gap)"
 
 
 def text(result: StabilityMap) -> str:

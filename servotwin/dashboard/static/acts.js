@@ -83,5 +83,5 @@ function proposalText(proposal, unit) {
   const { setting, verification, gap, interval } = proposal;
   const verified = verification ? `verified on ${verification.members} simulated machines` : "not simulated";
   const zone = setting?.tolerance ? `dead zone ${brief(setting.tolerance * unit.factor)} ${unit.name}` : "no dead zone";
-  return `A new version waits for approval since ${stamp(proposal.created)}: gap ${gapText(gap, interval?.[0] === null ? null : interval)} deg, ${zone}, ${verified}; of window ${proposal.window?.[1]}.`;
+  return `A new version waits for approval since ${stamp(proposal.created)}: gap ${gapText(gap, interval?.[0] === null ? null : interval)} deg (95 %), ${zone}, ${verified}; of window ${proposal.window?.[1]}.`;
 }

@@ -15,7 +15,7 @@ const COLUMNS = [
   ["servo", "Machine", (row) => row.servo, false],
   ["gap", "Gap, deg (95 %)", (row) => row.gap, true],
   ["history", "Last windows", null, false],
-  ["rate", "Wear", (row) => row.rate, true],
+  ["rate", "Wear (95 %)", (row) => row.rate, true],
   ["limit", "Time to limit", (row) => row.until_limit, false],
   ["version", "Version", (row) => row.version_in_force, true],
   ["window", "Last window", (row) => row.last_window?.received ?? null, true],

@@ -105,7 +105,7 @@ export class MachinePage {
       panel("Events", [], this.events));
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
     this.tilesList = element("dl", { class: "facts" },
-      tile("gap", "Gap, deg"), tile("rate", "Wear"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
+      tile("gap", "Gap, deg (95 %)"), tile("rate", "Wear (95 %)"), tile("limit", "Time to the gap limit"), tile("version", "Version in force"), tile("window", "Last window"), tile("link", "Link"));
     this.view.replaceChildren(this.head, this.tilesList, this.alarms, element("div", { class: "words" }, this.trouble, this.fileWords), this.blank, this.content);
     this.makePlots(plot, places);
     this.plots.push(...this.whatIf.plots, ...this.liveView.plots, ...this.residualPanel.plots);
@@ -168,7 +168,7 @@ export class MachinePage {
     if (!row) return;
     const unit = rateUnit([row.rate]), link = linkOf(row, now);
     this.tile("gap", rowGapText(row), [statusText(row.status), travelText(row.gap, row)]);
-    this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time, 95 %"]);
+    this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time"]);
     this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
     this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? row.receipt : ""]);
     this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? `${row.waiting} messages wait` : ""]);
@@ -234,7 +234,7 @@ export class MachinePage {
         scaled(windows.trend, DEG),
       ].map((values) => [...values, ...later.map(() => null)]),
       time.map(() => near),
-    ], `Gap over ${count} windows: newest ${gapText(newest.gap, newest.interval)} deg`);
+    ], `Gap over ${count} windows: newest ${gapText(newest.gap, newest.interval)} deg (95 %)`);
     const unit = positionUnit(machine);
     this.tailPlot.options.yLabel = `Error at the end (${unit.name})`;
     this.tailPlot.show([windows.received, scaled(windows.tail, unit.factor)], "Largest tracking error in the last tenth of each window");

@@ -10,7 +10,7 @@ export function chainTable(traces, gaps, unit) {
   const steps = traces.flatMap((trace) => trace.steps.map((step) => ({ trace, step })));
   const open = element("p", { class: "soft" }, newestDecision(gaps, steps.length > 0));
   if (!steps.length) return open;
-  const heads = ["Version", "Sent", "Window", "Gap, deg", "Setting", "Verified on", "The edge", `Error at the end, before → after (${unit.name})`];
+  const heads = ["Version", "Sent", "Window", "Gap, deg (95 %)", "Setting", "Verified on", "The edge", `Error at the end, before → after (${unit.name})`];
   const table = element("table", {},
     element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))),
     element("tbody", {}, steps.sort((a, b) => b.step.update.version - a.step.update.version).map(({ trace, step }) => row(trace, step, unit))));

@@ -29,7 +29,7 @@ from servotwin.simulation import simulate
 
 FittedLaw = FittedCascade | FittedPid
 _ROUNDS = 8
-_SETTLED = 1e-3  # relative change of inertia and Coulomb friction, of the force
+_CONVERGED = 1e-3  # relative change of inertia and Coulomb friction, of the force
 _TRACKS = 0.05  # of the position: a simulation that leaves more is not near enough for its motion to be used
 
 
@@ -53,12 +53,12 @@ class SimulatedLog:
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """Fits to the simulated motion; `settled`: the parameters came to rest."""
+    """Fits to the simulated motion, and if they converged."""
 
     symmetric: ParameterFit
     asymmetric: ParameterFit
     simulated: SimulatedLog
-    settled: bool
+    converged: bool
 
 
 def rigid_axis(fit: ParameterFit, law: FittedLaw, recording: DriveRecording, p: float) -> Axis:
@@ -137,9 +137,9 @@ def refine(
         motion = motion_of(simulated.position, recording.rate, band)
         symmetric, asymmetric = fit_models(_rows(recording, motion, band, cycle, fit, simulated))
         change = np.abs(symmetric.values - fit.values)
-        settled = bool(np.all(change < _SETTLED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
-        found, fit = Refinement(symmetric, asymmetric, simulated, settled), symmetric
-        if settled:
+        converged = bool(np.all(change < _CONVERGED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
+        found, fit = Refinement(symmetric, asymmetric, simulated, converged), symmetric
+        if converged:
             break
     return found
 

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics import checks
 from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw, Refinement, refine
+from servotwin.estimation.inverse_dynamics.command_delay import delay_remark
 from servotwin.estimation.inverse_dynamics.conditioning import RegressionBand, band_of, motion_of
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, cycle_time, fit_models, joined, rows_of, widened
 from servotwin.estimation.inverse_dynamics.fitted_cascade import EXPLAINED, RICHER, GivenGains, fitted_cascade
 from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid, fitted_pid
-from servotwin.estimation.inverse_dynamics.lateness import said_late
 from servotwin.estimation.inverse_dynamics.next_experiment import NextExperiment, next_experiment
 from servotwin.estimation.inverse_dynamics.recording import DriveRecording, held_command
 from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse, shaft_response, split_inertia
@@ -107,7 +107,7 @@ def identify_drive(
     law, refinement, doubts = _refined(used[0], symmetric, gains, (bands[0], cycle_time(motions[0])), p)
     # No further motion shows more of what the hold does.
     advice = next_experiment(fits[0], every, motions[0], used[0].unit)
-    late = said_late(used[0], motions[0], bands[0])
+    late = delay_remark(used[0], motions[0], bands[0])
     shaft = shaft_response(used[0])
     split = None if shaft is None else split_inertia(used[0], bands[0], shaft)
     return IdentifiedDrive(symmetric, asymmetric, tuple(bands), law, refinement, doubts, advice, shaft, split, late)
@@ -135,7 +135,7 @@ def _refined(
     """The law that ran, the refinement, and why there is none."""
     if recording.reference is None:
         given = _fitted_law(recording, gains) if gains.complete else None
-        return given, None, ("without a reference the loop cannot be simulated beside the log",)
+        return given, None, ("without a reference the loop cannot be simulated",)
     law = _fitted_law(recording, gains)
     if not law.explains:
         checks.check_reference(recording, gains if isinstance(gains, GivenGains) else _FITTED)
@@ -143,7 +143,7 @@ def _refined(
     found = refine(fit, law, recording, *filtering, p)
     if found is None:
         return law, None, ("the simulated loop does not follow the log",)
-    return law, found, () if found.settled else ("the fit to the simulated motion did not come to rest",)
+    return law, found, () if found.converged else ("the fit to the simulated motion did not converge",)
 
 
 def _fitted_law(recording: DriveRecording, gains: GivenLaw) -> FittedLaw:

@@ -11,7 +11,7 @@ from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit, Rows
 from servotwin.plant.signals import Array
 
-_WANTED = 0.01  # relative standard deviation
+_WANTED = 0.02  # half of the 95 % interval, relative
 _STEPS = 400  # samples of a cycle
 _WORDS = {
     "inertia": "the inertia",
@@ -29,26 +29,28 @@ class NextExperiment:
     ----------
     worst : str
         Parameter that is known worst, relative to itself; the offset relative to the Coulomb friction.
-    relative_std : float
-        Of it now.
+    half_width : float
+        Half of its 95 % interval now, relative likewise.
     motion : str
         In words.
     duration : float
-        s, until its relative standard deviation is 1 %; 0 where it already is.
+        s, until that is 2 %; 0 where it already is.
     """
 
     worst: str
-    relative_std: float
+    half_width: float
     motion: str
     duration: float
 
     def __str__(self) -> str:
         """One sentence."""
-        known = f"{_WORDS[self.worst]} is known worst, to {100.0 * self.relative_std:.2g} % (one standard deviation)"
+        known = f"{_WORDS[self.worst]} is known worst, to ± {100.0 * self.half_width:.2g} % (95 %)"
         if self.duration == 0.0:
-            return f"{known}: no further experiment is needed for 1 %"
+            return f"{known}: no further experiment is needed for ± {100.0 * _WANTED:g} %"
         seconds = float(f"{self.duration:.2g}")
-        return f"{known}; {self.motion}, for {seconds:g} s, would tell most of it and bring it to 1 %"
+        return (
+            f"{known}; {self.motion}, for {seconds:g} s, would tell most of it and bring it to ± {100.0 * _WANTED:g} %"
+        )
 
 
 def next_experiment(fit: ParameterFit, rows: Rows, motion: DriveMotion, unit: str) -> NextExperiment:
@@ -59,7 +61,8 @@ def next_experiment(fit: ParameterFit, rows: Rows, motion: DriveMotion, unit: st
     """
     scale = np.abs(fit.values)
     scale[3] = max(scale[3], scale[2])
-    relative = np.sqrt(np.diag(fit.covariance)) / np.maximum(scale, np.finfo(float).tiny)
+    half_widths = np.array([fit.half_width(name) for name in fit.names])
+    relative = half_widths / np.maximum(scale, np.finfo(float).tiny)
     place = int(np.argmax(relative))
     now = float(relative[place])
     if now <= _WANTED:
@@ -83,12 +86,13 @@ def _rows_per_second(rows: Rows, motion: DriveMotion) -> float:
 
 
 def _needed(fit: ParameterFit, place: int, scale: Array, per_second: Array) -> float:
-    """Duration of a motion until the relative standard deviation of a parameter is 1 %, s."""
+    """Duration of a motion until half of a parameter's 95 % interval is 2 %, s."""
     now = np.linalg.inv(fit.covariance)
+    wanted = _WANTED * scale[place] * fit.std(fit.names[place]) / fit.half_width(fit.names[place])
 
     def enough(seconds: float) -> bool:
         total = np.linalg.inv(now + seconds * per_second)
-        return bool(math.sqrt(total[place, place]) <= _WANTED * scale[place])
+        return bool(math.sqrt(total[place, place]) <= wanted)
 
     seconds = 1.0
     while not enough(seconds) and seconds < 1e6:

@@ -176,7 +176,7 @@ def _estimated(recording: EncoderRecording) -> LostMotion:
     prepared = regression(recording, strokes, 0)
     coarse = coarse_gap(prepared, least)
     # Until the gap has been taken up once nobody knows where the load is within it.
-    first = _settled(recording, 1.1 * coarse)
+    first = _first_moved(recording, 1.1 * coarse)
     if first is None:
         return _no_gap()
     prepared = regression(recording, strokes, first, ~behind_pauses(recording, coarse))
@@ -238,7 +238,7 @@ def _alternates(values: Array) -> bool:
     )
 
 
-def _settled(recording: EncoderRecording, gap: float) -> int | None:
+def _first_moved(recording: EncoderRecording, gap: float) -> int | None:
     """First sample by which the motor has moved by `gap`."""
     motor = recording.motor
     reach = np.maximum.accumulate(motor) - np.minimum.accumulate(motor)

@@ -150,7 +150,7 @@ class _Gain(NamedTuple):
         """In words."""
         less = f"{100.0 * self.share:.3g} % of" if self.share < _TIMES else f"{self.share:.3g} times"
         sense = "better" if self.errors >= 0.0 else "worse"
-        return f"{less} the square error of {before.model.name}, {sense} by {abs(self.errors):.1f} standard errors"
+        return f"{less} the square error of {before.model.name} ({abs(self.errors):.1f} standard errors {sense})"
 
 
 def _gain(before: ModelScore, after: ModelScore) -> _Gain:

@@ -11,8 +11,8 @@ from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial, trials
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.plant.axis import Axis
+from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
-from servotwin.plant.shown import position_unit
 
 ANGLES = {
     "rad": 1.0,

@@ -146,11 +146,13 @@ class LearntMachine(Struct, frozen=True):
         return np.abs(self.factors) - NORMAL_95 * spread
 
     def words(self) -> str:
-        """The factors in per cent off the model."""
+        """The factors in per cent off the model, with half of their 95 % intervals."""
         parts = zip(
             FACTORS, self.factors, np.sqrt(np.diag(np.array(self.covariance).reshape(_SIZE, _SIZE))), strict=True
         )
-        return ", ".join(f"{name} {100.0 * math.expm1(f):+.3g} % +- {196.0 * std:.2g} %" for name, f, std in parts)
+        return ", ".join(
+            f"{name} {100.0 * math.expm1(f):+.3g} ± {100.0 * NORMAL_95 * std:.2g} %" for name, f, std in parts
+        )
 
 
 def nameplate(settings: LearningSettings, k: float, c: float, m: float) -> FactorPrior:

@@ -97,7 +97,7 @@ class LearntMotor(Struct, frozen=True):
         shown = (("back EMF", 100.0, " %"), ("lag", 100.0, " %"), ("friction", 1.0, " V"), ("input bias", 1.0, " V"))
         parts = zip(shown, self.mean, range(4), strict=True)
         return ", ".join(
-            f"{name} {scale * value:+.3g}{unit} +- {scale * NORMAL_95 * self.std(index):.2g}{unit}"
+            f"{name} {scale * value:+.3g} ± {scale * NORMAL_95 * self.std(index):.2g}{unit}"
             for (name, scale, unit), value, index in parts
         )
 

@@ -17,12 +17,11 @@ from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.doubt import gap_doubt
-from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, look_around
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior, adapted
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     contacts_seen,
-    freed,
     judge,
     least_lead,
     lower_bound,
@@ -32,6 +31,7 @@ from servotwin.estimation.whitened.gate import (
     static_lost_motion,
     sure_of_contact,
     travel_needed,
+    with_free_model,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
 from servotwin.estimation.whitened.profile import profile_interval
@@ -173,7 +173,7 @@ class WindowFit:
         aligned, ramp = evidence.aligned, fastest(evidence.aligned.whitened.reduction, self.second)
         if self.learnt is not None:
             return self.learnt.doubt(ramp, self.settings.calibration)
-        problem, fitted = freed(aligned, self.servo), aligned.whitened
+        problem, fitted = with_free_model(aligned, self.servo), aligned.whitened
         at = np.array([*fitted.point, *problem.prior.mean])
         return gap_doubt(problem, at, max(1.0, fitted.variance), aligned.delay, ramp, learnt=False)
 
@@ -191,26 +191,26 @@ def fit(
     prior: float | GapEstimate | None,
     settings: WhitenedSettings | None,
     machine: FactorPrior | None = None,
-    looked: WindowFit | None = None,
+    first: WindowFit | None = None,
 ) -> WindowFit:
     """The first half of `estimate`, with the same arguments and errors.
 
-    With `machine`, the model's factors are free within that; without it the model is taken as it is. `looked`: what
-    `look` returned for the same arguments.
+    With `machine`, the model's factors are free within that; without it the model is taken as it is. `first`: what
+    `fit_gap_only` returned for the same arguments.
     """
     if machine is None:
-        return looked or look(window, servo, prior, settings)
+        return first or fit_gap_only(window, servo, prior, settings)
     made = _unfitted(window, servo, prior, settings)
     if made.broken:
         return made
-    aligned, start = None if looked is None else looked.aligned, _start(prior)
+    aligned, start = None if first is None else first.aligned, _start(prior)
     learnt = learn_and_fit(
         made.angle, window.position, window.sample_rate, servo, start, made.settings, machine, aligned
     )
     return replace(made, servo=learnt.servo, aligned=learnt.aligned, learnt=learnt)
 
 
-def look(
+def fit_gap_only(
     window: Window,
     servo: Servo,
     prior: float | GapEstimate | None,
@@ -223,7 +223,7 @@ def look(
         return made
     here = servo if machine is None else adapted(servo, machine.mean)
     channels = made.angle, window.position, window.sample_rate
-    _, points = look_around(*channels, here, _start(prior), made.settings)
+    _, points = coarse_search(*channels, here, _start(prior), made.settings)
     return replace(made, servo=here, aligned=align_and_fit(*channels, here, points, made.settings))
 
 

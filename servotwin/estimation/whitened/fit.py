@@ -272,7 +272,7 @@ def align_and_fit(
     return AlignedFit(whitened, shift, (shift + late) / rate, float(np.ptp(angle)), float(angle[0]))
 
 
-def look_around(
+def coarse_search(
     theta_m: Array, position: Array, rate: float, servo: Servo, prior: float, settings: WhitenedSettings
 ) -> tuple[Reduction, list[Point]]:
     """Decimate both channels, and find the points from which the search at the full rate begins.

@@ -213,10 +213,10 @@ def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...
 
 def contacts_seen(aligned: AlignedFit, servo: Servo) -> ContactEvidence:
     """Evidence for a second contact in a window, with the model free within its usual error."""
-    return contact_evidence(freed(aligned, servo), aligned.whitened.misfit, aligned.whitened.point)
+    return contact_evidence(with_free_model(aligned, servo), aligned.whitened.misfit, aligned.whitened.point)
 
 
-def freed(aligned: AlignedFit, servo: Servo) -> FreeProblem:
+def with_free_model(aligned: AlignedFit, servo: Servo) -> FreeProblem:
     """Return the window in its noise with the model free within its usual error."""
     result, usual = aligned.whitened, FactorPrior.of_spreads(*FREEDOM)
     return FreeProblem(result.reduction, result.noise, servo, usual, aligned.largest, COMPLIANCE)
@@ -224,7 +224,7 @@ def freed(aligned: AlignedFit, servo: Servo) -> FreeProblem:
 
 def least_lead(evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings) -> float:
     """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error."""
-    problem = freed(evidence.aligned, servo)
+    problem = with_free_model(evidence.aligned, servo)
     leads = possible_leads(problem, contacts.single, contacts.variance)
     sigmas = NORMAL_95 * (1.0 + _COLOURED * evidence.colour)
     return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.counts

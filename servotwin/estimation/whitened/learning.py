@@ -18,7 +18,7 @@ from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.whitened.doubt import gap_doubt
-from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, look_around
+from servotwin.estimation.whitened.fit import AlignedFit, align_and_fit, coarse_search
 from servotwin.estimation.whitened.free_model import (
     BELIEVED,
     COMPLIANCE,
@@ -198,7 +198,7 @@ def learn_and_fit(
     if first is not None:
         return _take_turns(theta_m, position, rate, servo, settings, machine, machine.mean, first)
     factors = machine.mean
-    slow, points = look_around(theta_m, position, rate, adapted(servo, factors), prior, settings)
+    slow, points = coarse_search(theta_m, position, rate, adapted(servo, factors), prior, settings)
     if machine.wide:  # what is known roughly is searched before the noise is known
         noise = Autoregression.white(_VAGUE * float(np.std(slow.position)))
         largest = 2.0 * float(np.ptp(slow.theta_m))

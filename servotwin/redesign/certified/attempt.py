@@ -11,11 +11,11 @@ import numpy as np
 
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
-from servotwin.control.retuning import answer, filter_time, integrates, only_integrates, rest_gain, unfed
+from servotwin.control.retuning import filter_time, integrates, law_for_margins, only_integrates, rest_gain, static_gain
 from servotwin.errors import InvalidInput
+from servotwin.plant.display_units import position_unit
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
-from servotwin.plant.shown import position_unit
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
 from servotwin.redesign.certified.certificate import (
@@ -25,7 +25,7 @@ from servotwin.redesign.certified.certificate import (
     LoopMargins,
     RampResult,
 )
-from servotwin.redesign.certified.margins import margins_in_every_zone, own_answer, slow_response, widened
+from servotwin.redesign.certified.margins import margins_in_every_zone, own_static_gain, slow_response, widened
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
@@ -99,7 +99,7 @@ class Question:
         begin, end = (edge / (2.0 * math.pi * time) for edge in _NOISE_BAND)
         end = end if law.sample_rate is None else 0.5 * law.sample_rate
         effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
-        authority = own_answer(self.servo) * self.uncertainty.step[1]
+        authority = own_static_gain(self.servo) * self.uncertainty.step[1]
         return self.demands.effort_weight * self.trial.unit * effort / authority
 
 
@@ -133,7 +133,12 @@ class Attempt:
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
         question, setting, loop = self.question, self.setting, self._loop
-        demands, known, members, law = question.demands, question.uncertainty, self._members, unfed(setting.controller)
+        demands, known, members, law = (
+            question.demands,
+            question.uncertainty,
+            self._members,
+            law_for_margins(setting.controller),
+        )
         measures = self._measured(members.count)
         settled = int(measures.settled.sum())
         ends = (np.array(known.input_bias), np.array(known.friction), known.step[1])
@@ -205,7 +210,7 @@ class Attempt:
         beyond, servo, known = question.demands.beyond, question.servo, question.uncertainty
         if beyond.machines == 0:
             return None
-        force = servo.torque_of(beyond.friction * own_answer(servo) * known.step[0])
+        force = servo.torque_of(beyond.friction * own_static_gain(servo) * known.step[0])
         force = max(known.friction[1], force) if servo.takes_friction else known.friction[1]
         wide = widened(known, question.demands)
         ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))
@@ -256,7 +261,7 @@ def _lag(servo: Plant, law: AnyController) -> float:
         return 1.0 / abs(gain * running.Ki)
     if integrates(law):
         return 0.0
-    return abs(1.0 / (slow * abs(gain)) - running.velocity_feedforward) / abs(answer(law))
+    return abs(1.0 / (slow * abs(gain)) - running.velocity_feedforward) / abs(static_gain(law))
 
 
 def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) -> int:

@@ -8,8 +8,8 @@ from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
 from servotwin.messages import Verification
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant
-from servotwin.plant.shown import command_unit, position_unit
 from servotwin.redesign.certified.uncertainty import LARGEST_DELAY
 from servotwin.redesign.design import Design
 

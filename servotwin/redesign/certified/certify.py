@@ -18,13 +18,13 @@ from time import perf_counter
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import answer, integrates, only_integrates
+from servotwin.control.retuning import integrates, only_integrates, static_gain
 from servotwin.plant.plants import Plant, check_load_encoder
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
-from servotwin.redesign.certified.margins import integral_shares, laws_within, own_answer, widened, with_margins
-from servotwin.redesign.certified.screening import Screening, is_plain, stops_widest
+from servotwin.redesign.certified.margins import integral_shares, laws_within, own_static_gain, widened, with_margins
+from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
@@ -90,7 +90,7 @@ def certify(
     attempts: list[Attempt] = []
     screening = Screening(question)
     ranked = _ranked_in_stages(question, screening, candidates, in_force)
-    for setting in _shortlist(screening, ranked, stops_widest(candidates), demands.attempts):
+    for setting in _shortlist(screening, ranked, has_widest_integral_zone(candidates), demands.attempts):
         attempt = Attempt(question, setting)
         attempts.append(attempt)
         if attempt.cannot_pass():
@@ -158,7 +158,7 @@ def _any_of(kinds: Sequence[Callable[[Design], bool]]) -> Callable[[Design], boo
 def known_bias(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> float:
     """V: an input bias up to this counts as known, since the error that it leaves is a small share of the smallest
     step."""
-    return demands.known * own_answer(servo) * uncertainty.step[0]
+    return demands.known * own_static_gain(servo) * uncertainty.step[0]
 
 
 def is_disturbed(servo: Plant, uncertainty: Uncertainty, demands: Demands, feedforward: float) -> bool:
@@ -233,7 +233,7 @@ def _with_friction(servo: Plant, laws: list[AnyController], friction: float, dem
     fed = min(float(servo.command_of(friction)), demands.friction_limit)
     if not demands.friction_feedforward or not fed:
         return []
-    fed = math.copysign(fed, answer(servo.controller))
+    fed = math.copysign(fed, static_gain(servo.controller))
     pids = [law for law in laws if isinstance(law, Controller) and not law.Ki]
     return [law.replace(friction_feedforward=fed) for law in pids]
 

@@ -12,7 +12,7 @@ from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.learnt_servo import learnt_servo
-from servotwin.redesign.certified.margins import own_answer
+from servotwin.redesign.certified.margins import own_static_gain
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
 from servotwin.redesign.policy import Evidence
@@ -53,7 +53,7 @@ class EvidenceRanges:
     @property
     def smallest_answer(self) -> float:
         """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
-        return own_answer(self.servo) * self.uncertainty.step[0]
+        return own_static_gain(self.servo) * self.uncertainty.step[0]
 
     @property
     def bias_floor(self) -> float:

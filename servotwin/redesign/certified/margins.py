@@ -15,12 +15,12 @@ from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.retuning import (
-    answer,
     integrates,
+    law_for_margins,
     only_integrates,
     scaled,
+    static_gain,
     strength,
-    unfed,
     without_integral,
 )
 from servotwin.errors import InvalidInput
@@ -218,13 +218,13 @@ def with_notch(servo: Plant) -> Controller | Cascade | None:
     return own.replace(notch_hz=hertz, notch_damping=_NOTCH_DAMPING, notch_depth=depth)
 
 
-def own_answer(servo: Plant) -> float:
+def own_static_gain(servo: Plant) -> float:
     """Size of the command (V) with which the servo's own controller answers a constant error of one metre.
 
     Of a controller that only integrates it is the command that moves the load by one metre.
     """
     law = servo.controller
-    return 1.0 / abs(slow_response(servo)[1]) if only_integrates(law) else abs(answer(law))
+    return 1.0 / abs(slow_response(servo)[1]) if only_integrates(law) else abs(static_gain(law))
 
 
 def slow_response(servo: Plant) -> tuple[float, complex]:
@@ -281,10 +281,10 @@ def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: AnyContro
 
     Without an integral that is all of a law there is no loop.
     """
-    acting = loop_margins(servo, uncertainty, unfed(law))
+    acting = loop_margins(servo, uncertainty, law_for_margins(law))
     if not law.integral_only or only_integrates(law):
         return acting
-    stopped = loop_margins(servo, uncertainty, without_integral(unfed(law)))
+    stopped = loop_margins(servo, uncertainty, without_integral(law_for_margins(law)))
     most = {name: max(getattr(acting, name), getattr(stopped, name)) for name in ("Ms", "Ms_worst")}
     names = [field.name for field in fields(LoopMargins) if field.name.endswith("margin_worst")]
     least = {name: min(getattr(acting, name), getattr(stopped, name)) for name in (*names, "phase_margin", "passivity")}

@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import ClassVar, Protocol
 
 from servotwin.control.gains import gains_of, with_gains
-from servotwin.control.retuning import answer
+from servotwin.control.retuning import static_gain
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
@@ -251,7 +251,9 @@ def band_of(certificate: Certificate, noise: float = 0.0) -> Band:
     The simulated machines are a sample: the real one may need half as long again as the slowest of them.
     """
     error = max(certificate.within, certificate.tail) + noise
-    effort = certificate.effort + abs(answer(certificate.setting.controller)) * (NEAR * certificate.step[1] + noise)
+    effort = certificate.effort + abs(static_gain(certificate.setting.controller)) * (
+        NEAR * certificate.step[1] + noise
+    )
     return Band(error, error, effort, math.ceil(1.5 * certificate.settling_worst))
 
 

@@ -36,7 +36,7 @@ def is_plain(setting: Design) -> bool:
     return not integrates(setting.controller) and not setting.tolerance
 
 
-def stops_widest(candidates: Sequence[Design]) -> Callable[[Design], bool]:
+def has_widest_integral_zone(candidates: Sequence[Design]) -> Callable[[Design], bool]:
     """Predicate of the settings whose integral stops the furthest from the reference: of those with integral action
     they settle most surely."""
     widest = max((each.tolerance for each in candidates if _stops(each)), default=math.inf)
@@ -48,7 +48,7 @@ def _stops(setting: Design) -> bool:
     return setting.controller.integral_only and (setting.tolerance > 0.0 or isinstance(setting.controller, Controller))
 
 
-def leaves_too_much(question: Question, setting: Design) -> bool:
+def exceeds_error_limit(question: Question, setting: Design) -> bool:
     """True where nothing integrates, and bias and friction may leave a larger error than is allowed.
 
     The few machines that rank may stop nearer by chance.
@@ -221,7 +221,7 @@ class Screening:
         demands, few = self.question.demands, self._known[setting]
         most = self._members.count - int(np.sum(~few.settled))
         fails = most / self._members.count < demands.settled or bool(self._is_off(setting, few).any())
-        fails = fails or leaves_too_much(self.question, setting) or self._far.get(setting, False)
+        fails = fails or exceeds_error_limit(self.question, setting) or self._far.get(setting, False)
         missing = self._members.count - few.cost.size
         costs = np.concatenate([few.cost.ravel(), np.zeros(missing)])
         return _Rank(fails, self.question.cost(setting, costs), place)

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import strength, unfed
+from servotwin.control.retuning import law_for_margins, strength
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands
@@ -82,7 +82,7 @@ def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Tria
     laws = laws_within(servo, uncertainty, demands, integral_shares(servo.controller, demands, disturbed=False))
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
-    loop = nominal_margins(servo, unfed(_reference(servo.controller, laws)))
+    loop = nominal_margins(servo, law_for_margins(_reference(servo.controller, laws)))
     crossover = _speed(loop, servo, slowest)
     duration = max(_LENGTH / crossover, _DECAYS / slowest)
     resonance = loop.Ms_omega if loop.Ms_omega < math.inf else 0.0

@@ -116,7 +116,7 @@ def estimate_biased(runs: Runs, square: Square) -> Finding:
     """Mean error of the estimates from steps 3 to 10."""
     mean, error = _bias(noisy(runs, square))
     reproduced = 2.0 * error < abs(mean) < 2.0
-    why = f"the mean error over steps 3 to 10 and {len(SEEDS)} seeds is {mean:.2g} ± {error:.1g} deg"
+    why = f"the mean error over steps 3 to 10 and {len(SEEDS)} seeds is {mean:.2g} deg (standard error {error:.1g} deg)"
     return decided(reproduced, why, ("mean error", mean, "deg"), ("standard error", error, "deg"))
 
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, contacts
 from servotwin.estimation.core.least_squares import orthonormal, project_out
 from servotwin.estimation.core.response import Response, response
-from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.reduction import Point, Reduction
 from servotwin.estimation.window import Window
@@ -199,7 +199,11 @@ def _contribution(axes: Axes, panel: WindowPanel, reach: float) -> None:
     axes.set(
         xlabel="Time (s)", xlim=(0.0, SPAN), xticks=(0.0, 0.5, SPAN), ylim=(-reach * per_degree, reach * per_degree)
     )
-    known = f"at best ±{panel.spread * style.DEG:.2g} deg" if math.isfinite(panel.spread) else "shows nothing"
+    known = (
+        f"at best ± {NORMAL_95 * panel.spread * style.DEG:.2g} deg (95 %)"
+        if math.isfinite(panel.spread)
+        else "shows nothing"
+    )
     axes.set_title(known, loc="right", fontsize=8.0)
 
 
@@ -219,7 +223,8 @@ def _misfit(axes: Axes, panel: WindowPanel) -> QuadMesh:
 def answer(estimate: GapEstimate) -> str:
     """Word the estimator's result in one line."""
     if estimate.ok:
-        return f"OK: {estimate.gap * style.DEG:.3f} ± {estimate.std * style.DEG:.3f} deg"
+        half = NORMAL_95 * estimate.std_total * style.DEG
+        return f"OK: {estimate.gap * style.DEG:.3f} ± {half:.3f} deg (95 %)"
     if estimate.status is GapStatus.LOWER_BOUND:
         return f"at least {estimate.gap * style.DEG:.2g} deg"
     return estimate.status.value

@@ -57,7 +57,7 @@ def test_a_pid_is_chosen_where_a_cascade_does_not_explain_the_command_and_the_lo
     drive = identify_drive([torque()], p=P)
     assert isinstance(drive.law, FittedPid)
     assert drive.refinement is not None
-    assert drive.refinement.settled
+    assert drive.refinement.converged
     assert drive.refinement.simulated.position_error < 1e-4
     for name in ("inertia", "viscous", "coulomb"):
         assert drive.refinement.symmetric[name] == pytest.approx(PARAMETERS[name], rel=2e-3), name

@@ -28,9 +28,9 @@ def test_a_richer_model_is_taken_on_evidence_only(scores):
 def test_each_model_is_told_with_what_speaks_for_it(scores):
     simplest, taken, left, without = (each.evidence for each in trials(scores))
     assert simplest == "the simplest"
-    assert taken.startswith("taken: 24.8 % of the square error of rigid, better by ")
+    assert taken.startswith("taken: 24.8 % of the square error of rigid (")
     assert left.startswith("not taken: 99.8 % of the square error of lag")
-    assert without.startswith("a gap is needed: 11.1 % of the square error of no gap, lag, ")
+    assert without.startswith("a gap is needed: 11.1 % of the square error of no gap, lag (")
 
 
 def test_where_no_gap_predicts_as_well_that_is_said(scores):

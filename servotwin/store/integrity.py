@@ -1,4 +1,4 @@
-"""Soundness of a store: damaged pages, bodies that differ from their digests, messages that are gone."""
+"""IntegrityReport of a store: damaged pages, bodies that differ from their digests, messages that are gone."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DIGEST_BYTES = 16
 _MOST_FAULTS = 3
 
 
-class Soundness(NamedTuple):
+class IntegrityReport(NamedTuple):
     """Result of a check.
 
     Attributes
@@ -61,14 +61,14 @@ def message_digest(data: bytes) -> bytes:
     return digest.digest()
 
 
-def check_pages(store: Store, seconds: float) -> Soundness:
+def check_pages(store: Store, seconds: float) -> IntegrityReport:
     """Check the pages of an SQLite store, table by table, for a bounded time; PostgreSQL checks its own at each read.
 
     Reading happens on a connection of its own and delays nobody; the log cannot be shortened meanwhile.
     """
     file = sqlite_file(store.engines.writer.url)
     if file is None:
-        return Soundness()
+        return IntegrityReport()
     checked, until = 0, time.monotonic() + seconds
     try:
         with closing(_opened(file, until)) as connection:
@@ -76,33 +76,33 @@ def check_pages(store: Store, seconds: float) -> Soundness:
                 rows = connection.execute(f"PRAGMA quick_check('{table}')").fetchmany(_MOST_FAULTS)
                 faults = tuple(f"table {table}: {row[0].splitlines()[-1]}" for row in rows if row[0] != "ok")
                 if faults:
-                    return Soundness(faults, False, checked)
+                    return IntegrityReport(faults, False, checked)
                 checked += 1
     except sqlite3.Error as error:
         if is_damage(error):
-            return Soundness((str(error),), False, checked)
+            return IntegrityReport((str(error),), False, checked)
         # The time is over, or something passes: no free file descriptor, a locked file. The next check tells.
         if time.monotonic() < until:
             log.warning("store not checked", extra={"why": str(error)})
-        return Soundness((), False, checked)
-    return Soundness((), True, checked)
+        return IntegrityReport((), False, checked)
+    return IntegrityReport((), True, checked)
 
 
-def check_bodies(store: Store, after: int, most: int) -> tuple[Soundness, int]:
+def check_bodies(store: Store, after: int, most: int) -> tuple[IntegrityReport, int]:
     """Compare the bodies of messages with their digests, from the one that follows the id `after`.
 
     Returns
     -------
-    Soundness, int
+    IntegrityReport, int
         `complete` where these were the last ones; and the id of the last one, with which to go on.
     """
     try:
         with transaction(store.engines.reader) as connection:
             rows = connection.execute(_BODIES, {"_after": after, "_most": most}).all()
     except StoreDamaged as error:
-        return Soundness((str(error),), False), after
+        return IntegrityReport((str(error),), False), after
     faults = [fault for row in rows if (fault := _fault(row))]
-    result = Soundness(tuple(faults[:_MOST_FAULTS]), len(rows) < most, len(rows))
+    result = IntegrityReport(tuple(faults[:_MOST_FAULTS]), len(rows) < most, len(rows))
     return result, rows[-1].id if rows else after
 
 

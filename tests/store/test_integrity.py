@@ -10,15 +10,15 @@ from store_cases import claim, outcome, window
 from servotwin.errors import InvalidInput
 from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable, sqlite_file
-from servotwin.store.retention import delete_old_bodies
-from servotwin.store.soundness import (
-    Soundness,
+from servotwin.store.integrity import (
+    IntegrityReport,
     check_bodies,
     check_pages,
     message_digest,
     missing_windows,
     newest_message,
 )
+from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
@@ -47,9 +47,9 @@ def overwrite(file: Path, page: int, pages: int = 1) -> None:
 def test_a_sound_store_is_sound(store: Store) -> None:
     store.put([digested(n, b"%d" % n) for n in range(5)])
     assert check_pages(store, math.inf).faults == ()
-    assert check_bodies(store, 0, 3)[0] == Soundness((), False, 3)
+    assert check_bodies(store, 0, 3)[0] == IntegrityReport((), False, 3)
     ids = newest_message(store)
-    assert check_bodies(store, ids - 2, 3) == (Soundness((), True, 2), ids)
+    assert check_bodies(store, ids - 2, 3) == (IntegrityReport((), True, 2), ids)
 
 
 def test_twenty_pages_of_rubbish_are_found(url: str) -> None:
@@ -72,7 +72,7 @@ def test_a_body_that_changed_is_found_by_its_digest(store: Store, changed: bytes
 
 def test_a_check_ends_in_time_and_says_so(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     filled(url)
-    monkeypatch.setattr("servotwin.store.soundness._STEPS", 1)
+    monkeypatch.setattr("servotwin.store.integrity._STEPS", 1)
     store = open_store(url)
     result = check_pages(store, 0.0)
     assert (result.faults, result.complete) == ((), False)
@@ -133,7 +133,7 @@ def test_an_error_that_passes_is_no_damage(url: str, caplog: pytest.LogCaptureFi
     file = filled(url, 2)
     store = open_store(url)
     aside = file.rename(file.with_suffix(".aside"))
-    assert check_pages(store, math.inf) == Soundness((), False, 0)
+    assert check_pages(store, math.inf) == IntegrityReport((), False, 0)
     assert "store not checked" in caplog.messages
     aside.rename(file)
     assert check_pages(store, math.inf).complete

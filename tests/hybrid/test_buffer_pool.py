@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from servotwin.hybrid.stock import Stock
+from servotwin.hybrid.buffer_pool import BufferPool
 
 
 def test_memory_is_used_again_by_the_next_user_of_its_kind() -> None:
-    stock: Stock[list[int]] = Stock(most=2)
+    stock: BufferPool[list[int]] = BufferPool(most=2)
     with stock.lent("small", list) as first:
         first.append(1)
     with stock.lent("large", list) as other:
@@ -18,7 +18,7 @@ def test_memory_is_used_again_by_the_next_user_of_its_kind() -> None:
 
 
 def test_memory_that_is_lent_is_nobody_elses() -> None:
-    stock: Stock[list[int]] = Stock(most=2)
+    stock: BufferPool[list[int]] = BufferPool(most=2)
     with stock.lent("small", list) as one, stock.lent("small", list) as other:
         assert one is not other
     with stock.lent("small", list) as one, stock.lent("small", list) as other:
@@ -26,7 +26,7 @@ def test_memory_that_is_lent_is_nobody_elses() -> None:
 
 
 def test_the_oldest_memory_is_dropped_where_too_much_is_kept() -> None:
-    stock: Stock[list[int]] = Stock(most=1)
+    stock: BufferPool[list[int]] = BufferPool(most=1)
     with stock.lent("small", list) as first:
         pass
     with stock.lent("large", list):
@@ -36,7 +36,7 @@ def test_the_oldest_memory_is_dropped_where_too_much_is_kept() -> None:
 
 
 def test_memory_in_use_at_an_error_is_not_kept() -> None:
-    stock: Stock[list[int]] = Stock(most=1)
+    stock: BufferPool[list[int]] = BufferPool(most=1)
     with pytest.raises(RuntimeError), stock.lent("small", list) as first:
         raise RuntimeError
     with stock.lent("small", list) as again:

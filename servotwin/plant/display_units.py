@@ -10,7 +10,7 @@ from servotwin.plant.load import ROTARY
 from servotwin.plant.plants import Plant
 
 
-class ShownUnit(NamedTuple):
+class DisplayUnit(NamedTuple):
     """A unit of position for tables and plots.
 
     Attributes
@@ -28,20 +28,20 @@ class ShownUnit(NamedTuple):
     si: str
 
     @property
-    def small(self) -> ShownUnit:
+    def small(self) -> DisplayUnit:
         """The thousandth of this unit, for what is small beside a step."""
-        return ShownUnit("um" if self.name == "mm" else f"m{self.name}", 1e3 * self.factor, self.si)
+        return DisplayUnit("um" if self.name == "mm" else f"m{self.name}", 1e3 * self.factor, self.si)
 
     def si_of(self, value: float) -> float:
         """The value in m or rad."""
         return value / self.factor
 
 
-MILLIMETRES = ShownUnit("mm", 1e3, "m")
-DEGREES = ShownUnit("deg", 180.0 / math.pi, "rad")
+MILLIMETRES = DisplayUnit("mm", 1e3, "m")
+DEGREES = DisplayUnit("deg", 180.0 / math.pi, "rad")
 
 
-def position_unit(plant: Plant) -> ShownUnit:
+def position_unit(plant: Plant) -> DisplayUnit:
     """Unit of a plant's position."""
     return DEGREES if isinstance(plant, Axis) and plant.load.motion == ROTARY else MILLIMETRES
 

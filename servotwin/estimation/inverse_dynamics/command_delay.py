@@ -16,7 +16,7 @@ _SHIFTS = (1, 2, 3, 5, 8, 13, 21, 34, 55)  # samples
 _FINER = 4
 
 
-def said_late(recording: DriveRecording, motion: DriveMotion, band: RegressionBand) -> str:
+def delay_remark(recording: DriveRecording, motion: DriveMotion, band: RegressionBand) -> str:
     """Say that the command explains the motion far better at another time than it was logged; empty: it does not."""
     cycle = cycle_time(motion)
 

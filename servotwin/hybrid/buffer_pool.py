@@ -10,7 +10,7 @@ from typing import Generic, TypeVar
 _Memory = TypeVar("_Memory")
 
 
-class Stock(Generic[_Memory]):
+class BufferPool(Generic[_Memory]):
     """Memory that nobody uses at present, by what it is good for; the oldest is dropped.
 
     Parameters
