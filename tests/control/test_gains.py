@@ -9,7 +9,7 @@ from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, holds, with_gains, written_gains
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import answer, integrates, scaled, without_integral
+from servotwin.control.retuning import integrates, scaled, static_gain, without_integral
 from servotwin.control.running_law import RunningLaw, command_of
 from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Setting
@@ -101,10 +101,10 @@ def test_one_factor_scales_a_cascade_and_its_linear_law_alike(share: float) -> N
 
 
 def test_answer_and_integral_action_are_those_of_the_law() -> None:
-    assert answer(PID) == 4e3
-    assert answer(CASCADE) == pytest.approx(600.0)
-    assert answer(LINEAR) == pytest.approx(600.0)
-    assert answer(LINEAR.replace(gain=0.5)) == pytest.approx(300.0)
+    assert static_gain(PID) == 4e3
+    assert static_gain(CASCADE) == pytest.approx(600.0)
+    assert static_gain(LINEAR) == pytest.approx(600.0)
+    assert static_gain(LINEAR.replace(gain=0.5)) == pytest.approx(300.0)
     assert all(integrates(law) for law in LAWS[:3])
     assert not any(integrates(without_integral(law)) for law in LAWS)
 
@@ -124,7 +124,7 @@ def test_a_change_of_gains_leaves_the_command_where_it_is(
     sample = (2e-3, 5e-3, 5e-4)
     wanted = command_of(before.tick(state, *sample))
     moved = after.tick(after.take_over(before, state, *sample), *sample)
-    assert abs(command_of(moved) - wanted) <= 1e-12 * max(1.0, abs(wanted), answer(old) * 1e-2)
+    assert abs(command_of(moved) - wanted) <= 1e-12 * max(1.0, abs(wanted), static_gain(old) * 1e-2)
 
 
 def test_what_an_integral_held_fades_where_the_new_law_has_none() -> None:
