@@ -1,5 +1,6 @@
 """A twin's service in this process, or as one of its own, for tests."""
 
+import asyncio
 import contextlib
 import os
 import signal
@@ -109,3 +110,13 @@ def trusting(certificate: Path) -> ssl.SSLContext:
 def unpacked(body: bytes) -> object:
     """Decoded MessagePack."""
     return msgspec.msgpack.decode(body)
+
+
+def with_service(folder, body, service=""):
+    """Run `body(system, client)` while a twin of a new file in `folder` is served."""
+
+    async def run():
+        async with served(twin_file(folder, service)) as (system, client):
+            await body(system, client)
+
+    asyncio.run(run())

@@ -3,7 +3,7 @@
 import asyncio
 
 import pytest
-from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, served, twin_file
+from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, with_service
 
 from servotwin.messages.live import MAX_LIVE_COLUMNS, LiveColumns, Watched, decode_watched, encode_live
 from servotwin.twin_service.limits import RequestRejected
@@ -87,14 +87,6 @@ def test_few_machines_are_watched_and_few_edges_wait():
         assert await waiting is False
 
     asyncio.run(body())
-
-
-def with_service(folder, body):
-    async def run():
-        async with served(twin_file(folder)) as (system, client):
-            await body(system, client)
-
-    asyncio.run(run())
 
 
 def test_an_edge_waits_until_a_page_looks_and_then_streams(tmp_path):
