@@ -20,7 +20,7 @@ from servotwin.plant.display_units import MILLIMETRES, DisplayUnit
 
 _ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a little shorter than requested
 _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
-_ABSENT = "; where absent {:g} s on the paper's servo, and as much of another's own time"
+_ABSENT = "; where absent {:g} s on the paper's servo, scaled to the time of another"
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 
 
