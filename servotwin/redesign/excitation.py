@@ -247,7 +247,8 @@ class ExcitationPolicy:
             return Decision(replace(state, misses=0), None, f"a longer window is {state.window.value} already")
         if state.misses < self.settings.after:
             return Decision(state, None, self._missed(state))
-        why = f"{self._missed(state)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
+        longer = f"one of {s.window:g} s, with {s.pre_trigger:g} s before the move, is more informative"
+        why = f"{self._missed(state)}: {longer}"
         after = replace(state, misses=0, window=Stage.REQUESTED)
         return Decision(after, LongerWindow(s.window, s.pre_trigger), why)
 

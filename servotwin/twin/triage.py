@@ -170,7 +170,7 @@ def glance(
     if skipped:
         return _without_result(skipped, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:
-        return _without_result("the window has no theta_m, or too few samples: what to make of it, the estimator says")
+        return _without_result("the window has no theta_m, or too few samples: the estimator decides")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _without_result(state.doubt or "the motor's angle is constant")
     model = servo_for(servo)
@@ -214,7 +214,7 @@ def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSe
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
     if not result.misfit <= settings.misfit * max(usual, spread.misfit):
-        return f"{1e6 * result.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
+        return f"a residual of {1e6 * result.misfit:.3g} um, where {1e6 * state.misfit:.3g} um is usual"
     spread_of_bias = settings.deviations * math.hypot(result.bias_std, state.bias_std)
     if abs(result.bias - state.bias) > max(settings.bias_limit, spread_of_bias):
         return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"

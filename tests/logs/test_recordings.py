@@ -237,7 +237,7 @@ def test_a_clean_log_is_left_as_it_is(made):
 
 BAD = {
     "no such column": (("--motor", "moter_rad"), r"did you mean 'motor_rad'\?"),
-    "no column like it": (("--time", "time_s"), "no column is called like the motor's position; give --motor COLUMN"),
+    "no column like it": (("--time", "time_s"), "no column is named like the motor's position; give --motor COLUMN"),
     "one direction": ((), "the motor reverses 0 times in"),
     "words": ((), r"samples can be used, .* column 'motor_rad', line 2: 'slow'"),
     "empty": ((), "the file holds no row"),

@@ -9,7 +9,7 @@ import servotwin as st
 from servotwin.commissioning.edge_settings import Commissioning
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import answer, integrates, scaled
+from servotwin.control.retuning import integrates, scaled, static_gain
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.messages import Setting
@@ -124,4 +124,4 @@ def test_what_cannot_be_verified_is_refused_at_configuration(
 ) -> None:
     with pytest.raises(st.InvalidInput, match=words):
         policy_of(SCREW.replace(controller=law), TwinSettings(**changes))  # type: ignore[arg-type]
-    assert answer(law) >= 0.0
+    assert static_gain(law) >= 0.0

@@ -172,7 +172,7 @@ def test_more_left_over_than_usual_is_seen() -> None:
     case = cases(True)[0]
     loud = seen(case, case.gap, misfit=1e-6)
     assert loud.moved
-    assert "um are left over, and 1 um are usual" in loud.why
+    assert "um, where 1 um is usual" in loud.why
     assert not seen(case, case.gap, misfit=1.0).moved
 
 
