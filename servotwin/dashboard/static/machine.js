@@ -92,7 +92,7 @@ export class MachinePage {
             legend(["blue", "motor"], ["orange", "screw or gear, from the position"]), places.motor,
             legend(["blue", "command"]), places.voltage),
           element("div", {}, element("h3", {}, "Hysteresis"),
-            element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
+            element("p", { class: "soft" }, "The motor's lead over the load, against the motor's angle. Backlash opens the loop by the gap; bending between motor and encoder adds to it."),
             this.loop))),
       panel("Residual", this.residualPanel.tools, ...this.residualPanel.content),
       panel("What if", this.whatIf.tools, ...this.whatIf.content),
