@@ -31,7 +31,7 @@ from urllib.parse import SplitResult, urlsplit
 from servotwin.messages import Channel, WindowMessage, checksum, encode, pack_channel
 from servotwin.store.records import EvidenceRecord, Incoming, MessageKind, WorkResult
 from servotwin.store.store import open_store
-from servotwin.twin.evidence import plain
+from servotwin.twin.evidence_rows import plain
 
 MACHINES, WATCHERS, RATE_HZ, PAIRS, SECONDS = 1000, 50, 10.0, 12, 10.0
 SETTLE_S = 1.0

@@ -44,7 +44,7 @@ from servotwin.messages import (
 from servotwin.plant.signals import as_pieces
 from servotwin.simulation import Run
 from servotwin.twin.estimating import Estimator
-from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.twin import Twin
 

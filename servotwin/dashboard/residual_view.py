@@ -23,7 +23,7 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
 from servotwin.twin.context import described, parts_of
 from servotwin.twin.estimating import decode_window, own_fit, stated_machine
-from servotwin.twin.evidence import StoredEstimate
+from servotwin.twin.evidence_rows import StoredEstimate
 
 _LAGS, _COLUMNS = 60, 300
 """Lags of the autocorrelations, and columns of the plot of the residual."""

@@ -32,12 +32,13 @@ from servotwin.edge_process.metrics import write_metrics
 from servotwin.edge_process.monitoring import TroubleLog, log, overwrite_status, read_status, summarise, write_status
 from servotwin.edge_process.shared_samples import SampleReader
 from servotwin.edge_process.transports import exclusive_transport, link_token, live_link
+from servotwin.edge_process.twin_limits import limits_told, window_trouble
 from servotwin.errors import InvalidInput
 from servotwin.link.claim import ExclusiveTransport
 from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.session import Receiver, Sender, Session
 from servotwin.link.sqlite_outbox import SqliteOutbox
-from servotwin.messages import Acknowledge, InvalidMessage, Resend, decode, encode
+from servotwin.messages import Acknowledge, ClaimStatus, InvalidMessage, Resend, decode, encode
 from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
 
@@ -196,7 +197,7 @@ class LinkProcess:
         if self._receiver is not None:
             self._troubles.update("to the twin", self._session.trouble)
             self._troubles.update("from the twin", self._receiver.trouble)
-            self._troubles.update("windows", self._window_trouble)
+            self._troubles.update("windows", window_trouble(self._config.agent, self._twin))
         if (dropped := self._dropped_unintended()) != self._dropped:
             self._dropped = dropped
             log("windows dropped", **dropped)
@@ -279,25 +280,10 @@ class LinkProcess:
         """Reason for which something is not on the disk; empty: all is."""
         return self._status_trouble if self.outbox.flushed else self.outbox.trouble or "not written yet"
 
-    def _limits(self) -> dict[str, int]:
-        """Limits of the twin, as it has told them; 0: it has not."""
-        twin = self._transport.twin if self._transport is not None else None
-        if twin is None:
-            return {"samples_per_window": 0, "bytes_per_day": 0}
-        return {"samples_per_window": twin.samples_per_window, "bytes_per_day": twin.bytes_per_day}
-
     @property
-    def _window_trouble(self) -> str:
-        """Key of the edge's file by which the twin will refuse windows for their length; empty: there is none."""
-        twin = self._transport.twin if self._transport is not None else None
-        if twin is None or not twin.samples_per_window:
-            return ""
-        agent, most = self._config.agent, twin.samples_per_window
-        lengths = {"window_s": agent.window_s, "longest_window_s": agent.longest_window_s or 0.0}
-        for name, seconds in lengths.items():
-            if (samples := round(seconds * agent.sample_rate)) > most:
-                return f"{name} = {seconds!r} s has {samples} samples; the twin takes at most {most} and refuses longer"
-        return ""
+    def _twin(self) -> ClaimStatus | None:
+        """Answer of the twin to the claim; None: there is no twin, or it has not answered."""
+        return None if self._transport is None else self._transport.twin
 
     def _status(self) -> dict[str, Any]:
         control, box = self._control, self.outbox
@@ -320,7 +306,7 @@ class LinkProcess:
         if self._receiver is not None:
             status["up"] = {"trouble": self._session.trouble, **self._session.counts}
             status["conflict"] = self._conflict
-            status["limits"] = self._limits()
+            status["limits"] = limits_told(self._twin)
             if self._live is not None:
                 status["live"] = dict(self._live.counts)
             status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}

@@ -74,8 +74,7 @@ def run(path: str | os.PathLike[str]) -> None:
 
 
 def _run(config: EdgeConfig, path: Path) -> None:
-    connect = table.control_drive if config.role == "control" else table.supervised_drive
-    drive: Drive = connect(config.drive_table, config.folder)
+    drive = _drive_of(config, path)
     first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent)
     # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
     boot = next_boot(config.path(config.files.boots), os.urandom(8))
@@ -99,6 +98,16 @@ def _run(config: EdgeConfig, path: Path) -> None:
         for each, handler in before.items():
             signal.signal(each, handler)
         log("end", windows_left_behind=outlet.untaken)
+
+
+def _drive_of(config: EdgeConfig, path: Path) -> Drive:
+    """Make the drive of the edge's file, not connected yet; refuse probing moves that it cannot make."""
+    if config.role == "control":
+        return table.control_drive(config.drive_table, config.folder)
+    drive = table.supervised_drive(config.drive_table, config.folder)
+    if config.agent.probe is not None and not drive.can_move:
+        raise InvalidInput(f"{path}: edge.probe: this drive cannot move its reference; leave the table out")
+    return drive
 
 
 def _shared_samples(config: EdgeConfig) -> SampleMemory | None:

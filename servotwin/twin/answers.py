@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -14,15 +15,11 @@ from servotwin.messages import (
     Message,
 )
 from servotwin.messages.acts import Act, ActKind
-from servotwin.twin.evidence import (
-    ActRecord,
-    Record,
-    VerificationRecord,
-    WithdrawalRecord,
-)
+from servotwin.redesign.policy import Evidence, Redesign
+from servotwin.twin.evidence import ActRecord, Record, VerificationRecord, WithdrawalRecord
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
-from servotwin.twin.oversight import decide_act
+from servotwin.twin.oversight import decide_act, sent_again
 from servotwin.twin.state import TwinState, noted_setting
 
 # Protocol from which on an edge sends a hello for every boot, and another where it is asked for windows of every boot.
@@ -136,3 +133,16 @@ def take_verification(model: TwinModel, state: TwinState, request: VerificationR
     versions, oversight = state.versions.without_pending(), state.oversight.without_proposal()
     state = replace(state, lookups=lookups, versions=versions, triage=triage, oversight=oversight)
     return StepResult(state, (), (record, WithdrawalRecord(request, why)))
+
+
+def roll_back(model: TwinModel, state: TwinState, evidence: Evidence, act: Act) -> tuple[TwinState, Redesign]:
+    """Carry out a roll back; the machine stays held."""
+    state = replace(state, oversight=replace(state.oversight, again=None))
+    try:
+        redesign = sent_again(model.policy, evidence, act, state.known)
+    except InvalidInput as error:
+        return state, Redesign(None, math.nan, str(error))
+    if state.lookups is not None and redesign.setting is not None:
+        # The setting that failed its verification is replaced.
+        state = replace(state, lookups=replace(state.lookups, why=""))
+    return state, redesign

@@ -12,7 +12,7 @@ from servotwin.estimation.estimate import GapEstimate
 from servotwin.messages import InvalidMessage, WindowMessage
 from servotwin.twin.context import context_of, described, differences, parts_of
 from servotwin.twin.estimating import DecodedWindow, estimator_of
-from servotwin.twin.evidence import StoredEstimate, plain
+from servotwin.twin.evidence_rows import StoredEstimate, plain
 from servotwin.twin.model_registry import ServoModel
 
 

@@ -10,6 +10,7 @@ With another status a policy may still use the window's input bias and noise, wi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from msgspec.structs import replace
@@ -34,6 +35,7 @@ from servotwin.messages.acts import Act
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.answers import (
     StepResult,
+    roll_back,
     take_act,
     take_answer,
     take_fallback,
@@ -58,7 +60,7 @@ from servotwin.twin.evidence import (
 )
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
-from servotwin.twin.oversight import Proposal, sent_again
+from servotwin.twin.oversight import Proposal
 from servotwin.twin.state import TwinState, draft_update
 from servotwin.twin.triage import Glance, no_glance
 
@@ -172,11 +174,11 @@ class _Learnt(NamedTuple):
 
 
 def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: float) -> StepResult:
-    """Process a window: estimate, redesign, and request."""
+    """Glance at a window and, where that is not enough, work on it."""
     before, message, arrived = state, event.window, event.time
     if not state.is_of_other_boot(message):
         state = replace(state, versions=state.versions.noted(message.boot, message.parameter_version))
-    decoded, records, others = DecodedWindow.of(message), list[Record](), list[Message]()
+    decoded = DecodedWindow.of(message)
     state, glance = _glance(model, state, decoded, arrived)
     if state.oversight.again is not None and not event.overtaken:
         glance = None  # the setting that is sent again needs the window's estimate
@@ -186,52 +188,65 @@ def _take_window(model: TwinModel, state: TwinState, event: WindowArrival, now: 
         return StepResult(before, deferred=True)
     if not state.has_overtaken(message):
         state = replace(state, newest=(message.boot, message.start))
-    if glance is not None:
-        records.append(GlanceRecord(message, glance, decoded.tail))
-        if event.overtaken:
-            return StepResult(state, (), tuple(records))
-        if not glance.moved:
-            state, taught = _teach(model, state, decoded, arrived)
-            return StepResult(state, taught, (*records, *taught))
+    if glance is None:
+        return _work_on(model, state, event, decoded, (), now)
+    seen = (GlanceRecord(message, glance, decoded.tail),)
+    if event.overtaken:
+        return StepResult(state, (), seen)
+    if glance.moved:
+        return _work_on(model, state, event, decoded, seen, now)
+    state, taught = _teach(model, state, decoded, arrived)
+    return StepResult(state, taught, (*seen, *taught))
+
+
+def _work_on(
+    model: TwinModel, state: TwinState, event: WindowArrival, decoded: DecodedWindow, seen: Sequence[Record], now: float
+) -> StepResult:
+    """Estimate a window, redesign for it, and request more informative ones; `seen`: the record of its glance."""
+    message, arrived, others = event.window, event.time, list[Message]()
     state, learnt, learnt_records = _learn(model, state, decoded, arrived)
-    records += learnt_records
-    estimate, stale = learnt.estimate, learnt.stale
-    if not stale:
-        state, taught = _teach(model, state, decoded, arrived, None if learnt.rejection else estimate)
+    records = [*seen, *learnt_records]
+    if not learnt.stale:
+        state, taught = _teach(model, state, decoded, arrived, None if learnt.rejection else learnt.estimate)
         others, records = [*taught], [*records, *taught]
-    if decoded.step > 0.0 and not stale:
-        state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
+        if decoded.step > 0.0:
+            state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
     evidence = _evidence(model, state, learnt, arrived)
     if why_none := _OVERTAKEN if event.overtaken else event.too_late:
         redesign = Redesign(None, math.nan, why_none)
     else:
         again = state.oversight.again
-        state, redesign = _redesign(model, state, evidence, stale)
+        state, redesign = _redesign(model, state, evidence, learnt.stale)
         if again is not None and state.oversight.again is None:
             records.append(ActRecord(again, redesign.reason if redesign.setting is None else "", later=True))
-    overseen = state.oversight
-    if learnt.disturbance.known and not stale:
+    if learnt.disturbance.known and not learnt.stale:
         state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
-    if not stale and not overseen.held:
-        state, requested, decided = _ask(model, state, message, estimate, arrived, now)
+    if not learnt.stale and not state.oversight.held:
+        state, requested, decided = _ask(model, state, message, learnt.estimate, arrived, now)
         others, records = [*others, *requested], [*records, *decided]
+    result = _send_redesign(model, state, message, evidence, redesign, now)
+    return result._replace(messages=(*result.messages, *others), evidence=(*records, *result.evidence))
+
+
+def _send_redesign(
+    model: TwinModel, state: TwinState, message: WindowMessage, evidence: Evidence, redesign: Redesign, now: float
+) -> StepResult:
+    """Send the setting of a redesign, or keep it as a proposal where an engineer is asked first."""
     if redesign.setting is None:
-        return StepResult(state, tuple(others), tuple(records))
-    draft = draft_update(message, evidence, redesign, model.settings.validity)
+        return StepResult(state)
+    draft, overseen = draft_update(message, evidence, redesign, model.settings.validity), state.oversight
     if overseen.ask_first and not overseen.held:
         if not overseen.proposes_anew(message):
-            return StepResult(state, tuple(others), tuple(records))
+            return StepResult(state)
         waiting = Proposal(draft, finite(redesign.gap), VerificationRequest.of(draft, redesign, evidence))
-        state = replace(state, oversight=replace(overseen, proposal=waiting))
-        return StepResult(state, tuple(others), (*records, ProposalRecord(waiting)))
+        return StepResult(replace(state, oversight=replace(overseen, proposal=waiting)), (), (ProposalRecord(waiting),))
     versions = state.versions.with_update(draft)
     state = replace(state, versions=versions, tuned_for=None if overseen.held else float(redesign.gap))
-    sent = _send(state, versions.pending, now, tuple(records))
     assert versions.pending is not None
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
-    all_records = sent.evidence if unverified is None else (*sent.evidence, unverified)
-    return StepResult(sent.state, (*sent.messages, *others), all_records)
+    sent = _send(state, versions.pending, now, ())
+    return sent if unverified is None else sent._replace(evidence=(*sent.evidence, unverified))
 
 
 def _learn(
@@ -343,7 +358,7 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     machine, overseen = state.wear.machine, state.oversight
     if overseen.again is not None and overseen.again.version is None and not stale:
         # The fallback set is for every machine within the stated ranges, in doubt too.
-        return _send_again(model, state, evidence, overseen.again)
+        return roll_back(model, state, evidence, overseen.again)
     if machine is not None and machine.disputed and not stale:
         return state, Redesign(None, math.nan, machine.alarm or _MIXED)
     if state.other_controller >= OTHER_CONTROLLER and not stale:
@@ -352,7 +367,7 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
     if stale:
         return state, Redesign(None, math.nan, evidence.why_not)
     if overseen.again is not None:
-        return _send_again(model, state, evidence, overseen.again)
+        return roll_back(model, state, evidence, overseen.again)
     if overseen.held:
         return state, Redesign(None, math.nan, _why_held(state))
     if evidence.why_not and needs_estimate:
@@ -371,19 +386,6 @@ def _why_held(state: TwinState) -> str:
     failed = "" if state.lookups is None else state.lookups.why
     held = state.oversight.held
     return f"{held}; but {failed}: roll back to the fallback set" if failed else held
-
-
-def _send_again(model: TwinModel, state: TwinState, evidence: Evidence, act: Act) -> tuple[TwinState, Redesign]:
-    """Carry out a roll back; the machine stays held."""
-    state = replace(state, oversight=replace(state.oversight, again=None))
-    try:
-        redesign = sent_again(model.policy, evidence, act, state.known)
-    except InvalidInput as error:
-        return state, Redesign(None, math.nan, str(error))
-    if state.lookups is not None and redesign.setting is not None:
-        # The setting that failed its verification is replaced.
-        state = replace(state, lookups=replace(state.lookups, why=""))
-    return state, redesign
 
 
 def _send(state: TwinState, update: Update | None, now: float, records: tuple[Record, ...]) -> StepResult:

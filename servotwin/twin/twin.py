@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from servotwin.estimation.learning.trend import Trend
 from servotwin.messages import Acknowledge, InvalidMessage, Message, WindowMessage
-from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.state import encode_state

@@ -21,7 +21,8 @@ from servotwin.messages.acts import Act, ActKind, decode_act
 from servotwin.messages.codec import decompress
 from servotwin.store.records import EvidenceRecord, Incoming, Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin.context import context_of
-from servotwin.twin.evidence import ActRecord, failure_row, rows
+from servotwin.twin.evidence import ActRecord
+from servotwin.twin.evidence_rows import failure_row, rows
 from servotwin.twin.lookups import VerificationRequest, decode_request, encode_request
 from servotwin.twin.model import TwinModel
 from servotwin.twin.model_registry import ModelRegistry, ServoModel

@@ -15,7 +15,7 @@ from uuid import uuid4
 from servotwin import __version__
 from servotwin.messages import NAME_PATTERN
 from servotwin.store.clock_gaps import old_messages
-from servotwin.store.engine import POSTGRESQL, StoreUnavailable, sqlite_file
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
@@ -26,33 +26,26 @@ from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher
-from servotwin.twin_service.fleet_feed import FleetFeed
-from servotwin.twin_service.fleet_process import ChangeReader
-from servotwin.twin_service.fleet_reader import EdgePresence, FleetReader
+from servotwin.twin_service.fleet_reader import EdgePresence
 from servotwin.twin_service.http_acts import ActsApi
 from servotwin.twin_service.http_app import HttpApp
-from servotwin.twin_service.http_dashboard import DashboardApi
 from servotwin.twin_service.http_edge import EdgeApi, LongPolls
-from servotwin.twin_service.http_live import LiveApi
 from servotwin.twin_service.http_lockstep import LockstepApi
 from servotwin.twin_service.http_operator import OperatorApi
-from servotwin.twin_service.http_parquet import ParquetApi
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.http_webhook import WebhookApi
-from servotwin.twin_service.http_what_if import WhatIfApi
 from servotwin.twin_service.ingest import Clocks, Ingest
 from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
-from servotwin.twin_service.live_views import LiveIntake, LiveViews
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.pace import VerificationQuota, WorkPace
+from servotwin.twin_service.page_service import PageService
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.unauthenticated import UnauthenticatedLimit
-from servotwin.twin_service.what_if_process import WhatIfProcess
 from servotwin.twin_service.worker_pool import WorkerPool, pool_of
 
 log = logging.getLogger(__name__)
@@ -63,8 +56,6 @@ _LEAST_DELETED = 4096
 a mistake does not cost the past at once."""
 _UNHEALTHY_S = 60.0
 """s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
-_READERS = 2
-"""Threads that read the store for the dashboard and the operators."""
 _SOLE_OWNER = "twin"
 """Owner of all leases where one process has the store to itself: after a crash it releases its own."""
 
@@ -88,8 +79,6 @@ class TwinService:
         config = twin.service
         self.config, self.store, self.clocks = config, store, clocks or Clocks.of_machine()
         self.metrics, self.executor = Metrics(), StoreExecutor()
-        # What people read may take long: edges and acknowledgements do not wait behind it.
-        self._readers = StoreExecutor(_READERS, "readers")
         self.pool = pool or pool_of(twin)
         self.tokens = None if config.tokens is None else TokenFile(config.tokens)
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
@@ -109,8 +98,32 @@ class TwinService:
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall
         )
         has_servo = _servo_test(twin.servos)
+        self.ingest = self._make_ingest(has_servo, sequences)
+        limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
+        self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
+        self.webhook: AlarmWebhook | None = None
+        if config.webhook is not None:
+            self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
+        self.dispatcher = self._make_dispatcher()
+        self.claims = self._make_claims()
+        only_here = config.mqtt is None and not self._shared
+        presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
+        self.pages = PageService(twin, store, presence, self.claims, self.clocks, self._shared)
+        self._mqtt: MqttServer | None = None
+        if config.mqtt is not None:
+            live = self.pages.live_intake
+            handler = MqttRequestHandler(
+                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self.metrics
+            )
+            self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
+        self._tasks: list[asyncio.Task[None]] = []
+        self._vital: list[asyncio.Task[None]] = []
+        self._add_gauges()
+
+    def _make_ingest(self, has_servo: Callable[[str], bool], sequences: SequenceWatch) -> Ingest:
+        config = self.config
         slack = math.inf if config.lockstep else config.future_slack_s
-        self.ingest = Ingest(
+        return Ingest(
             put=self.watch.put,
             has_servo=has_servo,
             sample_times=SampleTimeLimiter(config.speed, slack),
@@ -121,13 +134,11 @@ class TwinService:
             samples=config.samples_per_window,
             disk=_disk_limiter(config.megabytes_per_day, self.clocks.monotonic),
         )
-        limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
-        self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
-        self.webhook: AlarmWebhook | None = None
-        if config.webhook is not None:
-            self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
-        self.dispatcher = Dispatcher(
-            store=store,
+
+    def _make_dispatcher(self) -> Dispatcher:
+        config = self.config
+        return Dispatcher(
+            store=self.store,
             executor=self.executor,
             pool=self.pool,
             commit=self.watch.commit if self.webhook is None else announced(self.watch.commit, self.webhook),
@@ -141,8 +152,11 @@ class TwinService:
             speed=min(1.0, config.speed),
             paused=lambda: bool(self.watch.fault),
         )
-        self.claims = EdgeClaims(
-            store,
+
+    def _make_claims(self) -> EdgeClaims:
+        config = self.config
+        return EdgeClaims(
+            self.store,
             self.executor,
             self.polls.evict,
             self.metrics,
@@ -152,44 +166,22 @@ class TwinService:
             samples_per_window=config.samples_per_window,
             bytes_per_day=0 if math.isinf(config.megabytes_per_day) else round(config.megabytes_per_day * 1e6),
         )
-        only_here = config.mqtt is None and not self._shared
-        presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
-        self._reader = FleetReader(store, presence, self.clocks.wall)
-        self._changes = ChangeReader(self._reader, self._readers, _readable_elsewhere(store))
-        self.feed = FleetFeed(self._changes, presence, config.watchers, self._shared)
-        self.live_views = LiveViews(self.clocks.monotonic, presence, config.watchers, config.long_polls)
-        self._live_intake = LiveIntake(self.claims, self.live_views, self.clocks.monotonic)
-        self.what_if = WhatIfProcess(twin.start, self.clocks.monotonic)
-        self._mqtt: MqttServer | None = None
-        if config.mqtt is not None:
-            handler = MqttRequestHandler(
-                self.gate, self.ingest, self.polls, self.claims, self._live_intake, self.dispatcher.wake, self.metrics
-            )
-            self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
-        self._tasks: list[asyncio.Task[None]] = []
-        self._vital: list[asyncio.Task[None]] = []
-        self._add_gauges()
 
     def http_app(self) -> HttpApp:
         """HTTP application, whose lifespan starts and stops the service."""
         bodies = BodyReader(self.config.max_body_bytes, self.config.body_timeout_s)
         edge = EdgeApi(self.gate, bodies, self.ingest, self.polls, self.claims, self.dispatcher.wake)
         operator = OperatorApi(
-            self.operators, self.store, self.executor, self._readers, self.health, self.metrics, self.clocks.wall
+            self.operators, self.store, self.executor, self.pages.readers, self.health, self.metrics, self.clocks.wall
         )
-        dashboard = DashboardApi(
-            self.operators, self.store, self._readers, self._reader, self.feed, self.config.machine_metrics
-        )
-        what_if = WhatIfApi(self.operators, self.store, self._readers, self.what_if, self.clocks.monotonic)
         acts = ActsApi(
-            self.operators, self.store, self._readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
+            self.operators, self.store, self.pages.readers, self.watch.put, self.dispatcher.wake, self.clocks.wall,
             self.clocks.monotonic,
         )  # fmt: skip
-        live = LiveApi(self.gate, self.operators, self._live_intake, self.live_views)
-        parquet = ParquetApi(self.operators, self.store, self._readers, self.what_if)
         webhook = WebhookApi(self.operators, self.config.webhook, self.clocks.monotonic)
-        parts = edge, operator, dashboard, what_if, acts, live, parquet, webhook
+        parts = edge, operator, acts, webhook
         routes = [route for part in parts for route in part.routes()]
+        routes += self.pages.routes(self.gate, self.operators)
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
@@ -204,8 +196,8 @@ class TwinService:
                 await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
-        self._spawn(self.feed.run(), vital=False)
-        self._spawn(self.what_if.run())
+        self._spawn(self.pages.feed.run(), vital=False)
+        self._spawn(self.pages.what_if.run())
         if self.webhook is not None:
             self._spawn(self.webhook.run())
             self._spawn(self._announce_damage(self.webhook))
@@ -225,8 +217,7 @@ class TwinService:
     def end_streams(self) -> None:
         """End all long polls, live views and event streams, which would otherwise keep the server from stopping."""
         self.polls.close()
-        self.feed.close()
-        self.live_views.close()
+        self.pages.end_streams()
 
     async def stop(self) -> None:
         """Commit the received messages, finish the running work, stop the workers."""
@@ -238,14 +229,13 @@ class TwinService:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        await self.what_if.stop()
-        await self._changes.stop()
+        await self.pages.stop()
         await self.pool.stop()
         await asyncio.to_thread(self.commits.close)
         with suppress(StoreUnavailable):
             if not self.watch.fault:
                 await asyncio.to_thread(self.watch.mark)
-        self._readers.close()
+        self.pages.close()
         self.executor.close()
 
     def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
@@ -354,7 +344,7 @@ class TwinService:
                 lambda: unauthenticated.open,
             )
         add("servotwin_polls", "Polls that wait for a message.", lambda: self.polls.open)
-        add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.feed.watchers)
+        add("servotwin_watchers", "Pages that watch the fleet.", lambda: self.pages.feed.watchers)
         add("servotwin_workers", "Worker processes that run.", lambda: self.pool.alive)
         damaged = "1: the store is damaged, and is not written any more."
         add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))
@@ -381,13 +371,6 @@ def _log_failure(task: asyncio.Task[None]) -> None:
     """Log the exception of a background task at once: the task is awaited only when the service stops."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.error("a task of the service ended", exc_info=error)
-
-
-def _readable_elsewhere(store: Store) -> str | None:
-    """URL with which another process reads the store, password included; None: it is in this one's memory."""
-    url = store.engines.reader.url
-    inside = url.get_backend_name() != POSTGRESQL and sqlite_file(url) is None
-    return None if inside else url.render_as_string(hide_password=False)
 
 
 def _disk_limiter(megabytes_per_day: float, monotonic: Callable[[], float]) -> RateLimiter | None:

@@ -22,7 +22,8 @@ from servotwin.messages.windows import pack_finely
 from servotwin.store.store import open_store
 from servotwin.twin.context import context_of
 from servotwin.twin.estimating import decode_window, estimator_of
-from servotwin.twin.evidence import GapEstimateRecord, rows
+from servotwin.twin.evidence import GapEstimateRecord
+from servotwin.twin.evidence_rows import rows
 from servotwin.twin.settings import TwinSettings
 
 

@@ -77,7 +77,7 @@ def test_a_wrong_gap_alone_does_not_take_the_loop_out_of_the_band() -> None:
     candidates = candidates_of(
         policy.servo, policy.uncertainty, policy.demands_within_band(), disturbed=True, noisy=False
     )
-    known = policy.uncertainty.replace(input_bias=(-policy.bias_floor, policy.bias_floor))
+    known = policy.uncertainty.replace(input_bias=(-policy.ranges.bias_floor, policy.ranges.bias_floor))
     machines = members_of(policy.servo, known, 8, 8, seed=3)
     for outcome in assess(candidates, machines, policy.simulations):
         assert outcome.tail.max() < hostile.band().error

@@ -21,6 +21,7 @@ from stubmachine import StubMachine
 import servotwin
 from servotwin.control.controller import Controller
 from servotwin.edge.guard import Limits
+from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml
@@ -331,6 +332,15 @@ def test_a_wrong_configuration_ends_with_one_sentence(edge: RunningEdge, machine
 
 
 @pytest.mark.slow
+def test_probing_moves_are_refused_where_the_drive_cannot_make_them(edge: RunningEdge) -> None:
+    agent = replace(edge.config.agent, controller=None, probe=ProbeLimits(1e-4))
+    edge.write(role="supervise", controller=None, agent=agent, drive={"kind": "replay", "log": "run.csv"})
+    edge.start()
+    assert edge.process is not None
+    assert edge.process.wait(60) == 2
+    assert "edge.toml: edge.probe: this drive cannot move its reference" in edge.log()
+
+
 def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
     edge: RunningEdge, machine: StubMachine
 ) -> None:

@@ -16,6 +16,7 @@ from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus,
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.whitened import estimate_carrying, offset
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
@@ -129,8 +130,8 @@ def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
     """However sure it is: an offset that is right does not change what is left over."""
     window, true = noisy(stretch(5.0, 1.2), 1), whitened.fit
 
-    def lost(window, servo, prior, settings, machine):
-        fitted = true(window, servo, prior, settings, machine)
+    def lost(window, servo, prior, settings, machine, first=None):
+        fitted = true(window, servo, prior, settings, machine, first)
         right = fitted.concluded()
         wrong = replace(right, gap=right.gap + DEG, rms=100.0 * right.rms)
         return fitted if settings.offset is None else SimpleNamespace(servo=servo, concluded=lambda: wrong)
@@ -179,3 +180,19 @@ def test_a_loop_reports_bias_and_reason_for_every_window():
     for estimate, redesign in zip(loop().estimates, loop().redesigns, strict=True):
         assert (redesign.setting is not None) == estimate.ok == (redesign.reason == "")
     assert {len(d.reasons) for d in loop().disturbances if not d.known} <= {1}
+
+
+def test_the_machine_s_numbers_are_fitted_once_where_one_contact_needs_the_carried_offset(monkeypatch):
+    """A fit of the gap alone decides whether the offset is needed; a window of two contacts is fitted as without an
+    offset, bit for bit."""
+    fits = []
+    monkeypatch.setattr(offset, "fit", lambda *given: fits.append(given) or whitened.fit(*given))
+    machine, known = FactorPrior.of_spreads(1e-3, 5e-3, 1e-5, 2e-3), (0.0, 0.01 * DEG)
+    assert not machine.wide
+    one = estimate_carrying(noisy(stretch(5.0, 1.2), 1), SERVO, None, SETTINGS, known, machine)
+    assert one.ok
+    assert len(fits) == 1
+    both = noisy(stretch(5.0, 2.0), 1)
+    assert estimate_carrying(both, SERVO, None, SETTINGS, known, machine) == estimate_carrying(
+        both, SERVO, None, SETTINGS, None, machine
+    )

@@ -40,7 +40,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
 from servotwin.twin.estimating import DecodedWindow
-from servotwin.twin.evidence import rows
+from servotwin.twin.evidence_rows import rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.responses import Responses, ResponseState
 from servotwin.twin.twin import Twin

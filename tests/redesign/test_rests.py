@@ -56,7 +56,7 @@ def evidence(read: list[Disturbance], feedforward: float = 0.0, tuned_for: float
 
 def friction_of(seen: Evidence) -> Range:
     """Friction for which the policy verifies, V."""
-    low, high = POLICY._friction(seen)
+    low, high = POLICY.ranges.friction(seen)
     return low / STALL, high / STALL
 
 
@@ -78,7 +78,7 @@ def test_two_rests_from_both_sides_tell_friction_and_bias(friction: float, bias:
     low, high = friction_of(seen)
     assert low == 0.0
     assert friction <= high <= 1.5 * friction
-    fed, (least, most) = POLICY._input_bias(seen)
+    fed, (least, most) = POLICY.ranges.input_bias(seen)
     assert least < bias < most
     assert fed == pytest.approx(-bias, abs=0.1 * friction)
 
@@ -89,13 +89,13 @@ def test_rests_that_are_alike_speak_of_a_bias(bias: float, count: int) -> None:
     """Nothing is fed forward yet, so that nothing of it can be left."""
     seen = evidence(rests(0.0, bias)[:count])
     assert friction_of(seen) == (0.0, 0.0)
-    fed, (least, most) = POLICY._input_bias(seen)
+    fed, (least, most) = POLICY.ranges.input_bias(seen)
     assert fed == pytest.approx(-bias, abs=1e-3)
     assert least < bias < most
 
 
 def test_a_first_rest_tells_neither() -> None:
-    fed, (least, most) = POLICY._input_bias(evidence(rests(0.0, 0.05)[:1]))
+    fed, (least, most) = POLICY.ranges.input_bias(evidence(rests(0.0, 0.05)[:1]))
     assert fed == 0.0
     assert least <= 0.0 < 0.05 <= most
 
@@ -106,10 +106,10 @@ def test_friction_after_moves_one_way_looks_like_a_bias_until_the_motor_comes_ba
     forth, back, again, _ = rests(friction, 0.0)
     one_way = evidence([forth, again])
     assert friction_of(one_way) == (0.0, 0.0)
-    assert POLICY._input_bias(one_way)[0] == pytest.approx(friction, rel=0.1)
+    assert POLICY.ranges.input_bias(one_way)[0] == pytest.approx(friction, rel=0.1)
     both = evidence([forth, again, back], feedforward=friction)
     assert friction <= friction_of(both)[1] <= 2.1 * friction
-    assert POLICY._input_bias(both)[0] == pytest.approx(0.0, abs=0.1 * friction)
+    assert POLICY.ranges.input_bias(both)[0] == pytest.approx(0.0, abs=0.1 * friction)
 
 
 def test_a_feedforward_in_force_that_is_left_at_rest_shows_friction() -> None:
@@ -132,7 +132,7 @@ def test_a_motor_whose_friction_is_told_from_its_bias_counts_before_it_is_known_
     motor = LearntMotor((0.0, 0.0, 0.054, 0.0), (*[0.0] * 10, std**2, *[0.0] * 4, std**2), 0.0)
     held, small = Disturbance(-0.054, 1e-5, 0.0, 0.3, 0.0), Disturbance(-0.01, 1e-5, 0.0, 0.3, 0.0)
     first = replace(evidence([held]), motor=motor)
-    fed, (least, most) = POLICY._input_bias(first)
+    fed, (least, most) = POLICY.ranges.input_bias(first)
     assert fed == 0.0
     assert (least, most) == pytest.approx((-1.96 * std, 1.96 * std), rel=0.01)
     assert friction_of(first) == pytest.approx((0.054 - 1.96 * std, 0.054 + 1.96 * std), rel=0.01)
@@ -147,7 +147,7 @@ def test_friction_is_learnt_in_volts_and_is_a_torque_of_the_learnt_motor() -> No
     held = replace(evidence([Disturbance(-0.054, 1e-5, 0.0, 0.3, 0.0)]), motor=motor)
     assert friction_of(held) == pytest.approx((0.054 - 1.96 * std, 0.054 + 1.96 * std), rel=0.01)
     stated = CertifiedPolicy(SERVO, Uncertainty(input_bias=(-0.1, 0.1), k_T=0.2))
-    low, high = stated._friction(held)
+    low, high = stated.ranges.friction(held)
     assert (low / STALL, high / STALL) == pytest.approx([1.1 * each for each in friction_of(held)], rel=0.01)
 
 
@@ -168,6 +168,6 @@ def test_a_window_that_tells_friction_shows_more_than_integral_action_answers_to
     rest = Disturbance(-0.06, 1e-5, 0.0, 0.3, 0.0)
     unusable = replace(ESTIMATE, status=GapStatus.UNIDENTIFIABLE)
     seen = replace(evidence([rest, rest]), estimate=unusable, motor=motor, setting=Setting(0.0, gains))
-    assert POLICY._shows_more(seen)
+    assert POLICY.ranges.shows_more(seen)
     apart = [rest, replace(rest, bias=0.06)]
-    assert not POLICY._shows_more(replace(seen, motor=None, disturbance=apart[1], rests=(apart[0].bias,)))
+    assert not POLICY.ranges.shows_more(replace(seen, motor=None, disturbance=apart[1], rests=(apart[0].bias,)))

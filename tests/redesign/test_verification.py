@@ -238,7 +238,7 @@ def test_a_learnt_motor_narrows_back_emf_and_friction_and_shows_the_bias_that_fr
     assert stated.loop is not None
     # The margins are those of machines near the learnt one, not of all of the stated range.
     assert smooth.loop.Ms_worst < stated.loop.Ms_worst
-    assert policy._friction(Evidence(estimate, rest, motor=motor(0.0, 0.045, 0.03, 5e-4))) == pytest.approx(
+    assert policy.ranges.friction(Evidence(estimate, rest, motor=motor(0.0, 0.045, 0.03, 5e-4))) == pytest.approx(
         ((0.045 - 9.8e-4) * torque, (0.045 + 9.8e-4) * torque), rel=1e-3
     )
 

@@ -10,7 +10,7 @@ import servotwin as st
 from servotwin.messages import Hello, Receipt, Setting, WindowMessage, encode
 from servotwin.store.records import EvidenceRecord, Incoming, MessageKind
 from servotwin.store.store import Store, open_store
-from servotwin.twin.evidence import plain
+from servotwin.twin.evidence_rows import plain
 from servotwin.twin.work import work
 from servotwin.twin_service.twin_file import read_twin
 

@@ -18,7 +18,8 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
 from servotwin.twin.estimating import estimator_of
-from servotwin.twin.evidence import GapEstimateRecord, RedesignRecord, rows
+from servotwin.twin.evidence import GapEstimateRecord, RedesignRecord
+from servotwin.twin.evidence_rows import rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
 from servotwin.twin.step import WindowArrival, step

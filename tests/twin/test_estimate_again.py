@@ -24,7 +24,7 @@ from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage
 from servotwin.twin import context as contexts
 from servotwin.twin.context import context_of, described, differences, parts_of
-from servotwin.twin.evidence import plain
+from servotwin.twin.evidence_rows import plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.replay import replay
 from servotwin.twin.settings import TwinSettings

@@ -13,7 +13,8 @@ from servotwin.estimation.learning.motor import BACK_EMF
 from servotwin.estimation.learning.wear import Expectation
 from servotwin.messages import WindowMessage, checksum, pack_channel
 from servotwin.plant.servo import Servo
-from servotwin.twin.evidence import MachineRecord, StoredExpectation, rows
+from servotwin.twin.evidence import MachineRecord
+from servotwin.twin.evidence_rows import StoredExpectation, rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.state import decode_state, encode_state

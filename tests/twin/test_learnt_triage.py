@@ -19,7 +19,8 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import simulate
 from servotwin.twin.estimating import decode_window
-from servotwin.twin.evidence import EvidenceLog, plain
+from servotwin.twin.evidence_log import EvidenceLog
+from servotwin.twin.evidence_rows import plain
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.triage import Glance, TriageState, glance

@@ -31,7 +31,9 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.twin.estimating import decode_window, estimator_of
-from servotwin.twin.evidence import EvidenceLog, GlanceRecord, rows
+from servotwin.twin.evidence import GlanceRecord
+from servotwin.twin.evidence_log import EvidenceLog
+from servotwin.twin.evidence_rows import rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
 from servotwin.twin.triage import Glance, Triage, TriageState, due, glance

@@ -22,7 +22,7 @@ from servotwin.messages import (
     pack_channel,
 )
 from servotwin.twin.estimating import decode_channel, decode_window
-from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin

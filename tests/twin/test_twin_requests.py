@@ -12,7 +12,7 @@ from servotwin.messages import Answer, LongerWindow, Probe, Request, RequestOutc
 from servotwin.messages.acts import Act, ActKind
 from servotwin.plant.servo import Servo
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 from servotwin.twin.twin import Twin

@@ -41,7 +41,7 @@ from servotwin.messages import (
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.twin.evidence import EvidenceLog
+from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.lookups import LookupState
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings

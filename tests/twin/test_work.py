@@ -42,7 +42,7 @@ from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin import step as stepping
 from servotwin.twin.estimating import DecodedWindow
-from servotwin.twin.evidence import MAX_STATUS, plain
+from servotwin.twin.evidence_rows import MAX_STATUS, plain
 from servotwin.twin.model_registry import ModelRegistry, ServoModel
 from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.work import ABANDON_AFTER, ONE_BY_ONE, Urgency, work

@@ -166,7 +166,7 @@ def test_events_tell_what_changed_and_resume_where_a_stream_broke(tmp_path):
         begun = position(system)
         sent = window(0)
         await client.put(place(sent), content=encode(sent), headers=MSGPACK | bearer())
-        (event,), stream = await first_events(system.feed, 1, begun)
+        (event,), stream = await first_events(system.pages.feed, 1, begun)
         assert event[b"event"] == b"rows"
         assert [row["servo"] for row in msgspec.json.decode(event[b"data"])] == ["ax-1"]
         await asyncio.to_thread(say_hello, system.store, "ax-2", 5.0)
@@ -175,17 +175,17 @@ def test_events_tell_what_changed_and_resume_where_a_stream_broke(tmp_path):
                 pass
         assert b'"servo":"ax-2"' in part
         await stream.aclose()
-        resumed, stream = await first_events(system.feed, 1, position_of(event[b"id"].decode()))
+        resumed, stream = await first_events(system.pages.feed, 1, position_of(event[b"id"].decode()))
         assert [row["servo"] for row in msgspec.json.decode(resumed[0][b"data"])] == ["ax-2"]
         await stream.aclose()
-        assert system.feed.watchers == 0
+        assert system.pages.feed.watchers == 0
 
     with_service(tmp_path, body)
 
 
 def test_watchers_are_few_and_leave_when_they_may_no_longer_read(tmp_path):
     async def body(system, client):
-        streams = [system.feed.watch(None, lambda: None) for _ in range(2)]
+        streams = [system.pages.feed.watch(None, lambda: None) for _ in range(2)]
         for stream in streams:
             await anext(stream)
         answer = await client.get("/v1/fleet/events", headers=bearer(OPERATOR))
@@ -195,13 +195,13 @@ def test_watchers_are_few_and_leave_when_they_may_no_longer_read(tmp_path):
         def revoked():
             raise RequestRejected("bad_token", "no", 401)
 
-        (event,), stream = await first_events(system.feed, 1, position(system), revoked)
+        (event,), stream = await first_events(system.pages.feed, 1, position(system), revoked)
         assert event[b"event"] == b"rows"
-        await system.feed._send(b"event: rows\n\n")
+        await system.pages.feed._send(b"event: rows\n\n")
         assert (await anext(stream)).startswith(b"event: ended")
         with pytest.raises(StopAsyncIteration):
             await anext(stream)
-        system.feed.close()
+        system.pages.feed.close()
         with contextlib.suppress(StopAsyncIteration):
             async with asyncio.timeout(5.0):
                 while True:
@@ -212,10 +212,10 @@ def test_watchers_are_few_and_leave_when_they_may_no_longer_read(tmp_path):
 
 def test_a_slow_watcher_holds_nothing_up(tmp_path):
     async def body(system, _client):
-        stream = system.feed.watch(None, lambda: None)
+        stream = system.pages.feed.watch(None, lambda: None)
         await anext(stream)
         for number in range(100):
-            await system.feed._send(b"event: %d\n\n" % number)
+            await system.pages.feed._send(b"event: %d\n\n" % number)
         async with asyncio.timeout(10.0):
             found = [part async for part in stream]
         assert found[0].startswith(b"event: links")
@@ -226,7 +226,7 @@ def test_a_slow_watcher_holds_nothing_up(tmp_path):
 
 def test_an_event_goes_to_one_watcher_at_a_time(tmp_path):
     async def body(system, _client):
-        streams = [system.feed.watch(None, lambda: None) for _ in range(30)]
+        streams = [system.pages.feed.watch(None, lambda: None) for _ in range(30)]
         for stream in streams:
             await anext(stream)
             await anext(stream)
@@ -237,7 +237,7 @@ def test_an_event_goes_to_one_watcher_at_a_time(tmp_path):
 
         waiting = [asyncio.create_task(take(stream)) for stream in streams]
         await asyncio.sleep(0)
-        sending = asyncio.create_task(system.feed._send(b"event: x\n\n"))
+        sending = asyncio.create_task(system.pages.feed._send(b"event: x\n\n"))
         await asyncio.sleep(0)
         await asyncio.sleep(0)
         assert len(got) <= 1  # whoever else waits for the loop has had a turn
@@ -251,23 +251,23 @@ def test_an_event_goes_to_one_watcher_at_a_time(tmp_path):
 
 def feed_of(system):
     """A feed that looks only when it is told to."""
-    return FleetFeed(ChangeReader(system._reader, system.executor), system._reader._presence, 2, False)
+    return FleetFeed(ChangeReader(system.pages.fleet, system.executor), system.pages.fleet._presence, 2, False)
 
 
 @pytest.mark.parametrize("fault", [StoreUnavailable("locked"), ValueError("unforeseen")])
 def test_a_look_that_fails_is_told_and_repeated_from_the_same_place(tmp_path, monkeypatch, fault):
     async def body(system, _client):
-        feed, rows = feed_of(system), system._reader.rows
+        feed, rows = feed_of(system), system.pages.fleet.rows
         await feed._changed()
         await asyncio.to_thread(say_hello, system.store, "ax-2", 5.0)
 
         def fail(_servos):
             raise fault
 
-        monkeypatch.setattr(system._reader, "rows", fail)
+        monkeypatch.setattr(system.pages.fleet, "rows", fail)
         assert b"event: trouble" in (await feed._look())[0]
         assert await feed._look() == []
-        monkeypatch.setattr(system._reader, "rows", rows)
+        monkeypatch.setattr(system.pages.fleet, "rows", rows)
         assert b'"servo":"ax-2"' in (await feed._look())[0]
         assert await feed._look() == []
 
@@ -286,7 +286,7 @@ def test_the_first_look_tells_which_edges_came(tmp_path, monkeypatch):
 def test_a_watcher_learns_at_once_which_edges_are_connected(tmp_path, monkeypatch):
     async def body(system, _client):
         monkeypatch.setattr(system.polls, "_waiting", {"ax-1": {}})
-        stream = system.feed.watch(None, lambda: None)
+        stream = system.pages.feed.watch(None, lambda: None)
         assert [part async for part in aiter_of(stream, 2)][1] == (
             b'event: links\ndata: {"connected":["ax-1"],"sole":true}\n\n'
         )
@@ -346,18 +346,18 @@ def test_a_page_that_does_not_read_counts_and_is_cut_off(tmp_path, monkeypatch, 
     async def body(system, _client):
         page = Unread()
         stream = HttpStream(
-            system.feed.watch(None, lambda: None), "text/event-stream", page.request(), system.feed.closing
+            system.pages.feed.watch(None, lambda: None), "text/event-stream", page.request(), system.pages.feed.closing
         )
         sending = asyncio.create_task(stream.send(page.send))
         if ends:
             await asyncio.sleep(0.02)
             for _ in range(40):
-                await system.feed._send(b"event: rows\n\n")  # its queue overflows
-            assert system.feed.watchers == 1
-            system.feed.close()
+                await system.pages.feed._send(b"event: rows\n\n")  # its queue overflows
+            assert system.pages.feed.watchers == 1
+            system.pages.feed.close()
         await asyncio.wait_for(page.aborted.wait(), 20.0)
         await sending
-        assert system.feed.watchers == 0
+        assert system.pages.feed.watchers == 0
 
     with_service(tmp_path, body)
 
@@ -477,7 +477,7 @@ def test_metrics_of_machines_are_off_by_default(tmp_path):
 def test_a_process_of_its_own_reads_what_changed_and_a_thread_where_it_is_lost(tmp_path):
     async def body(system, client):
         await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)
-        begun, changes = position(system), system._changes
+        begun, changes = position(system), system.pages.changes
         changes.start()
         async with asyncio.timeout(60.0):
             while changes.pid is None:

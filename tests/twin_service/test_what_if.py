@@ -21,12 +21,12 @@ def test_an_operator_s_token_simulates_in_a_process_of_its_own(tmp_path, monkeyp
         async with served(twin_file(tmp_path)) as (system, client):
             assert (await client.post(PATH, json=ASKED)).status_code == 401
             assert (await client.post(PATH, json=ASKED, headers=bearer(TOKEN))).status_code == 403
-            assert system.what_if.pid is None
+            assert system.pages.what_if.pid is None
             headers = bearer(OPERATOR)
             first = await client.post(PATH, json=ASKED, headers=headers)
             assert first.status_code == 200
             assert first.json()["tolerance"] > 0.0
-            process = system.what_if.pid
+            process = system.pages.what_if.pid
             file = await client.get("/v1/servos/ax-1/gaps.parquet", headers=headers)
             assert file.content[:4] == b"PAR1"
             missing = await client.get("/v1/servos/ax-1/windows/b/7/residual", headers=headers)
@@ -38,13 +38,13 @@ def test_an_operator_s_token_simulates_in_a_process_of_its_own(tmp_path, monkeyp
             assert other.status_code == 400
             assert "has no model" in other.json()["detail"]
             assert (await client.post(PATH, content=b"x" * 5000, headers=headers)).status_code == 413
-            assert system.what_if.pid == process
+            assert system.pages.what_if.pid == process
             # All at once: however slow the machine, more than are allowed in the time that they take.
             asked = [client.post(PATH, json=ASKED, headers=headers) for _ in range(60)]
             statuses = {answer.status_code for answer in await asyncio.gather(*asked)}
             assert 429 in statuses
             assert 500 not in statuses
-        assert system.what_if.pid is None
+        assert system.pages.what_if.pid is None
 
     asyncio.run(body())
 

@@ -20,7 +20,7 @@ from servotwin.drives.simulated import supervise, wire
 from servotwin.drives.simulated.client import SimulatedSupervised
 from servotwin.errors import InvalidInput
 from servotwin.messages import Update, decode, encode
-from servotwin.twin.evidence import plain
+from servotwin.twin.evidence_rows import plain
 
 SCENARIO = """
 servo = "paper"

@@ -49,7 +49,7 @@ class CycleStatus(Enum):
     CHATTERS = "chatters"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class CycleResult:
     """Result of a search.
 
@@ -65,6 +65,16 @@ class CycleResult:
     status: CycleStatus
     orbit: Orbit | None
     reason: str
+
+    def __repr__(self) -> str:
+        """Status, and the orbit or the reason, in one line."""
+        if self.orbit is None:
+            return f"<CycleResult {self.status.value}: {self.reason}>"
+        swing = self.orbit.highest - self.orbit.lowest
+        stable = "stable" if self.orbit.stable else "not stable"
+        return (
+            f"<CycleResult {self.status.value}: {self.orbit.frequency:.4g} Hz, {swing:.4g} from peak to peak, {stable}>"
+        )
 
 
 def limit_cycle(

@@ -79,7 +79,7 @@ class Specification:
         return candidate.Ms
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Tuning:
     """A controller, its margins and the statistics of the search.
 
@@ -100,6 +100,10 @@ class Tuning:
     margins: Margins
     candidates: int
     stable: int
+
+    def __repr__(self) -> str:
+        """Controller, crossover, margin and Ms in one line."""
+        return f"<Tuning {self.controller!r}: crossover {self.factors.wc:.4g} rad/s, Ms {self.margins.Ms:.3g}>"
 
 
 def tune(

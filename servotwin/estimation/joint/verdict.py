@@ -34,7 +34,7 @@ class Parameter:
     factor: float = math.nan
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class JointEstimate:
     """Gaps of all windows and the parameters that they share.
 
@@ -60,6 +60,11 @@ class JointEstimate:
     covariance: Array
     servo: Servo
     reasons: tuple[str, ...]
+
+    def __repr__(self) -> str:
+        """Number of windows, those that are ok, and the last gap in one line."""
+        count, right = len(self.gaps), sum(gap.ok for gap in self.gaps)
+        return f"<JointEstimate of {count} windows, {right} ok; the last: {self.gap!r}>"
 
     @property
     def gap(self) -> GapEstimate:

@@ -18,7 +18,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Int
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
 from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
-from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior
+from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior, adapted
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     contacts_seen,
@@ -91,12 +91,14 @@ class WindowFit:
         Estimate without the window; its status and reasons are final where the channels are broken.
     angle : (n,) array
         rad, of the motor.
+    broken : bool
+        A channel is broken, so that nothing is fitted.
+    second : float
+        s, one of the servo's own (`plant.scales`).
     aligned : AlignedFit, optional
         None: the channels are broken.
     learnt : LearntFit, optional
         The same with the factors that were free; None: the model was taken as it is.
-    second : float
-        s, one of the servo's own (`plant.scales`).
     """
 
     window: Window
@@ -105,9 +107,10 @@ class WindowFit:
     settings: WhitenedSettings
     blank: GapEstimate
     angle: Array
-    aligned: AlignedFit | None
+    broken: bool
+    second: float
+    aligned: AlignedFit | None = None
     learnt: LearntFit | None = None
-    second: float = 1.0
 
     def one_sided(self) -> str:
         """Reason for which the window has too little contact to show the gap; empty when it has enough."""
@@ -188,11 +191,46 @@ def fit(
     prior: float | GapEstimate | None,
     settings: WhitenedSettings | None,
     machine: FactorPrior | None = None,
+    first: WindowFit | None = None,
 ) -> WindowFit:
     """The first half of `estimate`, with the same arguments and errors.
 
-    With `machine`, the model's factors are free within that; without it the model is taken as it is.
+    With `machine`, the model's factors are free within that; without it the model is taken as it is. `first`: what
+    `fit_gap_only` returned for the same arguments.
     """
+    if machine is None:
+        return first or fit_gap_only(window, servo, prior, settings)
+    made = _unfitted(window, servo, prior, settings)
+    if made.broken:
+        return made
+    aligned, start = None if first is None else first.aligned, _start(prior)
+    learnt = learn_and_fit(
+        made.angle, window.position, window.sample_rate, servo, start, made.settings, machine, aligned
+    )
+    return replace(made, servo=learnt.servo, aligned=learnt.aligned, learnt=learnt)
+
+
+def fit_gap_only(
+    window: Window,
+    servo: Servo,
+    prior: float | GapEstimate | None,
+    settings: WhitenedSettings | None,
+    machine: FactorPrior | None = None,
+) -> WindowFit:
+    """Fit gap and place to the machine as it is known, whose own numbers stay: a small part of what `fit` costs."""
+    made = _unfitted(window, servo, prior, settings)
+    if made.broken:
+        return made
+    here = servo if machine is None else adapted(servo, machine.mean)
+    channels = made.angle, window.position, window.sample_rate
+    _, points = coarse_search(*channels, here, _start(prior), made.settings)
+    return replace(made, servo=here, aligned=align_and_fit(*channels, here, points, made.settings))
+
+
+def _unfitted(
+    window: Window, servo: Servo, prior: float | GapEstimate | None, settings: WhitenedSettings | None
+) -> WindowFit:
+    """Prepare a fit; its channels may be broken."""
     second = scales(servo).time
     settings = (settings or WhitenedSettings()).on(second)
     _check(window)
@@ -202,15 +240,8 @@ def fit(
     if broken:
         dead = any("constant" in sentence for sentence in broken)
         blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
-        return WindowFit(window, servo, prior, settings, blank, window.theta_m, None)
-    angle = motor_angle(window, servo.encoder_resolution, settings, second)
-    position, rate = window.position, window.sample_rate
-    if machine is not None:
-        learnt = learn_and_fit(angle, position, rate, servo, _start(prior), settings, machine)
-        return WindowFit(window, learnt.servo, prior, settings, blank, angle, learnt.aligned, learnt, second)
-    _, points = coarse_search(angle, position, rate, servo, _start(prior), settings)
-    aligned = align_and_fit(angle, position, rate, servo, points, settings)
-    return WindowFit(window, servo, prior, settings, blank, angle, aligned, second=second)
+    angle = window.theta_m if broken else motor_angle(window, servo.encoder_resolution, settings, second)
+    return WindowFit(window, servo, prior, settings, blank, angle, bool(broken), second)
 
 
 def _check(window: Window) -> None:

@@ -188,11 +188,15 @@ def learn_and_fit(
     prior: float,
     settings: WhitenedSettings,
     machine: FactorPrior,
+    first: AlignedFit | None = None,
 ) -> LearntFit:
     """Fit theta_m (n,) rad and position (n,) m sampled at `rate` (Hz) with the factors free within what is known.
 
     `prior` (rad) is one of the gaps from which the search begins; `machine` is what is known of the factors on `servo`.
+    `first`: fit of the same with the factors that are known, where it was made.
     """
+    if first is not None:
+        return _take_turns(theta_m, position, rate, servo, settings, machine, machine.mean, first)
     factors = machine.mean
     slow, points = coarse_search(theta_m, position, rate, adapted(servo, factors), prior, settings)
     if machine.wide:  # what is known roughly is searched before the noise is known
@@ -202,15 +206,29 @@ def learn_and_fit(
         fits = [problem.descend(np.array([*point, *factors]), (True, True)) for point in points]
         fits.sort(key=lambda one: one.cost)
         factors, points = fits[0].factors, [one.point for one in fits[:2]]
-    before: AlignedFit | None = None
-    for _ in range(_TURNS):
-        here = adapted(servo, factors)
-        before = aligned = align_and_fit(theta_m, position, rate, here, points, settings, before)
+    first = align_and_fit(theta_m, position, rate, adapted(servo, factors), points, settings)
+    return _take_turns(theta_m, position, rate, servo, settings, machine, factors, first)
+
+
+def _take_turns(
+    theta_m: Array,
+    position: Array,
+    rate: float,
+    servo: Servo,
+    settings: WhitenedSettings,
+    machine: FactorPrior,
+    factors: Array,
+    aligned: AlignedFit,
+) -> LearntFit:
+    """Fit factors, and gap and place, in turns; `aligned` is the fit with `factors`."""
+    for left in reversed(range(_TURNS)):
         whitened = aligned.whitened
         problem = FreeProblem(whitened.reduction, whitened.noise, servo, machine, aligned.largest)
         free = problem.descend(np.array([*whitened.point, *factors]), (True, True))
         still = np.abs(free.factors - factors) <= _STILL * np.sqrt(np.diag(free.covariance)[2:])
-        if np.all(still):
+        if np.all(still) or left == 0:
             break
-        factors, points = free.factors, [free.point]
-    return LearntFit(here, aligned, free, problem)
+        factors = free.factors
+        here = adapted(servo, factors)
+        aligned = align_and_fit(theta_m, position, rate, here, [free.point], settings, aligned)
+    return LearntFit(adapted(servo, factors), aligned, free, problem)

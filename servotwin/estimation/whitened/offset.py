@@ -19,7 +19,7 @@ from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
 from servotwin.estimation.whitened.channels import motor_angle
-from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
+from servotwin.estimation.whitened.estimator import WhitenedSettings, fit, fit_gap_only
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.scales import scales
@@ -58,8 +58,12 @@ def estimate_carrying(
     machine : FactorPrior, optional
         What is known of the machine's numbers; None: the model is exact.
     """
-    fitted = fit(window, servo, prior, settings, machine)
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
+    # Where the machine is known well, a fit of the gap alone tells whether contact suffices.
+    gap_only = known and not (machine is not None and machine.wide)
+    fitted = (fit_gap_only if gap_only else fit)(window, servo, prior, settings, machine)
+    if gap_only and not fitted.one_sided():
+        fitted, gap_only = fit(window, servo, prior, settings, machine, fitted), False
     # A window of one contact cannot show the gap alone, and judging it takes longer than everything else here.
     alone = None if known and fitted.one_sided() else fitted.concluded()
     if alone is not None:
@@ -73,6 +77,8 @@ def estimate_carrying(
     if helped.ok and not helped.rms > _WORSE * fitted.rms():
         slope = _slope(_columns(window, aided.servo, helped, settings))
         return replace(helped, offset=CarriedOffset(*carried, slope))
+    if gap_only:
+        fitted = fit(window, servo, prior, settings, machine, fitted)
     return _refused(alone or fitted.concluded(), helped)
 
 

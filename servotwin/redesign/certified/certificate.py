@@ -258,7 +258,7 @@ class RampResult:
     error: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Certificate:
     """A setting and its results on the simulated machines.
 
@@ -340,6 +340,12 @@ class Certificate:
     delay: int = 0
     error_per_volt: float = 0.0
     lag: float = 0.0
+
+    def __repr__(self) -> str:
+        """Setting, and what it was verified on, in one line."""
+        low, high = (math.degrees(end) for end in self.gap)
+        share = f"{100.0 * self.settled:.4g} % of {self.members} simulated machines settled"
+        return f"<Certificate of {self.setting!r}: {share}, gaps {low:.4g} .. {high:.4g} deg, Ms {self.Ms:.3g}>"
 
     def tried(self, servo: Plant) -> str:
         """Sentence on what was tried, with ranges in the units of the servo or axis that was verified."""

@@ -17,6 +17,7 @@ from servotwin.hybrid.automaton import Array
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
+from servotwin.plant.signals import check_gap
 from servotwin.redesign.certified.sobol import sobol
 
 Range = tuple[float, float]
@@ -150,6 +151,7 @@ class Uncertainty:
             low, high = getattr(self, name)
             if not low <= high:
                 raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be in order")
+        check_gap(self.gap[1], "uncertainty gap")
 
     def replace(self, **changes: object) -> Uncertainty:
         """A copy with some values changed, validated again."""

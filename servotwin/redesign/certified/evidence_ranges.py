@@ -1,0 +1,197 @@
+"""Ranges of gap, bias, friction, noise and steps that a setting must serve, from the evidence of a machine."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from servotwin.control.gains import with_gains
+from servotwin.control.retuning import integrates
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate
+from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
+from servotwin.estimation.learning.trend import Trend
+from servotwin.plant.plants import Plant
+from servotwin.redesign.certified.learnt_servo import learnt_servo
+from servotwin.redesign.certified.margins import own_static_gain
+from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
+from servotwin.redesign.dead_zones import gap_range
+from servotwin.redesign.policy import Evidence
+
+SAME_FEEDFORWARD = 7e-3
+"""Relative to `smallest_answer`: a smaller change of the feedforward is not worth an update."""
+# Relative to `smallest_answer`: the least half-width of the range of input biases, however well one is estimated; a
+# voltage at rest that differs by so much from the feedforward indicates friction, which stops the motor short of its
+# reference.
+_BIAS_FLOOR, _BIAS_MOVED = 1.5e-3, 0.035
+# Friction holds the motor at up to so much more than half the difference of two rests.
+_HOLDS = 1.25
+# Share of the voltage at rest, up to which friction and bias of the turning motor must be known to tell it apart.
+_TELLS = 0.25
+
+
+@dataclass(frozen=True)
+class EvidenceRanges:
+    """Makes the region that a setting must serve.
+
+    Parameters
+    ----------
+    servo : Servo or Axis
+        The model.
+    uncertainty : Uncertainty
+        Prior knowledge, which counts where the evidence does not tell.
+    feedforward_limit : float
+        V, either sign.
+    horizon : float
+        s for which a setting is to hold.
+    """
+
+    servo: Plant
+    uncertainty: Uncertainty
+    feedforward_limit: float
+    horizon: float
+
+    @property
+    def smallest_answer(self) -> float:
+        """V, with which the servo's own Kp answers the smallest step: the unit of small voltages."""
+        return own_static_gain(self.servo) * self.uncertainty.step[0]
+
+    @property
+    def bias_floor(self) -> float:
+        """V: least half-width of the range of input biases, however well one is estimated."""
+        return _BIAS_FLOOR * self.smallest_answer
+
+    def region(self, evidence: Evidence) -> Region:
+        """Make the region that a setting must serve, from the evidence; gaps as stated where none was estimated."""
+        estimate = self.estimate(evidence)
+        gap = self.uncertainty.gap if estimate is None else self._gap(estimate, evidence.trend)
+        feedforward, input_bias = self.input_bias(evidence)
+        friction, noise, usual = self.friction(evidence), _noise(evidence), self._usual_step(evidence)
+        return Region(gap, feedforward, input_bias, friction, noise, usual)
+
+    def estimate(self, evidence: Evidence) -> GapEstimate | None:
+        """Estimate that counts: the window's own, or the trend's where only the window's bias is known."""
+        if not evidence.unusable:
+            return evidence.estimate
+        trend, bias_known = evidence.trend, math.isfinite(evidence.disturbance.bias_std)
+        return trend.as_estimate() if bias_known and trend is not None and trend.updates > 0 else None
+
+    def _gap(self, estimate: GapEstimate, trend: Trend | None) -> Range:
+        """Range of gaps until `horizon` has passed; one window alone tells nothing about wear."""
+        low, high = gap_range(estimate)
+        grows = trend is not None and trend.updates > 1
+        return low, high + (self.horizon * max(0.0, trend.rate_interval[1]) if trend is not None and grows else 0.0)
+
+    def input_bias(self, evidence: Evidence) -> tuple[float, Range]:
+        """Feedforward (V), and the range of input biases; a bias that is not significantly off the feedforward in force
+        leaves it as it is."""
+        bias, std, friction_voltage = self._rest(evidence)
+        gains = evidence.gains
+        fed = gains.feedforward if gains is not None else 0.0
+        if not math.isfinite(std):
+            return fed, self.uncertainty.input_bias
+        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * friction_voltage)
+        if self._may_be_friction(evidence):
+            return fed, (min(bias, -fed) - spread, max(bias, -fed) + spread)
+        # Only a significant change: every new feedforward is an update at the edge.
+        if abs(bias + fed) > spread:
+            fed = min(max(-bias, -limit), limit)
+        return fed, (bias - spread, bias + spread)
+
+    def _usual_step(self, evidence: Evidence) -> Range | None:
+        """Range of the steps in the last windows (m), as far as it lies within the stated one; None: none was seen."""
+        if not evidence.steps:
+            return None
+        least, most = self.uncertainty.step
+        low, high = (min(max(size, least), most) for size in (min(evidence.steps), max(evidence.steps)))
+        return low, high
+
+    def _rest(self, evidence: Evidence) -> tuple[float, float, float]:
+        """Input bias, its standard deviation, and the voltage of a friction that only the rests show (V); 0: none.
+
+        A bias is the same at every rest. Friction stops the motor at one end of what it can hold or at the other.
+        """
+        bias, std = evidence.disturbance.bias, evidence.disturbance.bias_std
+        motor = self._motor(evidence)
+        if motor is not None and motor.friction[0] > 0.0:
+            # Friction holds a motor at rest against any voltage up to its own; only a turning one shows the bias.
+            return float(motor.mean[BIAS]), motor.std(BIAS), 0.0
+        if motor is not None or not math.isfinite(std):
+            return bias, std, 0.0
+        rests = (*evidence.rests, bias)
+        half = 0.5 * (max(rests) - min(rests))
+        if half <= 0.5 * _BIAS_MOVED * self.smallest_answer:
+            return bias, std, 0.0
+        return 0.5 * (max(rests) + min(rests)), std, half
+
+    def _may_be_friction(self, evidence: Evidence) -> bool:
+        """True at the first rest, unless the motor's motion told friction: the voltage there is of bias or friction.
+
+        Fed forward, a friction would push the wrong way after the next reversal.
+        """
+        alone = not evidence.rests and self._motor(evidence) is None
+        return alone and self.uncertainty.friction[1] == 0.0 and self._moved(evidence.disturbance.bias)
+
+    def _moved(self, voltage: float) -> bool:
+        """True where a voltage at rest is no small change."""
+        return abs(voltage) > _BIAS_MOVED * self.smallest_answer
+
+    def shows_more(self, evidence: Evidence) -> bool:
+        """True where a window tells more of machine, bias or friction than the setting in force answers to."""
+        gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
+        if gains is None or not rested or evidence.estimate.ok:
+            return False
+        if evidence.estimate.machine is not None:
+            return True
+        fed, _ = self.input_bias(evidence)
+        if abs(fed - gains.feedforward) > SAME_FEEDFORWARD * self.smallest_answer:
+            return True
+        low, high = self.friction(evidence)
+        sticks, integral = high > 0.0, integrates(with_gains(self.servo.controller, gains))
+        if sticks and self._motor(evidence) is not None and (evidence.tuned_for is None or (low > 0.0 and integral)):
+            # The fallback set is verified for the stated friction only, and an integral is not all that friction allows
+            # once it is known.
+            return True
+        return integral != sticks and len(evidence.rests) > 0
+
+    def _motor(self, evidence: Evidence) -> LearntMotor | None:
+        """The learnt motor, where it tells friction and bias well enough to act on them: to a small voltage, or to a
+        share of the largest one of the last rests, which is then of one or of the other: at a single rest they may
+        cancel."""
+        motor, enough = evidence.motor, 0.5 * _BIAS_MOVED * self.smallest_answer
+        rests = (*evidence.rests, evidence.disturbance.bias)
+        enough = max([enough, *(_TELLS * abs(rest) for rest in rests if math.isfinite(rest))])
+        known = motor is not None and NORMAL_95 * max(motor.std(FRICTION), motor.std(BIAS)) <= enough
+        return motor if known else None
+
+    def friction(self, evidence: Evidence) -> Range:
+        """Range of friction torques (N m): as learnt, otherwise as stated or as the rests show.
+
+        A voltage at rest is that of the bias, less at most the friction's either way. So rests that are alike show no
+        friction, and those that differ show at least half of their difference, unless the bias moved. A feedforward
+        stands for the rests that it was made from: what it leaves at rest counts too, but only one that is in force,
+        and that its limit did not cut.
+        """
+        disturbance, now = evidence.disturbance, evidence.gains
+        low, high = self.uncertainty.friction
+        motor, servo = self._motor(evidence), self.servo
+        learnt = learnt_servo(servo, self.uncertainty, None, evidence.motor)
+        # Learnt as a voltage: as a torque it is that of the motor on which it is simulated.
+        torque = (servo if learnt is None else learnt[0]).torque_of(1.0)
+        if motor is not None:
+            # What the model states itself is simulated anyway.
+            least, most = (max(0.0, each - servo.command_of(servo.own_friction)) for each in motor.friction)
+            # Friction that is not significant counts at most as stated.
+            return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
+        high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
+        if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
+            return low, high
+        if not 0.0 < abs(now.feedforward) < self.feedforward_limit:
+            return low, high
+        left = abs(disturbance.bias + now.feedforward)
+        return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high
+
+
+def _noise(evidence: Evidence) -> float:
+    """Measurement noise, m rms; 0 where it is unknown."""
+    noise = evidence.disturbance.noise
+    return noise if math.isfinite(noise) else 0.0
