@@ -122,7 +122,7 @@ def fetch(name: str, folder: str | os.PathLike[str] | None = None) -> Path:
     if _digest(content) != known.sha256:
         raise InvalidInput(
             f"dataset {name}: what {known.url} sent is not the published file (SHA-256 {_digest(content)[:12]}..., "
-            f"wanted {known.sha256[:12]}...); nothing was kept"
+            f"wanted {known.sha256[:12]}...); nothing was stored"
         )
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -152,7 +152,7 @@ def _downloaded(name: str, known: PublicDataset) -> bytes:
         reason = getattr(error, "reason", None) or repr(error)
         raise InvalidInput(f"dataset {name}: cannot be fetched from {known.url} ({reason})") from None
     if len(content) > known.largest:
-        raise InvalidInput(f"dataset {name}: {known.url} sent more than {known.largest} bytes; nothing was kept")
+        raise InvalidInput(f"dataset {name}: {known.url} sent more than {known.largest} bytes; nothing was stored")
     return content
 
 

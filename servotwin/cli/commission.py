@@ -302,7 +302,7 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
             f"wind-up by friction together{'' if lost.ok else f': {lost.status.value}'}"
         )
         if lost.ratio < 0.0:
-            lines.append("the motor's encoder counts against the load's: its positions are turned")
+            lines.append("the motor's encoder counts in the opposite direction of the load's: its sign was changed")
     if shaft is None:
         return lines
     delay = f"{1e3 * shaft.delay:.3g} ± {1e3 * NORMAL_95 * shaft.delay_std:.2g} ms (95 %)"

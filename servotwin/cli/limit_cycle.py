@@ -82,7 +82,7 @@ def print_limit_cycle(
         return
     console = Console()
     console.print(
-        f"{name}: gap {gap_deg:g} deg in all, {_dead_zone(tolerance_shown, unit)}, after a step of "
+        f"{name}: total gap {gap_deg:g} deg, {_dead_zone(tolerance_shown, unit)}, after a step of "
         f"{step_shown:g} {unit.name}"
     )
     _print(console, computed, unit)

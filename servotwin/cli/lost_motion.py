@@ -298,19 +298,19 @@ def headline(found: TransmissionGap, unit: str, motor_unit: str) -> str:
     """Say in one line what is known, and its status, in the markup of rich."""
     lost, status = found.lost, f"[{'green' if found.ok else 'yellow'}]{found.status.value}[/]"
     if lost.interval_motor == NOTHING_KNOWN:
-        return f"no gap is known: {status}"
+        return f"no gap is known; status: {status}"
     if math.isinf(lost.interval_motor[1]):
-        return f"lost motion > {lost.at_motor:.4g} {motor_unit} at the motor: {status}"
+        return f"lost motion > {lost.at_motor:.4g} {motor_unit} at the motor; status: {status}"
     if math.isnan(found.gap_motor):
         (low, high), most = lost.interval_load, found.interval_load[1]
         return (
             f"lost motion {lost.at_load:.4g} {unit} at the load, {lost.at_motor:.4g} {motor_unit} at the motor "
-            f"(95 %: {low:.4g} .. {high:.4g} {unit}); the gap is at most {most:.4g} {unit}: {status}"
+            f"(95 %: {low:.4g} .. {high:.4g} {unit}); the gap is at most {most:.4g} {unit}; status: {status}"
         )
     low, high = found.interval_load
     return (
         f"gap {found.gap_load:.4g} {unit} at the load, {found.gap_motor:.4g} {motor_unit} at the motor "
-        f"(95 %: {low:.4g} .. {high:.4g} {unit}): {status}"
+        f"(95 %: {low:.4g} .. {high:.4g} {unit}); status: {status}"
     )
 
 

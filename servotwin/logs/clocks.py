@@ -113,7 +113,7 @@ class LogClock:
             return np.arange(before, before + size) / self._rate
         if times is None:
             raise InvalidInput(
-                f"log {self._path}: no column is called like a time; give --time COLUMN, or --rate in Hz above 0"
+                f"log {self._path}: no column is named like a time; give --time COLUMN, or --rate in Hz above 0"
             )
         if not self._unit and before == 0:
             self._epoch = _seen_epoch(times)

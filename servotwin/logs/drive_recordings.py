@@ -261,7 +261,7 @@ def _chosen(path: Path, names: tuple[str, ...], wanted: DriveColumns) -> dict[st
         elif part in ("motor", "command"):
             what = "position of the motor" if part == "motor" else "command to the drive (torque, current, voltage)"
             raise InvalidInput(
-                f"log {path}: no column is called like the {what}; give --{part} COLUMN, one of "
+                f"log {path}: no column is named like the {what}; give --{part} COLUMN, one of "
                 f"{', '.join(names) or 'none'}"
             )
     used = list(result.values())

@@ -223,12 +223,12 @@ def _chosen(path: Path, names: Sequence[str], wanted: RecordingColumns) -> dict[
             result[part] = name
         elif part in ("motor", "load"):
             raise InvalidInput(
-                f"log {path}: no column is called like the {part}'s position; give --{part} COLUMN, one of "
+                f"log {path}: no column is named like the {part}'s position; give --{part} COLUMN, one of "
                 f"{', '.join(names) or 'none'}"
             )
     if "time" not in result and wanted.rate is None:
         raise InvalidInput(
-            f"log {path}: no column is called like a time; give --time COLUMN, one of {', '.join(names)}, or --rate in "
+            f"log {path}: no column is named like a time; give --time COLUMN, one of {', '.join(names)}, or --rate in "
             "Hz above 0"
         )
     if result["motor"] == result["load"]:

@@ -103,7 +103,7 @@ class DcMotor:
     stribeck: Annotated[float | None, _STRIBECK] = None
     limit: Annotated[
         float | None,
-        key("voltage_limit_v", above=0.0, help="Supply of the drive: it gives no more, either sign; absent: no limit."),
+        key("voltage_limit_v", above=0.0, help="Largest voltage of the drive, either sign; absent: no limit."),
     ] = None
 
     unit = "V"

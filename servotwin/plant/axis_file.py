@@ -69,18 +69,22 @@ def linear_load(
     k: Annotated[
         tuple[float, ...],
         key(
-            "stiffness_n_per_m", minimum=0.0, help="Of each to the one before; the first to the ground, 0: a free load."
+            "stiffness_n_per_m",
+            minimum=0.0,
+            help="Stiffness between each and the one before; the first is to the ground, 0: a free load.",
         ),
     ] = (0.0,),
     c: Annotated[
         tuple[float, ...],
-        key("damping_n_s_per_m", minimum=0.0, help="As the stiffness; the first is viscous friction of a free load."),
+        key(
+            "damping_n_s_per_m", minimum=0.0, help="Damping likewise; the first is the viscous friction of a free load."
+        ),
     ] = (0.0,),
     friction: Annotated[float, key("friction_n", minimum=0.0, help="Coulomb friction on the last mass.")] = 0.0,
     force: Annotated[float, key("force_n", help="Constant force on the last mass, gravity for one.")] = 0.0,
     static: Annotated[
         float | None,
-        key("static_friction_n", above=0.0, help="Friction of it at standstill; absent: the Coulomb friction."),
+        key("static_friction_n", above=0.0, help="Its friction at standstill; absent: the Coulomb friction."),
     ] = None,
     stribeck: Annotated[
         float | None,
@@ -100,7 +104,7 @@ def rotary_load(
         key(
             "stiffness_n_m_per_rad",
             minimum=0.0,
-            help="Of each to the one before; the first to the ground, 0: a free load.",
+            help="Stiffness between each and the one before; the first is to the ground, 0: a free load.",
         ),
     ] = (0.0,),
     c: Annotated[
@@ -108,14 +112,14 @@ def rotary_load(
         key(
             "damping_n_m_s_per_rad",
             minimum=0.0,
-            help="As the stiffness; the first is viscous friction of a free load.",
+            help="Damping likewise; the first is the viscous friction of a free load.",
         ),
     ] = (0.0,),
     friction: Annotated[float, key("friction_n_m", minimum=0.0, help="Coulomb friction on the last inertia.")] = 0.0,
     force: Annotated[float, key("torque_n_m", help="Constant torque on the last inertia, gravity for one.")] = 0.0,
     static: Annotated[
         float | None,
-        key("static_friction_n_m", above=0.0, help="Friction of it at standstill; absent: the Coulomb friction."),
+        key("static_friction_n_m", above=0.0, help="Its friction at standstill; absent: the Coulomb friction."),
     ] = None,
     stribeck: Annotated[
         float | None,

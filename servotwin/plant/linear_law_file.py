@@ -67,7 +67,7 @@ def linear_law(
     ] = None,
     discrete: Annotated[bool, key(help="The matrices belong to that rate.")] = False,
     names: Annotated[
-        tuple[str, ...], key(form=Form.OTHER, parse=_names, help="Of the states; x1, x2 and so on where absent.")
+        tuple[str, ...], key(form=Form.OTHER, parse=_names, help="Names of the states; x1, x2 and so on where absent.")
     ] = (),
     on: Annotated[str, key(choices=(LOAD, MOTOR), help="Measurement of the error that the dead zone looks at.")] = LOAD,
     ratio: Annotated[

@@ -91,8 +91,14 @@ class Servo:
             "list is inert (Eq 10).",
         ),
     ]
-    k: Annotated[PerMass, key("stiffness_n_per_m", table="structure", above=0.0, help="Stiffness, as the mass.")]
-    c: Annotated[PerMass, key("damping_n_s_per_m", table="structure", minimum=0.0, help="Damping, as the mass.")]
+    k: Annotated[
+        PerMass,
+        key("stiffness_n_per_m", table="structure", above=0.0, help="Stiffness of the springs, one for all or a list."),
+    ]
+    c: Annotated[
+        PerMass,
+        key("damping_n_s_per_m", table="structure", minimum=0.0, help="Damping of the springs, one for all or a list."),
+    ]
     J: Annotated[float, key("inertia_kg_m2", table="motor", above=0.0, help="Inertia of the rotor (Eqs 1-8).")]
     p: Annotated[float, key("pitch_m_per_rad", table="screw", above=0.0, help="Pitch of the lead screw.")]
     L: Annotated[float, key("inductance_h", table="motor", above=0.0, help="Inductance of the winding.")]

@@ -20,7 +20,7 @@ from servotwin.plant.display_units import MILLIMETRES, DisplayUnit
 
 _ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a little shorter than requested
 _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
-_ABSENT = "; where absent {:g} s on the paper's servo, and as much of another's own time"
+_ABSENT = "; where absent {:g} s on the paper's servo, scaled to the time of another"
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 
 
@@ -247,7 +247,8 @@ class ExcitationPolicy:
             return Decision(replace(state, misses=0), None, f"a longer window is {state.window.value} already")
         if state.misses < self.settings.after:
             return Decision(state, None, self._missed(state))
-        why = f"{self._missed(state)}: one of {s.window:g} s, {s.pre_trigger:g} s of it before the move, tells more"
+        longer = f"one of {s.window:g} s, with {s.pre_trigger:g} s before the move, is more informative"
+        why = f"{self._missed(state)}: {longer}"
         after = replace(state, misses=0, window=Stage.REQUESTED)
         return Decision(after, LongerWindow(s.window, s.pre_trigger), why)
 

@@ -113,7 +113,9 @@ def _row(record: Record) -> EvidenceRecord | None:
     """Make the row of a record, without message and context; None for a trend that does not exist yet."""
     match record:
         case GlanceRecord(window, glance, tail):
-            made = _computed("glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std), tail=tail)
+            made = _computed(
+                "glance", glance, glance.why, gap=finite(glance.gap), std=finite(glance.std_total), tail=tail
+            )
             return made._replace(version=window.parameter_version)
         case GapEstimateRecord(window, estimate, expected, tail):
             body = StoredEstimate(msgspec.Raw(plain(estimate)), StoredExpectation.of(expected), window.boot)

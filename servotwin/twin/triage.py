@@ -50,6 +50,8 @@ class TriageState(Struct, frozen=True):
         Of its middle, s.
     gap, std : float
         rad, as estimated.
+    model_std : float
+        rad, what the estimate adds to its standard deviation for errors of the model.
     bias, bias_std : float
         V; NaN and inf where the loop did not rest.
     misfit : float
@@ -71,6 +73,7 @@ class TriageState(Struct, frozen=True):
     misfit: float = math.nan
     glances: int = 0
     vain: int = 0
+    model_std: float = 0.0
 
     def doubted(self, why: str) -> TriageState:
         """Copy with a reason for which the next window is estimated in any case."""
@@ -87,8 +90,8 @@ class Glance(Struct, frozen=True, omit_defaults=True):
 
     Attributes
     ----------
-    gap, std : float
-        rad; NaN and inf where it has no result.
+    gap, std, std_total : float
+        rad; NaN and inf where it has no result. The total contains the model's errors, as those of the last estimate.
     misfit : float
         m.
     bias, bias_std : float
@@ -109,6 +112,7 @@ class Glance(Struct, frozen=True, omit_defaults=True):
     moved: bool
     why: str
     machine: MachineReading | None = None
+    std_total: float = math.inf
 
 
 def due(message: WindowMessage, state: TriageState, settings: TriageSettings) -> str:
@@ -126,7 +130,7 @@ def due(message: WindowMessage, state: TriageState, settings: TriageSettings) ->
     return ""
 
 
-def without_result(message: WindowMessage, state: TriageState) -> str:
+def reason_to_skip(message: WindowMessage, state: TriageState) -> str:
     """Reason to skip a window without a glance: the last estimates of such windows were not accepted; empty: none.
 
     Otherwise every window would be estimated of a loop that shows one contact only, with the encoder's offset unknown.
@@ -162,11 +166,11 @@ def glance(
     machine : FactorPrior, optional
         The machine's numbers over the servo's, as learnt; None: the servo is exact.
     """
-    settings, skipped = settings or TriageSettings(), without_result(message, state)
+    settings, skipped = settings or TriageSettings(), reason_to_skip(message, state)
     if skipped:
         return _without_result(skipped, moved=False)
     if window.theta_m is None or window.position.size < _SHORTEST:
-        return _without_result("the window has no theta_m, or too few samples: what to make of it, the estimator says")
+        return _without_result("the window has no theta_m, or too few samples: the estimator decides")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _without_result(state.doubt or "the motor's angle is constant")
     model = servo_for(servo)
@@ -175,7 +179,8 @@ def glance(
     fit = quick_fit(window, model, state.gap, offset, machine)
     bias, bias_std = quick_bias(window, servo)
     numbers = None if machine is None else machine.reading
-    result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "", numbers)
+    total = math.hypot(fit.std, state.model_std)
+    result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "", numbers, total)
     why = due(message, state, settings) or _unclear(fit, settings) or _moved(result, fit, state, settings)
     return replace(result, moved=bool(why), why=why or "nothing moved")
 
@@ -209,7 +214,7 @@ def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSe
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
     if not result.misfit <= settings.misfit * max(usual, spread.misfit):
-        return f"{1e6 * result.misfit:.3g} um are left over, and {1e6 * state.misfit:.3g} um are usual"
+        return f"a residual of {1e6 * result.misfit:.3g} um, where {1e6 * state.misfit:.3g} um is usual"
     spread_of_bias = settings.deviations * math.hypot(result.bias_std, state.bias_std)
     if abs(result.bias - state.bias) > max(settings.bias_limit, spread_of_bias):
         return f"the input bias moved: {result.bias:.4g} V, {state.bias:.4g} V before"
@@ -318,6 +323,7 @@ class Triage:
             time=estimate.time,
             gap=estimate.gap,
             std=estimate.std,
+            model_std=math.sqrt(max(0.0, estimate.std_total**2 - estimate.std**2)),
             bias=bias,
             bias_std=bias_std,
             misfit=fit.misfit if math.isnan(state.misfit) else max(_FADES * state.misfit, fit.misfit),

@@ -173,7 +173,7 @@ class ServiceConfig:
             above=0.0,
             infinite=True,
             help="Largest mean rate at which one servo fills the disk, in MB of messages as they are stored; of a rate "
-            "above it the edge keeps what is too much, and sends it later.",
+            "above it the edge keeps the excess, and sends it later.",
         ),
     ] = 10_000.0
     unauthenticated_connections: Annotated[

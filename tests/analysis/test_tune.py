@@ -165,8 +165,8 @@ def unstable() -> linear.LinearSystem:
     ("system", "specification", "message"),
     [
         (unstable(), (1.0, 60.0, "PI"), "has a pole at 1"),
-        (PAPER.plant(), (10.0, 60.0, "PD"), "cannot be had at 10 rad/s"),
-        (PAPER.plant(), (10.0, 60.0, "PIDF"), "is stable on this plant"),
+        (PAPER.plant(), (10.0, 60.0, "PD"), "cannot be reached at 10 rad/s"),
+        (PAPER.plant(), (10.0, 60.0, "PIDF"), "no stable PIDF controller"),
         (FrequencyData([1.0, 2.0, 3.0, 4.0], [1.0, 0.5, 0.3, 0.2]), (9.0, 60.0, "PI"), "1 to 4 rad/s"),
     ],
 )

@@ -105,7 +105,7 @@ def test_a_step_is_tried_on_the_model(open_page):
     open_machine(page, WEARING)
     panel = page.locator("[aria-label='What if']")
     panel.locator("text=Try on the model").click()
-    panel.locator("text=exactly simulated on the model").wait_for()
+    panel.locator("text=simulated exactly on the model").wait_for()
     assert panel.locator(".uplot").count() == 2
     panel.locator(".map-words", has_text="The nearest cell").wait_for()
     assert panel.locator(".map rect").count() == 121

@@ -141,7 +141,7 @@ def test_a_fit_that_the_carried_offset_spoils_is_not_used(monkeypatch):
     monkeypatch.setattr(offset, "fit", lost)
     refused = estimate_carrying(window, SERVO, None, SETTINGS, known)
     assert refused.status in REFUSED
-    assert "times as much is left over" in refused.reasons[-1]
+    assert "times the residual is left" in refused.reasons[-1]
 
 
 def test_an_offset_that_is_too_uncertain_is_not_carried():

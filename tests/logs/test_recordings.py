@@ -237,7 +237,7 @@ def test_a_clean_log_is_left_as_it_is(made):
 
 BAD = {
     "no such column": (("--motor", "moter_rad"), r"did you mean 'motor_rad'\?"),
-    "no column like it": (("--time", "time_s"), "no column is called like the motor's position; give --motor COLUMN"),
+    "no column like it": (("--time", "time_s"), "no column is named like the motor's position; give --motor COLUMN"),
     "one direction": ((), "the motor reverses 0 times in"),
     "words": ((), r"samples can be used, .* column 'motor_rad', line 2: 'slow'"),
     "empty": ((), "the file holds no row"),
@@ -283,7 +283,7 @@ def test_lost_motion_is_gap_only_where_nothing_winds_up(tmp_path, made):
         CliRunner().invoke(app, ["identify", str(path), *options]).output for options in ([], ["--stiff"])
     )
     assert re.search(
-        r"lost motion 0\.00\d+ mm .* the gap is at most 0\.005\d+ mm: lost motion", " ".join(unknown.split())
+        r"lost motion 0\.00\d+ mm .* the gap is at most 0\.005\d+ mm; status: lost motion", " ".join(unknown.split())
     )
     assert re.search(r"gap 0\.00\d+ mm at the load, .*: ok", " ".join(stiff.split()))
     both = CliRunner().invoke(app, ["identify", str(path), "--stiff", "--axis", "ball-screw"])

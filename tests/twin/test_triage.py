@@ -31,7 +31,9 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.twin.estimating import decode_window, estimator_of
+from servotwin.twin.evidence import GlanceRecord
 from servotwin.twin.evidence_log import EvidenceLog
+from servotwin.twin.evidence_rows import rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
 from servotwin.twin.triage import Glance, Triage, TriageState, due, glance
@@ -172,7 +174,7 @@ def test_more_left_over_than_usual_is_seen() -> None:
     case = cases(True)[0]
     loud = seen(case, case.gap, misfit=1e-6)
     assert loud.moved
-    assert "um are left over, and 1 um are usual" in loud.why
+    assert "um, where 1 um is usual" in loud.why
     assert not seen(case, case.gap, misfit=1.0).moved
 
 
@@ -185,6 +187,14 @@ def test_a_bias_that_moved_is_seen() -> None:
     assert moved.bias == pytest.approx(0.05, abs=5e-5)
     assert f"the input bias moved: {moved.bias:.4g} V, 0.04 V before" in moved.why
     assert not glance(message, window, SERVO, watch_of(25.0 * DEG, bias=0.049, **told), OFFSET).moved
+
+
+def test_the_range_that_a_person_sees_contains_the_model_s_errors() -> None:
+    case = cases(True)[0]
+    one = seen(case, case.gap, model_std=0.02 * DEG)
+    assert one.std_total == pytest.approx(math.hypot(one.std, 0.02 * DEG))
+    (row,) = rows([GlanceRecord(message_of(case.window), one, None)], 1, "")
+    assert row.std == one.std_total
 
 
 def test_what_is_no_measurement_of_a_gap_is_left_to_the_estimator() -> None:

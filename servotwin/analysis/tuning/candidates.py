@@ -140,8 +140,8 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
             return ControllerSearch(stable, count)
     if not possible:
         raise InvalidInput(_unreachable(name, kind, wc, margin, at))
-    where = f"{wc:g} rad/s and {math.degrees(margin):g} deg there"
-    raise InvalidInput(f"no {name} controller with its crossover at {where} is stable on this plant")
+    where = f"crossover of {wc:g} rad/s with a phase margin of {math.degrees(margin):g} deg"
+    raise InvalidInput(f"no stable {name} controller gives this plant a {where}")
 
 
 def _at_crossover(plant: Plant, wc: float) -> complex:
@@ -200,6 +200,6 @@ def _unreachable(name: str, kind: ControllerType, wc: float, margin: float, at: 
     phase = math.degrees(float(np.angle(at)))
     turns = f"by {low:g} to {high:g} deg" if high > low else "not at all"
     return (
-        f"phase margin = {math.degrees(margin):g} deg cannot be had at {wc:g} rad/s with a {name} controller: "
+        f"phase margin = {math.degrees(margin):g} deg cannot be reached at {wc:g} rad/s with a {name} controller: "
         f"the plant's phase there is {phase:.1f} deg (modulo 360), and the controller turns it {turns}"
     )

@@ -11,7 +11,7 @@ export class ActsPanel {
     Object.assign(this, { name, done, oversight: null });
     this.state = element("p", { class: "oversight", role: "status" });
     this.waiting = element("p", { class: "waiting" });
-    this.why = element("input", { type: "text", maxlength: 256, "aria-label": "Reason", placeholder: "Reason (kept with the act)" });
+    this.why = element("input", { type: "text", maxlength: 256, "aria-label": "Reason", placeholder: "Reason (stored with the act)" });
     this.version = element("select", { "aria-label": "Version to roll back to" });
     const button = (word, act, named) => element("button", { type: "button", on: { click: () => this.act(act(), named?.()) } }, word);
     this.holding = button("Hold", () => (this.oversight.held ? "release" : "hold"));
@@ -56,7 +56,7 @@ export class ActsPanel {
   async act(act, named = {}) {
     const why = this.why.value.trim();
     if (!why) {
-      setText(this.error, "Give a reason: it is kept with the act.");
+      setText(this.error, "Give a reason: it is stored with the act.");
       this.why.focus();
       return;
     }

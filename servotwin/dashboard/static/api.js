@@ -10,8 +10,8 @@ export class ApiError extends Error {
 const WORDS = {
   401: "The session has ended, or its token was revoked.",
   403: "This token may not read the fleet: it belongs to a machine.",
-  404: "The twin does not have that.",
-  429: "The twin is asked too often at the moment.",
+  404: "The twin has no such data.",
+  429: "Too many requests at the moment.",
   503: "The twin cannot read its store now.",
 };
 

@@ -81,7 +81,7 @@ export class Live {
   // A twin that hangs, and a network that is gone, end no connection.
   heard() {
     clearTimeout(this.silence);
-    this.silence = setTimeout(() => this.retry("The twin has not been heard for 40 s."), SILENT_MS);
+    this.silence = setTimeout(() => this.retry("No message from the twin for 40 s."), SILENT_MS);
   }
 
   take(event) {
@@ -114,7 +114,7 @@ export class Live {
     try {
       const { admitted } = await api.session();
       if (!admitted) this.end("The session has ended, or its token was revoked.");
-      else this.retry("The twin refuses more pages that watch.");
+      else this.retry("Too many pages watch the fleet already.");
     } catch (error) {
       if (error.status === 401 || error.status === 403) this.end(error.message);
       else this.retry(error.message);

@@ -7,11 +7,11 @@ import { positionUnit } from "./format.js";
 
 const ASK_MS = 500, IDLE_MS = 3000, SHOWN_S = 30;
 const WORDS = {
-  off: ["Off at the edge", "The edge's file does not allow it: live = true in its table [twin] would. With edges of earlier versions there is none."],
-  away: ["The edge is not connected", "The live view begins when it is."],
+  off: ["Off at the edge", "Set live = true in the table [twin] of the edge's file. Edges of earlier versions have no live view."],
+  away: ["The edge is not connected", "The live view begins when the edge connects."],
   waiting: ["Waiting", "The edge has been asked; nothing has come yet."],
-  live: ["Live", "Least and greatest sample of each column. The edge streams while a page like this one is looked at."],
-  stale: ["Stale", "Nothing has come for a while: what is shown is old."],
+  live: ["Live", "Least and greatest sample of each column. The edge streams while somebody looks at such a page."],
+  stale: ["Stale", "No new data for a while: the curves are old."],
   failed: ["Unknown", ""],
   asking: ["Waiting", "The twin is being asked."],
 };

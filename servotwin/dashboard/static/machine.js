@@ -66,7 +66,7 @@ export class MachinePage {
     this.rest = element("p", { class: "rest", role: "status" });
     this.loop = element("div", { class: "hysteresis" });
     this.chain = element("div", { class: "scroll list", tabindex: "0", role: "region", "aria-label": "Updates" });
-    this.proof = element("div", { class: "list", tabindex: "0", role: "region", "aria-label": "Verification" });
+    this.verification = element("div", { class: "list", tabindex: "0", role: "region", "aria-label": "Verification" });
     this.events = element("div", { class: "scroll list low", tabindex: "0", role: "region", "aria-label": "Events" });
     this.blank = element("p", { class: "empty", hidden: true });
     const plot = (place, options) => {
@@ -92,7 +92,7 @@ export class MachinePage {
             legend(["blue", "motor"], ["orange", "screw or gear, from the position"]), places.motor,
             legend(["blue", "command"]), places.voltage),
           element("div", {}, element("h3", {}, "Hysteresis"),
-            element("p", { class: "soft" }, "The motor's angle ahead of the load's, over the motor's angle. Backlash opens the loop by the gap; what bends between motor and encoder adds to it."),
+            element("p", { class: "soft" }, "The motor's lead over the load, against the motor's angle. Backlash opens the loop by the gap; bending between motor and encoder adds to it."),
             this.loop))),
       panel("Residual", this.residualPanel.tools, ...this.residualPanel.content),
       panel("What if", this.whatIf.tools, ...this.whatIf.content),
@@ -101,7 +101,7 @@ export class MachinePage {
         element("div", { class: "two" }, places.tail, places.residual)),
       panel("Updates", [], this.chain),
       panel("Oversight", [], ...this.acts.content),
-      panel("Behind the last update", [], this.proof),
+      panel("Behind the last update", [], this.verification),
       panel("Events", [], this.events));
     this.head = element("div", { class: "head" }, element("h1", {}, name), element("a", { href: api.reportFile(name), download: true }, "Report to mail"), element("a", { href: "#/" }, "All machines"));
     this.tilesList = element("dl", { class: "facts" },
@@ -242,7 +242,7 @@ export class MachinePage {
     this.residualPlot.options.yLabel = `Residual, rms (${residual[0]})`;
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
     this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
-    this.proof.replaceChildren(simulated(this.updates, unit));
+    this.verification.replaceChildren(simulated(this.updates, unit));
     this.acts.show(this.oversight, this.gaps.versions, unit);
     this.events.replaceChildren(eventList(this.happened));
     await this.chooseWindows();

@@ -29,7 +29,7 @@ export class ResidualPanel {
       element("div", {}, legend(["orange", "of the residual"], ["blue", "after the noise model"], ["green dash", "95 % of white noise"]), places[1]));
     this.tools = [this.button];
     this.content = [
-      element("p", { class: "soft" }, "What the fit of a window leaves: noise alone, if the model is right. The window is fitted again from what is stored."),
+      element("p", { class: "soft" }, "The residual of a window's fit: noise alone, if the model is right. The twin fits the stored window again."),
       this.words, this.error, this.body,
     ];
   }

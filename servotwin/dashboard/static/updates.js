@@ -76,7 +76,7 @@ export function simulated(traces, unit) {
   const redesign = trace.evidence.find((one) => one.kind === "redesign" && one.body?.certificate);
   const tried = [
     `${verification.members} machines, drawn at random from what is stated and learnt, were simulated with this setting; ${percent(verification.settled)} of them settled.`,
-    verification.confidence ? `Of such machines at least ${percent(verification.settled_least)} settle, at a confidence of ${percent(verification.confidence)}.` : null,
+    verification.confidence ? `At least ${percent(verification.settled_least)} of such machines settle (confidence ${percent(verification.confidence)}).` : null,
     `Largest overshoot ${percent(verification.overshoot)} of the step, largest error at the end ${brief(verification.tail * unit.factor)} ${unit.name}.`,
     verification.Ms_worst ? `Peak of the sensitivity ${brief(verification.Ms)} on the model, ${brief(verification.Ms_worst)} on the worst plant; least phase margin ${brief(verification.phase_margin_worst * DEG)} deg.` : null,
     `${verification.looked_at} settings were simulated until this one was chosen.`,

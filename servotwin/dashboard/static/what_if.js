@@ -196,5 +196,5 @@ function told(found, unit) {
     : found.last_motion > 0.02 * found.step
       ? `It does not come to rest: in the last quarter it still moves by ${size(found.last_motion)}.`
       : `It does not settle within ${brief(found.duration)} s.`;
-  return `A step of ${size(found.step)} from rest, exactly simulated on the model, without noise and friction that the model does not state. ${end} Overshoot ${brief(found.overshoot * 100)} %, largest error in the last quarter ${size(found.last_error)}. Without the gap the loop's sensitivity peak is ${brief(found.sensitivity_peak)}.`;
+  return `A step of ${size(found.step)} from rest, simulated exactly on the model, without noise and without friction beyond the model's. ${end} Overshoot ${brief(found.overshoot * 100)} %, largest error in the last quarter ${size(found.last_error)}. Without the gap the loop's sensitivity peak is ${brief(found.sensitivity_peak)}.`;
 }

@@ -66,9 +66,9 @@ def check_motion(recording: DriveRecording) -> None:
     place, usual = int(np.argmax(np.abs(steps))), float(np.quantile(np.abs(steps), _FAST))
     if abs(steps[place]) > _JUMP * max(usual, recording.resolution):
         raise InvalidInput(
-            f"{recording.source}: {(place + 1) / recording.rate:.4g} s after its begin the position jumps by "
-            f"{steps[place]:+.3g} {unit}, and else by {usual:.3g} {unit} at most from sample to sample: the encoder "
-            "slipped, its unit changes, or two logs were joined; give each part by itself"
+            f"{recording.source}: {(place + 1) / recording.rate:.4g} s after its start the position jumps by "
+            f"{steps[place]:+.3g} {unit}, and otherwise by at most {usual:.3g} {unit} from sample to sample: the "
+            "encoder slipped, its unit changes, or two logs were joined; give each part by itself"
         )
 
 

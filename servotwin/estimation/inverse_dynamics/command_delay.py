@@ -40,7 +40,7 @@ def delay_remark(recording: DriveRecording, motion: DriveMotion, band: Regressio
         return ""
     sense = "later" if best > 0 else "earlier"
     return (
-        f"the command explains the motion best {1e3 * abs(best) / recording.rate:.3g} ms {sense} than it was logged: "
-        f"{100.0 * tried[best]:.2g} % of it are left then instead of {100.0 * now:.2g} %, so command and position are "
-        "not of one time, and the parameters are off; record both on one clock"
+        f"the command explains the motion best {1e3 * abs(best) / recording.rate:.3g} ms {sense} than it was logged "
+        f"(all but {100.0 * tried[best]:.2g} % of it, instead of {100.0 * now:.2g} %): command and position have "
+        "different clocks, and the parameters are off; record both on one clock"
     )

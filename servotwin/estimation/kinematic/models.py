@@ -192,7 +192,7 @@ def trials(comparisons: Sequence[ModelScore]) -> tuple[ModelTrial, ...]:
         best = each if gain.enough else best
     without = comparisons[-1]
     needed = best.rms < without.rms
-    said.append(f"{'a gap is needed' if needed else 'no gap is needed'}: {_gain(without, best).said(without)} with one")
+    said.append(f"{'a gap is needed' if needed else 'no gap is needed'}; with one {_gain(without, best).said(without)}")
     return tuple(
         ModelTrial(each.model.name, each.gap, each.rms, words) for each, words in zip(comparisons, said, strict=True)
     )

@@ -105,7 +105,7 @@ def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
         # A load that hunts spoils the fit; no gap that it takes up is larger than the largest lead.
         high = max(high, 3.0 * fit.left, fit.reach, *(gap + fit.half for gap in fit.simpler.values()))
         return KinematicVerdict(
-            GapStatus.UNIDENTIFIABLE, (0.0, high), (f"no gap can be told from none: at most {high:.3g} {unit}",)
+            GapStatus.UNIDENTIFIABLE, (0.0, high), (f"the gap cannot be told from none: at most {high:.3g} {unit}",)
         )
     reasons = _doubts(fit, unit)
     if not reasons and not fit.differs:

@@ -49,16 +49,29 @@ class LearningSettings:
     ] = 0.01
     k_floor: Annotated[
         float,
-        key("k_floor_percent", above=0.0, help="No number of windows tells the stiffness over the masses better."),
+        key(
+            "k_floor_percent",
+            above=0.0,
+            help="Smallest standard deviation of stiffness over mass, however many windows.",
+        ),
     ] = 2e-4
     c_floor: Annotated[
-        float, key("c_floor_percent", above=0.0, help="No number of windows tells the damping over the masses better.")
+        float,
+        key(
+            "c_floor_percent", above=0.0, help="Smallest standard deviation of damping over mass, however many windows."
+        ),
     ] = 1e-3
     pitch_floor: Annotated[
-        float, key("pitch_floor_percent", above=0.0, help="No number of windows tells the pitch better.")
+        float,
+        key("pitch_floor_percent", above=0.0, help="Smallest standard deviation of the pitch, however many windows."),
     ] = 1e-4
     ratio_floor: Annotated[
-        float, key("mass_ratio_floor_percent", above=0.0, help="No number of windows tells the mass ratio better.")
+        float,
+        key(
+            "mass_ratio_floor_percent",
+            above=0.0,
+            help="Smallest standard deviation of the mass ratio, however many windows.",
+        ),
     ] = 1e-3
     motor: Annotated[
         float,
@@ -66,7 +79,7 @@ class LearningSettings:
             "motor_percent",
             above=0.0,
             below=1.0,
-            help="Least standard deviation of the motor's lag (J R / k_T) before any window.",
+            help="Smallest standard deviation of the motor's lag (J R / k_T) before any window.",
         ),
     ] = 0.05
     motor_drift: Annotated[
@@ -75,11 +88,15 @@ class LearningSettings:
     ] = 0.005
     motor_floor: Annotated[
         float,
-        key("motor_floor_percent", above=0.0, help="No number of windows tells the motor's back EMF and lag better."),
+        key(
+            "motor_floor_percent",
+            above=0.0,
+            help="Smallest standard deviation of the motor's back EMF and lag, however many windows.",
+        ),
     ] = 1e-3
     restart_after: Annotated[
         int,
-        key(minimum=1, help="So many windows in a row that agree on other numbers mean that the machine is another."),
+        key(minimum=1, help="Number of windows in a row that must agree on other numbers to replace the learnt ones."),
     ] = 3
 
     def __post_init__(self) -> None:

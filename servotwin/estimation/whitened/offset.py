@@ -86,7 +86,7 @@ def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
     """Return the estimate of the window alone, with the reason for not using the other."""
     if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH:
         return alone
-    worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times as much is left over"
+    worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times the residual is left"
     return replace(alone, reasons=(*alone.reasons, worse))
 
 

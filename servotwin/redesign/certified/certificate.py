@@ -131,8 +131,8 @@ class Demands:
             "come on top.",
         ),
     ] = 0.1
-    beyond: Annotated[Beyond, key(help="Ranges that nobody stated, in which a setting must settle too.")] = field(
-        default_factory=Beyond
+    beyond: Annotated[Beyond, key(help="Ranges outside of the stated ones, in which a setting must settle too.")] = (
+        field(default_factory=Beyond)
     )
     velocity_feedforward: Annotated[
         bool,

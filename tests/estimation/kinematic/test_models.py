@@ -30,7 +30,7 @@ def test_each_model_is_told_with_what_speaks_for_it(scores):
     assert simplest == "the simplest"
     assert taken.startswith("taken: 24.8 % of the square error of rigid (")
     assert left.startswith("not taken: 99.8 % of the square error of lag")
-    assert without.startswith("a gap is needed: 11.1 % of the square error of no gap, lag (")
+    assert without.startswith("a gap is needed; with one 11.1 % of the square error of no gap, lag (")
 
 
 def test_where_no_gap_predicts_as_well_that_is_said(scores):
