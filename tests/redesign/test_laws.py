@@ -104,7 +104,7 @@ def test_a_rest_without_friction_is_news_only_where_something_integrates(integra
     estimate = GapEstimate(0.0, 1.0, 1.0, (0.0, 1.0), GapStatus.UNIDENTIFIABLE, 1.0)
     rest = Disturbance(0.0, 1e-6, 0.0, 0.3, 0.0)
     seen = Evidence(estimate, rest, None, Setting.of(0.0, gains_of(law)), 0.01, rests=(0.0,))
-    assert policy._shows_more(seen) == integrates(law)
+    assert policy.ranges.shows_more(seen) == integrates(law)
 
 
 @pytest.mark.parametrize(
