@@ -12,7 +12,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
-from servotwin.estimation.kinematic.wind_up import ANGLES
+from servotwin.estimation.kinematic.travel import ANGLES
 from servotwin.logs.cleaning import OUT_OF_ORDER, SAME_TIME, Cleaned
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.columns import LogColumns

@@ -18,7 +18,8 @@ from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side
-from servotwin.estimation.kinematic.wind_up import TransmissionGap, units_of
+from servotwin.estimation.kinematic.travel import units_of
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, travel_of_machine
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
@@ -166,7 +167,7 @@ def with_dynamics(recording: EncoderRecording, found: TransmissionGap, machine: 
     """
     if found.ok or found.status is GapStatus.LOWER_BOUND:
         return found
-    known = None if machine is None else load_of(machine, units_of(recording, machine)[1])
+    known = None if machine is None else load_of(machine, units_of(recording, travel_of_machine(machine))[1])
     single = known if known is None else replace(known, links=ONE_MASS)
     driven = gap_of_driven_load(recording, found.lost, single)
     if driven.gap is None and known is not None and len(known.links.masses) > 1:

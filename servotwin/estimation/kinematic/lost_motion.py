@@ -126,6 +126,19 @@ class LostMotion:
         low, high = (abs(self.ratio) * (gap + self.load_spread * (end - gap)) for end in interval)
         return (max(low, 0.0), high)
 
+    def with_load_times(self, scale: float) -> LostMotion:
+        """The same in a unit of the load that is `scale` times smaller."""
+        return replace(
+            self,
+            ratio=scale * self.ratio,
+            rms=scale * self.rms,
+            comparisons=tuple(
+                each._replace(rms=scale * each.rms, squares=scale**2 * each.squares) for each in self.comparisons
+            ),
+            local=tuple(each._replace(position=scale * each.position) for each in self.local),
+            curves=None if self.curves is None else self.curves.with_load_times(scale),
+        )
+
     @property
     def ok(self) -> bool:
         return self.status is GapStatus.OK
