@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from servotwin.estimation.driven_load.estimate import swings, with_dynamics
+from servotwin.estimation.driven_load.flanks import with_forces
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within
@@ -28,7 +29,7 @@ def gap_of_recording(
     lost : LostMotion
         Of that recording, without dynamics.
     machine : Servo or Axis, optional
-        Takes its wind-up off; a fit without dynamics must also be right on a simulation of it.
+        Takes its wind-up off, and doubts a fit without dynamics that its load's forces contradict.
     stiff : bool
         Instead of a machine: nothing winds up.
     dynamics : bool
@@ -44,7 +45,7 @@ def gap_of_recording(
     if machine is None:
         found = gap_within(lost, 0.0 if stiff else None)
     else:
-        found = gap_of_machine(recording, lost, machine)
+        found = with_forces(recording, gap_of_machine(recording, lost, machine), machine)
     if dynamics or swings(found):
         tell("dynamics of the load")
         found = with_dynamics(recording, found, machine)

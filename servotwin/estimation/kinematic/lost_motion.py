@@ -334,7 +334,7 @@ def _answer(
             rms=float(np.sqrt(np.mean(residual**2))) / abs(ratio),
             of_none=(best.rms / comparisons[-1].rms) ** 2 if comparisons[-1].rms else 1.0,
             accelerated=INERTIA in best.model.used,
-            lead=_lead(prepared, best),
+            lead=_lead(prepared),
             reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),
         ),
         recording.motor_unit,
@@ -359,9 +359,9 @@ def _answer(
     )
 
 
-def _lead(prepared: Regression, best: ModelScore) -> float:
+def _lead(prepared: Regression) -> float:
     usual = float(np.median(np.diff(prepared.recording.time)))
-    return -prepared.lag if INERTIA in best.model.used and prepared.lag < -_SKEW * usual else 0.0
+    return -prepared.lag if prepared.lag < -_SKEW * usual else 0.0
 
 
 def _no_gap() -> LostMotion:
