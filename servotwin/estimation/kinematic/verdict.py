@@ -148,8 +148,8 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
         )
     if fit.lead > 0.0:
         reasons.append(
-            f"the load would be {1e3 * fit.lead:.3g} ms ahead of the motor: its inertia drives it, or the motor's column "
-            "is late; if you know that it is, shift it by so much"
+            f"the load would be {1e3 * fit.lead:.3g} ms ahead of the motor: its inertia drives it, or the motor's "
+            "column is late; if you know that it is, shift it by so much"
         )
     for name, gap in fit.simpler.items():
         # What a swinging load does at a reversal is no proof of a gap, nor against one; a lag shows at other speeds.
