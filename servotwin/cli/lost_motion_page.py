@@ -44,7 +44,8 @@ def _draw_reversals(axes: Axes, lost: LostMotion, unit: str) -> None:
     gaps = [each.gap * abs(lost.ratio) for each in lost.local]
     axes.plot([each.position for each in lost.local], gaps, "o", markersize=3.0, color=style.BLUE)
     _say_unless(axes, bool(lost.local))
-    axes.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, None))
+    most = max([*gaps, high if np.isfinite(high) else 0.0])
+    axes.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, 1.1 * most or None))
 
 
 def _draw_left(axes: Axes, lost: LostMotion, unit: str) -> None:
