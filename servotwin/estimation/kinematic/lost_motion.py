@@ -229,7 +229,7 @@ def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
         if _alternates(values):
             raise InvalidInput(
                 f"{source}: the {part}'s position jumps to and fro from sample to sample: two machines by turns in one "
-                "log; give each by itself"
+                "log, give each by itself; or one that hunts at half the sample rate, record it faster"
             )
     if not reach > 2.0 * least:
         raise InvalidInput(
