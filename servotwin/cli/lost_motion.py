@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -76,7 +76,7 @@ def show(
     for path in logs:
         with console.status(path.name) as status:
             tell = partial(_tell, status, path.name)
-            log = read_recording(path, columns, lambda samples, tell=tell: tell(f"{samples:,} samples read"))
+            log = read_recording(path, columns, partial(_tell_samples, tell))
             tell("models")
             recording, lost = log.recording, estimate_lost_motion(log.recording)
             if travel is not None:
@@ -213,6 +213,10 @@ def _said(wear: _Wear | str, unit: str) -> str:
         f"wear from {_iso(wear.begin)[:10]} to {_iso(wear.end)[:10]}: {wear.quantity} {wear.growth.per_year:+.4g} "
         f"{unit} per year (95 %: {low:+.4g} .. {high:+.4g}), in {wear.logs} logs"
     )
+
+
+def _tell_samples(tell: Callable[[str], object], samples: int) -> None:
+    tell(f"{samples:,} samples read")
 
 
 def _tell(status: Any, name: str, what: str) -> None:
