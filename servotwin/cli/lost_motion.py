@@ -22,7 +22,7 @@ from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
-from servotwin.estimation.kinematic.travel import Travel, in_stated_unit
+from servotwin.estimation.kinematic.travel import StatedTravel, in_stated_unit
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
@@ -48,7 +48,7 @@ def show(
     dates: str | None = None,
     stiff: bool = False,
     dynamics: bool = False,
-    travel: Travel | None = None,
+    travel: StatedTravel | None = None,
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 

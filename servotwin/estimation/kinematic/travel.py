@@ -26,7 +26,7 @@ LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "cm": 1e-2
 _RATIO, _RATIO_OF_SWINGING = 0.05, 0.25
 
 
-class Travel(NamedTuple):
+class StatedTravel(NamedTuple):
     """Travel of the load per radian of the motor, m, of a rotary load rad.
 
     Attributes
@@ -47,7 +47,7 @@ class Travel(NamedTuple):
         return ANGLES if self.rotary else LENGTHS
 
 
-def stated_travel(lead_mm: float | None, ratio: float | None) -> Travel | None:
+def stated_travel(lead_mm: float | None, ratio: float | None) -> StatedTravel | None:
     """Travel by a lead (mm per turn of the motor) or a gear ratio; None: neither is given.
 
     Raises
@@ -61,11 +61,11 @@ def stated_travel(lead_mm: float | None, ratio: float | None) -> Travel | None:
         if value is not None and not (math.isfinite(value) and value > 0.0):
             raise InvalidInput(f"{name} {value!r}: must be positive and finite")
     if lead_mm is not None:
-        return Travel(lead_mm * 1e-3 / (2.0 * math.pi), False, "--lead-mm")
-    return None if ratio is None else Travel(1.0 / ratio, True, "--ratio")
+        return StatedTravel(lead_mm * 1e-3 / (2.0 * math.pi), False, "--lead-mm")
+    return None if ratio is None else StatedTravel(1.0 / ratio, True, "--ratio")
 
 
-def check_travel(recording: EncoderRecording, lost: LostMotion, travel: Travel) -> None:
+def check_travel(recording: EncoderRecording, lost: LostMotion, travel: StatedTravel) -> None:
     """Refuse a recording whose load moves otherwise than is stated.
 
     Raises
@@ -83,7 +83,7 @@ def check_travel(recording: EncoderRecording, lost: LostMotion, travel: Travel) 
         )
 
 
-def units_of(recording: EncoderRecording, travel: Travel) -> tuple[float, float]:
+def units_of(recording: EncoderRecording, travel: StatedTravel) -> tuple[float, float]:
     """SI units in one unit of the motor and of the load.
 
     Raises
@@ -101,7 +101,7 @@ def units_of(recording: EncoderRecording, travel: Travel) -> tuple[float, float]
 
 
 def in_stated_unit(
-    recording: EncoderRecording, lost: LostMotion, travel: Travel
+    recording: EncoderRecording, lost: LostMotion, travel: StatedTravel
 ) -> tuple[EncoderRecording, LostMotion]:
     """Recording and lost motion with the load in a unit that the stated travel gives; one that has a unit is checked.
 

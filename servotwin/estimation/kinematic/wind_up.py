@@ -9,7 +9,7 @@ from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial, trials
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.estimation.kinematic.travel import Travel, check_travel, units_of
+from servotwin.estimation.kinematic.travel import StatedTravel, check_travel, units_of
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.shown import position_unit
@@ -137,5 +137,5 @@ def gap_of_machine(recording: EncoderRecording, lost: LostMotion, machine: Plant
     return gap_within(lost, off, recording.motor_unit)
 
 
-def travel_of_machine(machine: Plant) -> Travel:
-    return Travel(machine.p, position_unit(machine).si == "rad", "--axis")
+def travel_of_machine(machine: Plant) -> StatedTravel:
+    return StatedTravel(machine.p, position_unit(machine).si == "rad", "--axis")
