@@ -23,10 +23,10 @@ from benchmarks.axis_presets import DUTIES
 from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import swings, with_dynamics
+from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
-from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within, wind_up
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, wind_up
 from servotwin.logs.recordings import read_recording
 from servotwin.plant.axis import Axis
 from servotwin.plant.display_units import position_unit
@@ -165,13 +165,10 @@ def _answered(case: LogCase, path: Path, table: Array) -> _Answered:
     in_si = replace(recording, load_unit=position_unit(case.plant).si)
     machine = Axis.preset(case.name)
     try:
-        known: TransmissionGap | str = gap_of_machine(in_si, lost, machine)
+        known: TransmissionGap | str = gap_of_recording(in_si, lost, machine)
     except InvalidInput as error:
         known = str(error).partition(": ")[2]
-    if not isinstance(known, str) and swings(known):
-        known = with_dynamics(in_si, known, machine)
-    alone = gap_within(lost, None)
-    return _Answered(in_si, with_dynamics(in_si, alone) if swings(alone) else alone, known)
+    return _Answered(in_si, gap_of_recording(in_si, lost), known)
 
 
 def measured(case: LogCase) -> dict[str, Any]:

@@ -97,7 +97,7 @@ def _check_files(options: CommissionOptions) -> None:
         if path is not None:
             files.check_file(path, (".toml",))
     if options.page is not None:
-        from servotwin.cli.lost_motion_page import check_page
+        from servotwin.report.panels import check_page
 
         check_page(options.page)
     if options.scenario is not None and (options.output is None or options.largest_gap is None):

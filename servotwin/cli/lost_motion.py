@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -17,11 +18,12 @@ from rich.table import Table
 from rich.text import Text
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.driven_load.estimate import swings, with_dynamics
+from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
-from servotwin.estimation.kinematic.wind_up import TransmissionGap, gap_of_machine, gap_within
+from servotwin.estimation.kinematic.travel import StatedTravel, in_stated_unit
+from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
 from servotwin.plant.plants import resolve_plant
@@ -46,6 +48,7 @@ def show(
     dates: str | None = None,
     stiff: bool = False,
     dynamics: bool = False,
+    travel: StatedTravel | None = None,
 ) -> None:
     """Estimate each log's gap and print it; with several, their differences too; draw the last one's page.
 
@@ -63,7 +66,8 @@ def show(
         raise InvalidInput(f"--stiff and --axis {axis}: give one of the two; the axis says how stiff it is")
     console = Console(stderr=as_json)
     if page is not None:
-        from servotwin.cli.lost_motion_page import check_page, write_page
+        from servotwin.cli.lost_motion_page import write_page
+        from servotwin.report.panels import check_page
 
         check_page(page)
     machine = None if axis is None else resolve_plant(axis)
@@ -71,14 +75,14 @@ def show(
     answers = []
     for path in logs:
         with console.status(path.name) as status:
-            log = read_recording(path, columns, partial(_tell, status, path.name))
-            status.update(f"{path.name}: models")
-            lost = estimate_lost_motion(log.recording)
-            known = 0.0 if stiff else None
-            found = gap_within(lost, known) if machine is None else gap_of_machine(log.recording, lost, machine)
-            if dynamics or swings(found):
-                status.update(f"{path.name}: dynamics of the load")
-                found = with_dynamics(log.recording, found, machine)
+            tell = partial(_tell, status, path.name)
+            log = read_recording(path, columns, partial(_tell_samples, tell))
+            tell("models")
+            recording, lost = log.recording, estimate_lost_motion(log.recording)
+            if travel is not None:
+                recording, lost = in_stated_unit(recording, lost, travel)
+                log = replace(log, recording=recording)
+            found = gap_of_recording(recording, lost, machine, stiff=stiff, dynamics=dynamics, tell=tell)
             answers.append((log, found))
     if page is not None:
         log, found = answers[-1]
@@ -211,8 +215,12 @@ def _said(wear: _Wear | str, unit: str) -> str:
     )
 
 
-def _tell(status: Any, name: str, samples: int) -> None:
-    status.update(f"{name}: {samples:,} samples read")
+def _tell_samples(tell: Callable[[str], object], samples: int) -> None:
+    tell(f"{samples:,} samples read")
+
+
+def _tell(status: Any, name: str, what: str) -> None:
+    status.update(f"{name}: {what}")
 
 
 def as_dict(log: RecordedLog, found: TransmissionGap) -> dict[str, Any]:

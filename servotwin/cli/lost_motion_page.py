@@ -2,80 +2,80 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from servotwin.cli.lost_motion import model_line, model_rows, read_line
+from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.recordings import RecordedLog
 from servotwin.report import style
 from servotwin.report.page import page
-from servotwin.runtime import files
+from servotwin.report.panels import write_panels
 
 _NOT_SHOWN = "not known with this model"
-_SUFFIXES = (".html", ".png", ".svg")
-
-
-def check_page(path: Path) -> None:
-    """Check the name before anything is computed.
-
-    Raises
-    ------
-    InvalidInput
-        Unknown suffix or missing folder.
-    """
-    files.check_file(path, _SUFFIXES)
 
 
 def write_page(path: Path, log: RecordedLog, found: TransmissionGap, headline: str) -> None:
     """Write the picture (.png, .svg) or the page with it (.html), whole or not at all."""
-    figure = picture(log, found)
-    with files.atomic_output(path) as temporary:
-        if path.suffix == ".html":
-            temporary.write_text(_html(log, found, headline, style.svg(figure, path.stem)), encoding="utf-8")
-        else:
-            figure.savefig(temporary, format=path.suffix[1:], dpi=150)
+    lost, unit = found.lost, log.recording.load_unit
+    draws = [partial(draw, lost=lost, unit=unit) for draw in (_draw_loop, _draw_reversals, _draw_left, _draw_profile)]
+    write_panels(path, draws, partial(_html, log, found, headline))
 
 
-def picture(log: RecordedLog, found: TransmissionGap) -> Any:
-    """Figure of four panels: hysteresis loop, gap of each reversal, what the model leaves, error over the gap."""
-    recording, lost, scale = log.recording, found.lost, abs(found.lost.ratio)
-    curves = lost.curves
-    unit = recording.load_unit
-    with style.look():
-        figure = style.sheet(9.0, 6.4)
-        axes = figure.subplots(2, 2)
-        style.label_panels(axes.ravel())
-        loop, local, left, profile = axes.ravel()
-        if curves is not None:
-            loop.plot(curves.load, curves.lead * scale, ".", markersize=1.2, color=style.GREY, rasterized=True)
-            for side in (-0.5, 0.5):
-                loop.axhline(side * lost.at_load, color=style.BLUE)
-            style.trace(left, curves.time, curves.residual, style.GREY)
-            profile.plot(curves.gaps * scale, curves.rms, color=style.BLUE)
-        low, high = lost.interval_load
-        if np.isfinite(high):
-            profile.axvspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0)
-            local.axhspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0, label="95 % interval")
-        local.plot([each.position for each in lost.local], [each.gap * scale for each in lost.local], "o",
-                   markersize=3.0, color=style.BLUE)  # fmt: skip
-        for panel, known in ((local, lost.local), (profile, curves is not None and curves.gaps.size)):
-            if not known:
-                panel.text(0.5, 0.5, _NOT_SHOWN, transform=panel.transAxes, ha="center", va="center", color=style.GREY)
-        loop.set(xlabel=f"Load position ({unit})", ylabel=f"Motor's lead, at the load ({unit})")
-        local.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, None))
-        left.set(xlabel="Time (s)", ylabel=f"Left by the model ({unit})")
-        profile.set(xlabel=f"Lost motion ({unit})", ylabel=f"rms error of the model ({unit})", ylim=(0.0, None))
-    return figure
+def _draw_loop(axes: Axes, lost: LostMotion, unit: str) -> None:
+    """Motor's lead over the load's position."""
+    if lost.curves is not None:
+        lead = lost.curves.lead * abs(lost.ratio)
+        axes.plot(lost.curves.load, lead, ".", markersize=1.2, color=style.GREY, rasterized=True)
+        for side in (-0.5, 0.5):
+            axes.axhline(side * lost.at_load, color=style.BLUE)
+    axes.set(xlabel=f"Load position ({unit})", ylabel=f"Motor's lead, at the load ({unit})")
+
+
+def _draw_reversals(axes: Axes, lost: LostMotion, unit: str) -> None:
+    """Lost motion of each reversal."""
+    low, high = lost.interval_load
+    if np.isfinite(high):
+        axes.axhspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0, label="95 % interval")
+    gaps = [each.gap * abs(lost.ratio) for each in lost.local]
+    axes.plot([each.position for each in lost.local], gaps, "o", markersize=3.0, color=style.BLUE)
+    _say_unless(axes, bool(lost.local))
+    most = max([*gaps, high if np.isfinite(high) else 0.0])
+    axes.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, 1.1 * most or None))
+
+
+def _draw_left(axes: Axes, lost: LostMotion, unit: str) -> None:
+    """Residual over time."""
+    if lost.curves is not None:
+        style.trace(axes, lost.curves.time, lost.curves.residual, style.GREY)
+    axes.set(xlabel="Time (s)", ylabel=f"Left by the model ({unit})")
+
+
+def _draw_profile(axes: Axes, lost: LostMotion, unit: str) -> None:
+    """Error of the model over the lost motion."""
+    low, high = lost.interval_load
+    if lost.curves is not None:
+        axes.plot(lost.curves.gaps * abs(lost.ratio), lost.curves.rms, color=style.BLUE)
+    if np.isfinite(high):
+        axes.axvspan(low, high, color=style.SKY, alpha=0.4, linewidth=0.0)
+    _say_unless(axes, lost.curves is not None and lost.curves.gaps.size > 0)
+    axes.set(xlabel=f"Lost motion ({unit})", ylabel=f"rms error of the model ({unit})", ylim=(0.0, None))
+
+
+def _say_unless(axes: Axes, known: bool) -> None:
+    if not known:
+        axes.text(0.5, 0.5, _NOT_SHOWN, transform=axes.transAxes, ha="center", va="center", color=style.GREY)
 
 
 def _sentence(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}."
 
 
-def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes) -> str:
+def _html(log: RecordedLog, found: TransmissionGap, headline: str, images: list[bytes]) -> str:
     unit = log.recording.load_unit
     read = [read_line(log)]
     if found.lost.comparisons:
@@ -86,7 +86,7 @@ def _html(log: RecordedLog, found: TransmissionGap, headline: str, vector: bytes
         heading=f"{'Gap' if found.ok else 'Lost motion'} of {log.recording.source.removeprefix('log ')}",
         headline=_sentence(headline),
         sentences=[_sentence(each) for each in (*found.reasons, *read)],
-        picture=vector,
+        images=images,
         unit=unit,
         models=model_rows(found),
         defects=[(str(count), defect) for defect, count in log.found.items()],

@@ -25,6 +25,8 @@ MotorUnit = Annotated[
 LoadUnit = Annotated[
     str | None, typer.Option("--load-unit", help="Unit of --load, such as mm, if the header does not state it.")
 ]
+LeadMm = Annotated[float | None, typer.Option("--lead-mm", help="Travel of a linear load per turn of the motor, mm.")]
+Ratio = Annotated[float | None, typer.Option("--ratio", help="Turns of the motor per turn of a rotary load.")]
 _LOGS = "Recordings: .csv, .txt, .npz, .parquet, .mat, .h5, .mf4, .tdms, .mcap ..."
 
 
@@ -100,6 +102,8 @@ def identify(
     rate: SampleRate = None,
     motor_unit: MotorUnit = None,
     load_unit: LoadUnit = None,
+    lead_mm: LeadMm = None,
+    ratio: Ratio = None,
     page: Annotated[Path | None, typer.Option(help="Page or picture of the gap: .html, .png or .svg.")] = None,
     servo: Annotated[
         str | None, typer.Option(help="Model of the machine: a preset or a servo's TOML; by default the log's own.")
@@ -141,6 +145,7 @@ def identify(
     from servotwin.cli.identify import IdentifyOptions, show
     from servotwin.cli.lost_motion import describes_its_machine
     from servotwin.cli.lost_motion import show as show_lost_motion
+    from servotwin.estimation.kinematic.travel import stated_travel
     from servotwin.logs.recordings import RecordingColumns
 
     columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)
@@ -156,14 +161,16 @@ def identify(
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
     )
-    without_model = columns != RecordingColumns() or axis is not None or stiff or dynamics or dates is not None
+    travel = stated_travel(lead_mm, ratio)
+    stated = any(each is not None for each in (axis, dates, travel)) or stiff or dynamics
+    without_model = columns != RecordingColumns() or stated
     if without_model or (servo is None and not describes_its_machine(logs[0])):
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(
                 "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
                 "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
             )
-        show_lost_motion(logs, columns, json, page, axis, dates, stiff, dynamics)
+        show_lost_motion(logs, columns, json, page, axis, dates, stiff, dynamics, travel)
         return
     if len(logs) > 1 or page is not None:
         raise InvalidInput(
@@ -194,8 +201,8 @@ def commission(
     inertia: Annotated[
         float | None, typer.Option(help="Instead of --scale: total moving mass, kg (rotary: inertia, kg m^2).")
     ] = None,
-    lead_mm: Annotated[float | None, typer.Option(help="Travel of a linear load per turn of the motor, mm.")] = None,
-    ratio: Annotated[float | None, typer.Option(help="Turns of the motor per turn of a rotary load.")] = None,
+    lead_mm: LeadMm = None,
+    ratio: Ratio = None,
     position_gain: Annotated[
         float | None, typer.Option(help="Position gain of the cascade that ran, 1/s; fitted by default.")
     ] = None,
@@ -239,11 +246,13 @@ def commission(
     from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains
     from servotwin.estimation.inverse_dynamics.fitted_pid import GivenPid
     from servotwin.estimation.inverse_dynamics.identify import stated_law
-    from servotwin.logs.drive_recordings import DriveColumns, travel_of
+    from servotwin.estimation.kinematic.travel import stated_travel
+    from servotwin.logs.drive_recordings import DriveColumns
 
+    travel = stated_travel(lead_mm, ratio)
     columns = DriveColumns(
         motor, command, reference, load, time, rate, motor_unit, command_unit, reference_unit, load_unit, scale,
-        travel_of(lead_mm, ratio),
+        None if travel is None else travel.per_radian,
     )  # fmt: skip
     show(
         CommissionOptions(

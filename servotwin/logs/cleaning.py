@@ -22,6 +22,7 @@ _STEPS = (0.1, 0.9)  # quantiles of its steps, which differ
 
 
 OUT_OF_ORDER, SAME_TIME = "out of order in time", "at the time of the sample before"
+REPEATED = "left out that repeat the one before in every column"
 """Names of defects."""
 
 
@@ -101,11 +102,14 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     for place, name in enumerate(names, 1):
         if name in MEASURED:
             keep(~frozen(table[:, place]), f"of a {name} that stood still until it jumped")
-    # Counted only: to leave them out would cost every other channel its samples. What a hold delays is the fit's lag.
-    for place, name in enumerate(names, 1):
-        held = _repeats(table[:, place]) if name in MEASURED else 0
-        if held:
-            found[f"repeats of a {name} that is written more often than it is measured"] = held
+    new = {name: _new(table[:, place]) for place, name in enumerate(names, 1) if name in MEASURED}
+    for name, rows in new.items():
+        if not rows.all():
+            found[f"repeats of a {name} that is written more often than it is measured"] = int(np.sum(~rows))
+    # Where one channel has news, its repeats of another stay: what a hold delays is the fit's lag.
+    told = np.any(list(new.values()), axis=0) | np.any(np.diff(table[:, 1:], axis=0, prepend=np.nan) != 0.0, axis=1)
+    if not all(rows.all() for rows in new.values()):
+        keep(told, REPEATED)
     if gaps := pauses(table[:, 0]):
         found["pauses longer than five intervals"] = len(gaps)
     return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found, parted)
@@ -120,18 +124,23 @@ def _alone_at_the_end(time: Array) -> _Mask:
     return result
 
 
-def _repeats(values: Array) -> int:
-    """Number of samples that repeat a value because the channel is written more often than it is measured.
+def _new(values: Array) -> _Mask:
+    """False for samples that repeat a value because the channel is written more often than it is measured.
 
     Its values last for the same number of samples at any speed, and change by different steps; those of an encoder
     with few counts last longer the slower it moves, and change by one count.
     """
+    result = np.ones(values.size, dtype=np.bool_)
     changes = np.flatnonzero(np.diff(values)) + 1
     if changes.size < _HELD_CHANGES:
-        return 0
+        return result
     lengths, steps = np.diff(changes), np.abs(np.diff(values))[changes - 1]
     usual = int(np.median(lengths))
     if usual < 2 or np.mean(lengths % usual == 0) < _HELD or np.ptp(np.quantile(steps, _STEPS)) <= 0.1 * steps.mean():
-        return 0
+        return result
     # A channel at rest goes on being measured: of a longer run one in so many samples is new.
-    return int(np.sum(lengths - lengths // usual))
+    since = (
+        np.arange(values.size)
+        - np.concatenate([[0], changes])[np.searchsorted(changes, np.arange(values.size), side="right")]
+    )
+    return np.asarray(since % usual == 0)

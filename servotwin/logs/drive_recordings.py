@@ -14,7 +14,7 @@ from servotwin.estimation.inverse_dynamics.recording import DriveRecording, Mask
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
-from servotwin.estimation.kinematic.wind_up import ANGLES, LENGTHS
+from servotwin.estimation.kinematic.travel import ANGLES, LENGTHS
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.log import read_columns
@@ -90,24 +90,6 @@ class DriveLog:
     travel: float | None
     found: Mapping[str, int]
     lost_motion: LostMotion | None = None
-
-
-def travel_of(lead_mm: float | None, ratio: float | None) -> float | None:
-    """Travel of the load per radian of the motor from a lead (mm per turn) or a gear ratio; None: neither is given.
-
-    Raises
-    ------
-    InvalidInput
-        Both are given, or a value is not positive.
-    """
-    if lead_mm is not None and ratio is not None:
-        raise InvalidInput(f"--lead-mm {lead_mm:g} and --ratio {ratio:g}: give one of the two")
-    for name, value in (("--lead-mm", lead_mm), ("--ratio", ratio)):
-        if value is not None and not (math.isfinite(value) and value > 0.0):
-            raise InvalidInput(f"{name} {value!r}: must be positive and finite")
-    if lead_mm is not None:
-        return lead_mm * 1e-3 / (2.0 * math.pi)
-    return None if ratio is None else 1.0 / ratio
 
 
 def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
-from servotwin.estimation.kinematic.wind_up import ANGLES, LENGTHS
+from servotwin.estimation.kinematic.travel import ANGLES, LENGTHS
 
 # A number in brackets is a row of a matrix.
 _UNIT = re.compile(r"^(?P<name>.*?)\s*[\[(](?P<unit>[^\d\])][^\])]*)[\])]\s*$")

@@ -95,6 +95,14 @@ def test_the_twin_of_the_scenario_knows_how_sure_the_parameters_are(files):
     assert scenario.input_bias == pytest.approx(-PARAMETERS["offset"] * axis.p, rel=1e-2)
 
 
+def test_the_gap_of_the_scenario_hardly_grows_within_a_window(files):
+    # It grew by up to twice itself within one, and the twin accepted none of EMPS's five windows.
+    found = tomllib.loads(files["scenario.toml"].read_text(encoding="utf-8"))
+    gap, window = found["gap"], found["recording"]["window_s"]
+    growth = window * (gap["to_deg"] - gap["from_deg"]) / gap["over_s"]
+    assert 0.0 < growth < 0.15 * gap["from_deg"]
+
+
 def test_json_and_page_say_the_same(files):
     fit = files["json"]["simulated_loop"]["symmetric"]["parameters"]
     for name, true in PARAMETERS.items():

@@ -1,7 +1,9 @@
 """Foreign logs: every format, and what real ones have in them."""
 
 import json
+import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from typer.testing import CliRunner
 
 from servotwin.cli.app import app
 from servotwin.errors import InvalidInput
+from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import read_log, write_log
@@ -291,6 +294,39 @@ def test_lost_motion_is_gap_only_where_nothing_winds_up(tmp_path, made):
     assert "give one of the two" in both.stderr
 
 
+def test_a_stated_travel_gives_a_load_without_a_unit_its_scale(tmp_path, made):
+    # 0.1 per rad of the motor: 2 pi / 10 mm a turn, or ten turns for one.
+    counts = replace(made, load=made.load / 3e-4)
+    path = csv(tmp_path / "log.csv", rows(counts), "t [s],motor [rad],load")
+
+    def found(*options):
+        return json.loads(CliRunner().invoke(app, ["identify", str(path), "--json", *options]).stdout)
+
+    plain, lead, ratio = found(), found("--lead-mm", str(0.2 * math.pi)), found("--ratio", "10")
+    assert (plain["unit_load"], lead["unit_load"], ratio["unit_load"]) == ("load unit", "mm", "rad")
+    for each in (lead, ratio):
+        assert each["lost_motion_load"] == pytest.approx(0.1 * each["lost_motion_motor"], rel=1e-9)
+        assert each["lost_motion_motor"] == pytest.approx(plain["lost_motion_motor"])
+        assert each["rms_load"] / plain["rms_load"] == pytest.approx(3e-4, rel=1e-3)
+        assert each["segments"][0]["position_load"] == pytest.approx(made.load[0], abs=1.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--lead-mm", "0.9"), "that of --lead-mm by 0.000143.*: check the units of both columns"),
+        (("--ratio", "10"), "load in 'mm': with --ratio give --load-unit, one of rad"),
+        (("--ratio", "10", "--lead-mm", "1"), "give one of the two"),
+        (("--ratio", "0"), "must be positive and finite"),
+    ],
+)
+def test_a_stated_travel_that_is_not_the_log_s_is_refused(tmp_path, made, options, message):
+    path = csv(tmp_path / "log.csv", rows(made), "t [s],motor [rad],load [mm]")
+    result = CliRunner().invoke(app, ["identify", str(path), *options])
+    assert result.exit_code == 2
+    assert re.search(message, " ".join(result.stderr.split()))
+
+
 def test_dates_of_files_and_of_one_day_are_no_wear(tmp_path):
     logs = [
         csv(tmp_path / f"{place}.csv", rows(recording(gap=gap, ratio=RATIO, seconds=8.0, rate=100.0)))
@@ -321,7 +357,7 @@ def test_a_page_of_the_gap(tmp_path, made):
     text = (tmp_path / "gap.html").read_text()
     assert "log &lt;b&gt;.csv" in text
     assert "<b>" not in text
-    assert "data:image/svg+xml" in text
+    assert text.count("data:image/svg+xml") == 4
     wrong = CliRunner().invoke(app, ["identify", str(log), "--page", str(tmp_path / "gap.pdf")])
     assert wrong.exit_code == 2
     assert ".html" in wrong.stderr
@@ -387,12 +423,28 @@ def test_a_channel_that_is_measured_less_often_than_it_is_written_is_counted(mad
     channels = {"motor": made.motor, "load": made.load, "command": made.motor[every]}
     channels |= {name: channels[name][every] for name in held}
     found = cleaned(made.time, channels, {})
-    assert found.time.size == made.time.size
+    # Samples that repeat in every column are left out.
+    both = len(held) == 2
+    assert found.time.size == (made.time.size // times if both else made.time.size)
     # A value that equals the one before it makes a run longer; the first and the last run are not counted.
     for name in held:
         repeats = found.found[f"repeats of a {name} that is written more often than it is measured"]
         assert repeats / made.time.size == pytest.approx(1.0 - 1.0 / times, abs=0.03)
-    assert len(found.found) == len(held)
+    assert len(found.found) == len(held) + both
+
+
+def test_two_encoders_on_a_slow_bus_show_the_lost_motion(tmp_path):
+    # The lag between held values is no lag in time: 0.0663 rad by every moment, 0.0599 by the motor's way.
+    made = recording(lag=2e-3, seconds=12.0)
+    every = np.arange(made.time.size) // 4 * 4
+    held = replace(made, motor=made.motor[every], load=made.load[every])
+    log = read_recording(csv(tmp_path / "log.csv", rows(held)), RecordingColumns())
+    assert log.recording.time.size == made.time.size // 4
+    found = estimate_lost_motion(log.recording)
+    assert found.ok, found.reasons
+    low, high = found.interval_motor
+    assert low < GAP < high
+    assert found.lag == pytest.approx(2e-3, abs=2e-4)
 
 
 @pytest.mark.parametrize("times", [2, 4, 10])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.driven_load.fit import SLOWER, LoadFit, best_fit, carried, slowest_and_fastest
+from servotwin.estimation.driven_load.flanks import parts_without_pause, reversals_of
 from servotwin.estimation.driven_load.problem import ONE_MASS, DrivenLoad, Links, LoadDynamics
 from servotwin.estimation.estimate import NORMAL_95, GapStatus
 from servotwin.estimation.kinematic.curves import FittedCurves
@@ -18,14 +19,14 @@ from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side
-from servotwin.estimation.kinematic.wind_up import TransmissionGap, units_of
+from servotwin.estimation.kinematic.travel import units_of
+from servotwin.estimation.kinematic.wind_up import TransmissionGap, travel_of_machine
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 
 _MOST = 10_000  # samples
-_PAUSE = 12.0  # usual intervals, over which nothing says how the load moved
 _LEAST, _ENOUGH = 6, 12  # strokes within them
 _DAMPED = 2.0  # of the critical damping: beyond, the load does not swing
 _FOLDS = 8  # parts of the recording, whose errors are compared
@@ -166,7 +167,7 @@ def with_dynamics(recording: EncoderRecording, found: TransmissionGap, machine: 
     """
     if found.ok or found.status is GapStatus.LOWER_BOUND:
         return found
-    known = None if machine is None else load_of(machine, units_of(recording, machine)[1])
+    known = None if machine is None else load_of(machine, units_of(recording, travel_of_machine(machine))[1])
     single = known if known is None else replace(known, links=ONE_MASS)
     driven = gap_of_driven_load(recording, found.lost, single)
     if driven.gap is None and known is not None and len(known.links.masses) > 1:
@@ -180,10 +181,7 @@ def with_dynamics(recording: EncoderRecording, found: TransmissionGap, machine: 
 
 def _piece(recording: EncoderRecording, lost: LostMotion) -> EncoderRecording:
     """At most 10 000 samples of the longest part without a pause; nothing says how the load moved in one."""
-    intervals = np.diff(recording.time)
-    pauses = np.flatnonzero(intervals > _PAUSE * np.median(intervals)) + 1 if intervals.size else intervals
-    parts = np.split(np.arange(recording.time.size), pauses.astype(int))
-    rows = max(parts, key=len)
+    rows = max(parts_without_pause(recording), key=len)
     whole = _rows(recording, rows)
     if rows.size > _MOST:
         # Strokes that last longer than the samples go are worth more than every sample of few strokes.
@@ -220,9 +218,7 @@ def _strokes(piece: EncoderRecording, lost: LostMotion) -> int:
     first, last = piece.time[0], piece.time[-1]
     if lost.local:
         return sum(first <= each.time <= last for each in lost.local)
-    side = np.zeros(piece.motor.size, dtype=np.int8)
-    play_and_side(piece.motor, 0.1 * float(np.ptp(piece.motor)), side)
-    return int(np.count_nonzero(np.diff(side[side != 0]))) + 1
+    return reversals_of(piece.motor) + 1
 
 
 def _quasi_static(problem: DrivenLoad, lost: LostMotion) -> Array:

@@ -33,6 +33,10 @@ class FittedCurves(NamedTuple):
     gaps: Array
     rms: Array
 
+    def with_load_times(self, scale: float) -> FittedCurves:
+        """The same in a unit of the load that is `scale` times smaller."""
+        return self._replace(load=scale * self.load, residual=scale * self.residual, rms=scale * self.rms)
+
 
 def fitted_curves(prepared: Regression, model: Model, gap: float, interval: Interval) -> FittedCurves:
     """Draw a model with a gap and its 95 % interval (the motor's unit); `prepared` has the fitted lag."""

@@ -126,6 +126,19 @@ class LostMotion:
         low, high = (abs(self.ratio) * (gap + self.load_spread * (end - gap)) for end in interval)
         return (max(low, 0.0), high)
 
+    def with_load_times(self, scale: float) -> LostMotion:
+        """The same in a unit of the load that is `scale` times smaller."""
+        return replace(
+            self,
+            ratio=scale * self.ratio,
+            rms=scale * self.rms,
+            comparisons=tuple(
+                each._replace(rms=scale * each.rms, squares=scale**2 * each.squares) for each in self.comparisons
+            ),
+            local=tuple(each._replace(position=scale * each.position) for each in self.local),
+            curves=None if self.curves is None else self.curves.with_load_times(scale),
+        )
+
     @property
     def ok(self) -> bool:
         return self.status is GapStatus.OK
@@ -216,7 +229,7 @@ def _check(recording: EncoderRecording, least: float, reversals: int) -> None:
         if _alternates(values):
             raise InvalidInput(
                 f"{source}: the {part}'s position jumps to and fro from sample to sample: two machines by turns in one "
-                "log; give each by itself"
+                "log, give each by itself; or one that hunts at half the sample rate, record it faster"
             )
     if not reach > 2.0 * least:
         raise InvalidInput(
@@ -321,7 +334,7 @@ def _answer(
             rms=float(np.sqrt(np.mean(residual**2))) / abs(ratio),
             of_none=(best.rms / comparisons[-1].rms) ** 2 if comparisons[-1].rms else 1.0,
             accelerated=INERTIA in best.model.used,
-            lead=_lead(prepared, best),
+            lead=_lead(prepared),
             reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),
         ),
         recording.motor_unit,
@@ -346,9 +359,9 @@ def _answer(
     )
 
 
-def _lead(prepared: Regression, best: ModelScore) -> float:
+def _lead(prepared: Regression) -> float:
     usual = float(np.median(np.diff(prepared.recording.time)))
-    return -prepared.lag if INERTIA in best.model.used and prepared.lag < -_SKEW * usual else 0.0
+    return -prepared.lag if prepared.lag < -_SKEW * usual else 0.0
 
 
 def _no_gap() -> LostMotion:

@@ -55,7 +55,7 @@ class KinematicFit(NamedTuple):
     accelerated : bool
         The model has wind-up by acceleration.
     lead : float
-        s, by which a load that winds up by its acceleration would be ahead of the motor, beyond two samples; or 0.
+        s, by which the load would be ahead of the motor, if by more than two samples; or 0.
     """
 
     gap: float
@@ -114,7 +114,7 @@ def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
     both = (low, high, fit.by_travel - fit.half, fit.by_travel + fit.half)
     if not reasons:
         return KinematicVerdict(GapStatus.OK, (max(min(both) - wide, 0.0), max(both) + wide))
-    ends = (*both, *fit.simpler.values(), *([0.0] if fit.swings else []))
+    ends = (*both, *fit.simpler.values(), *([0.0] if fit.swings or fit.lead > 0.0 else []))
     return KinematicVerdict(
         GapStatus.MODEL_MISMATCH, (max(min(ends) - wide, 0.0), max(max(ends) + wide, fit.reach)), reasons
     )
@@ -147,7 +147,10 @@ def _doubts(fit: KinematicFit, unit: str) -> tuple[str, ...]:
             f"{fit.gap:.4g} {unit} that the model finds: the load swings"
         )
     if fit.lead > 0.0:
-        reasons.append(f"the load would be {1e3 * fit.lead:.3g} ms ahead of the motor: it swings")
+        reasons.append(
+            f"the load would be {1e3 * fit.lead:.3g} ms ahead of the motor: its inertia drives it, or the motor's "
+            "column is late; if you know that it is, shift it by so much"
+        )
     for name, gap in fit.simpler.items():
         # What a swinging load does at a reversal is no proof of a gap, nor against one; a lag shows at other speeds.
         if (reasons or name != LAG) and abs(gap - fit.gap) > fit.half + 2.0 * fit.quantisation:

@@ -5,29 +5,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
 from servotwin.estimation.kinematic.lost_motion import LostMotion
 from servotwin.estimation.kinematic.models import ModelTrial, trials
 from servotwin.estimation.kinematic.recording import EncoderRecording
+from servotwin.estimation.kinematic.travel import StatedTravel, check_travel, units_of
 from servotwin.plant.axis import Axis
 from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
 
-ANGLES = {
-    "rad": 1.0,
-    "mrad": 1e-3,
-    "deg": math.pi / 180.0,
-    "°": math.pi / 180.0,
-    "rev": 2.0 * math.pi,
-    "arcmin": math.pi / 10_800.0,
-    "arcsec": math.pi / 648_000.0,
-}
-"""Radians per unit."""
-LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "nm": 1e-9, "cm": 1e-2, "in": 0.0254}
-"""Metres per unit."""
-# By how much the recording's load per motor may differ from the machine's; where the load swings it is not well known.
-_RATIO, _RATIO_OF_SWINGING = 0.05, 0.25
 _DOUBT = 1.0  # of the wind-up: friction changes, and a load that swings leaves less of it
 _SHARE = 0.5  # of the lost motion: a larger wind-up leaves no gap that is known
 _UNKNOWN = (
@@ -145,28 +131,11 @@ def gap_of_machine(recording: EncoderRecording, lost: LostMotion, machine: Plant
     """
     if lost.interval_motor == NOTHING_KNOWN:
         return gap_within(lost, None)
-    motor_unit, load_unit = units_of(recording, machine)
-    ratio = abs(lost.ratio) * load_unit / motor_unit
-    if abs(ratio / machine.p - 1.0) > (_RATIO if lost.ok else _RATIO_OF_SWINGING):
-        raise InvalidInput(
-            f"{recording.source}: its load moves by {ratio:.4g} per rad of the motor, in SI units, and that of --axis "
-            f"by {machine.p:.4g}: check the units of both columns (--motor-unit, --load-unit) and the axis"
-        )
-    return gap_within(lost, wind_up(machine) / motor_unit, recording.motor_unit)
+    travel = travel_of_machine(machine)
+    check_travel(recording, lost, travel)
+    off = wind_up(machine) / units_of(recording, travel)[0]
+    return gap_within(lost, off, recording.motor_unit)
 
 
-def units_of(recording: EncoderRecording, machine: Plant) -> tuple[float, float]:
-    """SI units in one unit of the motor and of the load.
-
-    Raises
-    ------
-    InvalidInput
-        A unit that is not known.
-    """
-    loads = ANGLES if position_unit(machine).si == "rad" else LENGTHS
-    for part, unit, known in (("motor", recording.motor_unit, ANGLES), ("load", recording.load_unit, loads)):
-        if unit not in known:
-            raise InvalidInput(
-                f"{recording.source}: {part} in {unit!r}: with --axis give --{part}-unit, one of {', '.join(known)}"
-            )
-    return ANGLES[recording.motor_unit], loads[recording.load_unit]
+def travel_of_machine(machine: Plant) -> StatedTravel:
+    return StatedTravel(machine.p, position_unit(machine).si == "rad", "--axis")

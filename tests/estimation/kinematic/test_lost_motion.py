@@ -32,6 +32,16 @@ def test_a_lag_is_told_from_the_gap():
     assert found.lag == pytest.approx(5e-3, rel=0.02)
 
 
+def test_a_load_that_runs_ahead_of_its_motor_is_doubted():
+    # Inertia does that, or a motor's column that is late: the log does not tell which.
+    found = estimate_lost_motion(recording(lag=-12e-3))
+    assert found.status is GapStatus.MODEL_MISMATCH
+    assert "ms ahead of the motor" in found.reasons[0]
+    assert found.interval_motor[0] == 0.0
+    assert found.interval_motor[1] > 0.05
+    assert estimate_lost_motion(recording(lag=-2e-3)).ok
+
+
 def test_a_long_lag_of_a_fast_motion_is_no_wind_up_by_acceleration():
     # Its column is right to first order; what is left was taken for wind-up, and gap and wind-up looked alike.
     found = estimate_lost_motion(recording(lag=12e-3, speed=4.0, rate=1000.0, seconds=60.0))
