@@ -18,11 +18,12 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
-from servotwin.estimation.output_error.possible import possible_half
+from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
@@ -44,7 +45,11 @@ def shortest_window(_settings: OutputErrorSettings, _axis: object, sample_rate: 
 
 
 def estimate(
-    window: Window, axis: Axis | Servo, prior: float | GapEstimate | None, settings: OutputErrorSettings | None
+    window: Window,
+    axis: Axis | Servo,
+    prior: float | GapEstimate | None,
+    settings: OutputErrorSettings | None,
+    machine: FactorPrior | None = None,
 ) -> GapEstimate:
     """Estimate the total gap (rad at the motor) from a window with theta_m and position.
 
@@ -56,6 +61,8 @@ def estimate(
     prior : float or GapEstimate, optional
         Total gap, rad: one of the starts.
     settings : OutputErrorSettings, optional
+    machine : FactorPrior, optional
+        What is known of the machine. Of a rigid transmission its pitch is the ratio, and the estimate has a reading.
 
     Raises
     ------
@@ -65,18 +72,47 @@ def estimate(
     settings = settings or OutputErrorSettings()
     theta_m = _checked(window, axis)
     assert isinstance(axis, Axis)
+    axis, settings = _known(axis, settings, machine)
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
     found, noise = _fit(window, theta_m, axis, prior, settings)
-    unit = 2.0 / axis.p
-    return _stated(blank, found, judge(found, settings, unit, possible_half(found), axis.p * noise), unit)
+    unit, possible = 2.0 / axis.p, possible_half(found)
+    verdict = judge(found, settings, unit, possible, axis.p * noise)
+    stated = _stated(blank, found, verdict, unit)
+    if machine is None or possible is None or not verdict.teaches:
+        return stated
+    return replace(stated, machine=_taught(machine, possible, settings.calibration).reading)
 
 
-def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings) -> Search:
+def fit(
+    window: Window,
+    axis: Axis,
+    prior: float | GapEstimate | None,
+    settings: OutputErrorSettings,
+    machine: FactorPrior | None = None,
+) -> Search:
     """Fit a window as `estimate` does; raises InvalidInput as it does."""
-    return _fit(window, _checked(window, axis), axis, prior, settings)[0]
+    theta_m = _checked(window, axis)
+    axis, settings = _known(axis, settings, machine)
+    return _fit(window, theta_m, axis, prior, settings)[0]
+
+
+def _known(
+    axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None
+) -> tuple[Axis, OutputErrorSettings]:
+    """The axis with the ratio that is known of it, and the settings with that ratio's spread."""
+    if machine is None or axis.backlash_kind is BacklashKind.FREE:
+        return axis, settings
+    mean, std = machine.pitch
+    return axis.scaled({"p": math.exp(mean)}), replace(settings, ratio=std)
+
+
+def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) -> FactorPrior:
+    """The machine with the ratio that a window leaves possible, what was known before included."""
+    mean, std = machine.pitch
+    return machine.with_pitch(mean + possible.ratio, min(std, calibration * possible.ratio_std))
 
 
 def _fit(

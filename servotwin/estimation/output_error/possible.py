@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.output_error.fit import Fit, Search, descend, only_rounding
-from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.models import HALF, RATIO
 from servotwin.plant.signals import Array
 
 _FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next, of the gap, and their growth
@@ -32,10 +32,19 @@ _PATIENCE = 0.1  # logarithm of a ratio of gaps
 
 
 class PossibleHalf(NamedTuple):
-    """Half gap that a window leaves possible, m or rad at the load: mean and standard deviation."""
+    """Half gap that a window leaves possible, m or rad at the load: mean and standard deviation; and so the ratio.
+
+    Attributes
+    ----------
+    mean, std : float
+    ratio, ratio_std : float
+        Of the logarithm of the transmission's ratio over the model's.
+    """
 
     mean: float
     std: float
+    ratio: float = 0.0
+    ratio_std: float = math.inf
 
 
 def possible_half(found: Search) -> PossibleHalf | None:
@@ -55,8 +64,26 @@ def possible_half(found: Search) -> PossibleHalf | None:
         widths = np.minimum(widths, [_BELL * fit.std(HALF, found.free) for fit in fits])
         weights = widths * _in_noise(found, fits)
     weights /= weights.sum()
-    mean = float(weights @ halves)
-    return PossibleHalf(mean, math.sqrt(float(weights @ ((halves - mean) ** 2 + widths**2 / 12.0))))
+    ratios = np.array([fit.values[RATIO] for fit in fits])
+    spreads = np.array([_ratio_std(found, fit, rounding) for fit in fits])
+    return PossibleHalf(*_moments(weights, halves, widths / math.sqrt(12.0)), *_moments(weights, ratios, spreads))
+
+
+def _moments(weights: Array, values: Array, spreads: Array) -> tuple[float, float]:
+    """Mean and standard deviation of values (f,) that have spreads of their own."""
+    mean = float(weights @ values)
+    return mean, math.sqrt(float(weights @ ((values - mean) ** 2 + spreads**2)))
+
+
+def _ratio_std(found: Search, fit: Fit, rounding: bool) -> float:
+    """Standard deviation of the ratio's logarithm at the half gap of a fit."""
+    free = found.free.copy()
+    free[HALF] = False
+    std, known = fit.std(RATIO, free), found.problem.model.unknowns[RATIO].std
+    if not rounding:
+        return std
+    told = max(0.0, std**-2 - known**-2) * min(1.0, _INDEPENDENT / fit.raw.size)
+    return 1.0 / math.sqrt(told + known**-2)
 
 
 def _deepest(found: Search, fit: Fit, width: float) -> Fit:

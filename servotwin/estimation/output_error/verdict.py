@@ -44,6 +44,8 @@ class JudgedFit:
     std, std_total : float
         Of the half gap.
     reasons : tuple of str
+    teaches : bool
+        True where the window shows the transmission's ratio, whether or not it shows the gap well enough.
     """
 
     status: GapStatus
@@ -51,6 +53,7 @@ class JudgedFit:
     std: float = math.inf
     std_total: float = math.inf
     reasons: tuple[str, ...] = ()
+    teaches: bool = False
 
 
 def judge(
@@ -93,9 +96,10 @@ def judge(
         words = "one flank explains the window nearly as well as two"
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
         return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
-    doubts = tuple(filter(None, (_wide(found, half, std, settings, unit), _rival(found, half, total, unit))))
+    rival = _rival(found, half, total, unit)
+    doubts = tuple(filter(None, (_wide(found, half, std, settings, unit), rival)))
     status = GapStatus.UNIDENTIFIABLE if doubts else GapStatus.OK
-    return JudgedFit(status, math.nan if doubts else half, std, total, doubts)
+    return JudgedFit(status, math.nan if doubts else half, std, total, doubts, not rival)
 
 
 def _wide(found: Search, half: float, std: float, settings: OutputErrorSettings, unit: float) -> str:
