@@ -58,12 +58,14 @@ def stated_machine(settings: TwinSettings) -> FactorPrior:
 def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
     """What is known of a machine before its first window; None: it is not learnt, and keeps the numbers of its model.
 
-    Of one mass behind a rigid transmission only the ratio shows, which is known better beforehand.
+    Of one mass behind a rigid transmission only the ratio shows, and is known better beforehand where nothing is stated.
     """
-    model, known = servo_for(servo), stated_machine(settings)
+    known = stated_machine(settings)
     if not settings.learning.learn or servo.at_motor or not servo.rigid:
         return None
-    return known if model is not None else known.with_pitch(0.0, output_error.OutputErrorSettings().ratio)
+    if servo_for(servo) is not None:
+        return known
+    return known.with_pitch(0.0, min(known.pitch[1], output_error.OutputErrorSettings().ratio))
 
 
 def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:

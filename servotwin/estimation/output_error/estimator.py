@@ -14,7 +14,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, MachineReading, no_estimate
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
@@ -36,6 +36,7 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
+_TELLS = 0.5  # of the standard deviation of a ratio that was known: a window that tells it better is learnt from
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -79,11 +80,10 @@ def estimate(
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
     found, noise = _fit(window, theta_m, axis, prior, settings)
     unit, possible = 2.0 / axis.p, possible_half(found)
-    verdict = judge(found, settings, unit, possible, axis.p * noise)
-    stated = _stated(blank, found, verdict, unit)
-    if machine is None or possible is None or not verdict.teaches:
+    stated = _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
+    if machine is None or possible is None or not stated.ok:
         return stated
-    return replace(stated, machine=_taught(machine, possible, settings.calibration).reading)
+    return replace(stated, machine=_taught(machine, possible, settings.calibration))
 
 
 def fit(
@@ -109,10 +109,14 @@ def _known(
     return axis.scaled({"p": math.exp(mean)}), replace(settings, ratio=std)
 
 
-def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) -> FactorPrior:
-    """The machine with the ratio that a window leaves possible, what was known before included."""
-    mean, std = machine.pitch
-    return machine.with_pitch(mean + possible.ratio, min(std, calibration * possible.ratio_std))
+def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) -> MachineReading | None:
+    """The machine with the ratio that a window leaves possible; None where that was known nearly as well before.
+
+    Moves between the same two places tell a ratio hardly, and their errors of rounding repeat: many such windows would
+    only seem to tell more.
+    """
+    (mean, known), std = machine.pitch, calibration * possible.ratio_std
+    return machine.with_pitch(mean + possible.ratio, std).reading if std < _TELLS * known else None
 
 
 def _fit(

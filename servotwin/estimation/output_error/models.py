@@ -46,12 +46,13 @@ class Unknown(NamedTuple):
     """One unknown of a model: name, standard deviation beforehand (inf: nothing known), and unit of its size.
 
     The unit is "load" (m or rad at the load), "speed" (that per s), "time" (s), "factor" (a logarithm), or "damping": a
-    factor on a number that is hardly ever known.
+    factor on a number that is hardly ever known. A `positive` one is never below 0.
     """
 
     name: str
     std: float
     unit: str
+    positive: bool = False
 
 
 class FittedModel(Protocol):
@@ -300,7 +301,7 @@ class PlayModel:
         return (
             *_common(self.priors),
             Unknown("first place", math.inf, "load"),
-            Unknown("lag", self.priors.delay, "time"),
+            Unknown("lag", self.priors.delay, "time", positive=True),
         )
 
     def start(self, half: float, offset: float, first: tuple[float, float]) -> Array:
@@ -319,10 +320,7 @@ class PlayModel:
 
 
 def lagged(values: Array, samples: float) -> Array:
-    """A signal (N,) behind a first-order lag of a number of samples, straight between them.
-
-    A lag below 0 is a lead, by the slope: so a fit can pass through 0.
-    """
+    """A signal (N,) behind a first-order lag of a number of samples, straight between them."""
     out = np.empty(values.size)
     decay = math.exp(-1.0 / samples) if samples > 0.0 else 0.0
     slope = samples * (1.0 - decay)
