@@ -55,6 +55,19 @@ def stated_machine(settings: TwinSettings) -> FactorPrior:
     return nameplate(settings.learning, known.k, known.c, known.m)
 
 
+def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
+    """What is known of a machine before its first window; None: it is not learnt, and keeps the numbers of its model.
+
+    Of one mass behind a rigid transmission only the ratio shows, and is known better beforehand where nothing is stated.
+    """
+    known = stated_machine(settings)
+    if not settings.learning.learn or servo.at_motor or not servo.rigid:
+        return None
+    if servo_for(servo) is not None:
+        return known
+    return known.with_pitch(0.0, min(known.pitch[1], output_error.OutputErrorSettings().ratio))
+
+
 def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     """Make the estimator that `settings` name, with a servo as its model.
 
@@ -76,22 +89,32 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         motor_side.check_reaction(servo)
         own, model = motor_side.METHOD, None
     options = options_for(servo, settings.method, settings.estimator)
-    new = stated_machine(settings) if settings.learning.learn and model is not None and model.rigid else None
+    new = known_machine(servo, settings)
 
-    def of_model(window: Window, expected: Expectation) -> GapEstimate:
+    def fitted(window: Window, expected: Expectation, machine: FactorPrior | None, afresh: bool) -> GapEstimate:
+        prior = None if afresh else expected.prior
         if model is None:
             # The methods that settings name are those of a servo.
-            return estimate_gap(window, servo, own, expected.prior, _worn(own, expected, settings))
-        if not isinstance(options, whitened.WhitenedSettings):
-            return estimate_gap(window, servo, settings.method, expected.previous, options)
+            chosen = _worn(own, expected, settings)
+            if machine is None:
+                return estimate_gap(window, servo, own, prior, chosen)
+            assert isinstance(chosen, output_error.OutputErrorSettings)
+            return output_error.estimate(window, servo, prior, chosen, machine)
+        assert isinstance(options, whitened.WhitenedSettings)
         growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
+        offset = None if afresh else expected.offset
+        return whitened.estimate_carrying(window, model, prior, growing, offset, machine)
+
+    def of_model(window: Window, expected: Expectation) -> GapEstimate:
+        if model is not None and not isinstance(options, whitened.WhitenedSettings):
+            return estimate_gap(window, servo, settings.method, expected.previous, options)
         if new is None or expected.machine is None:
-            return whitened.estimate_carrying(window, model, expected.prior, growing, expected.offset, new)
-        made = whitened.estimate_carrying(window, model, expected.prior, growing, expected.offset, expected.machine)
+            return fitted(window, expected, new, afresh=False)
+        made = fitted(window, expected, expected.machine, afresh=False)
         if made.status is not GapStatus.MODEL_MISMATCH:
             return made
         # The machine may have been exchanged: its new numbers are then worth knowing, and nothing else yet.
-        other = whitened.estimate_carrying(window, model, None, growing, None, new)
+        other = fitted(window, expected, new, afresh=True)
         return replace(made, machine=other.machine) if other.ok else made
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
@@ -107,7 +130,7 @@ def own_fit(window: Window, servo: Axis, settings: TwinSettings, expected: Expec
         motor = motor_side.MotorSideSettings(gap_rate=expected.gap_rate(settings.trend))
         return motor_side.fit(window, servo, expected.prior, motor)
     own = output_error.OutputErrorSettings(gap_rate=expected.gap_rate(settings.trend))
-    return output_error.fit(window, servo, expected.prior, own)
+    return output_error.fit(window, servo, expected.prior, own, expected.machine or known_machine(servo, settings))
 
 
 def _worn(

@@ -14,15 +14,16 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, MachineReading, no_estimate
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
-from servotwin.estimation.output_error.possible import possible_half
+from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
@@ -35,6 +36,7 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
+_TELLS = 0.5  # of the standard deviation of a ratio that was known: a window that tells it better is learnt from
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -44,7 +46,11 @@ def shortest_window(_settings: OutputErrorSettings, _axis: object, sample_rate: 
 
 
 def estimate(
-    window: Window, axis: Axis | Servo, prior: float | GapEstimate | None, settings: OutputErrorSettings | None
+    window: Window,
+    axis: Axis | Servo,
+    prior: float | GapEstimate | None,
+    settings: OutputErrorSettings | None,
+    machine: FactorPrior | None = None,
 ) -> GapEstimate:
     """Estimate the total gap (rad at the motor) from a window with theta_m and position.
 
@@ -56,6 +62,8 @@ def estimate(
     prior : float or GapEstimate, optional
         Total gap, rad: one of the starts.
     settings : OutputErrorSettings, optional
+    machine : FactorPrior, optional
+        What is known of the machine. Of a rigid transmission its pitch is the ratio, and the estimate has a reading.
 
     Raises
     ------
@@ -65,18 +73,50 @@ def estimate(
     settings = settings or OutputErrorSettings()
     theta_m = _checked(window, axis)
     assert isinstance(axis, Axis)
+    axis, settings = _known(axis, settings, machine)
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
     found, noise = _fit(window, theta_m, axis, prior, settings)
-    unit = 2.0 / axis.p
-    return _stated(blank, found, judge(found, settings, unit, possible_half(found), axis.p * noise), unit)
+    unit, possible = 2.0 / axis.p, possible_half(found)
+    stated = _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
+    if machine is None or possible is None or not stated.ok:
+        return stated
+    return replace(stated, machine=_taught(machine, possible, settings.calibration))
 
 
-def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings) -> Search:
+def fit(
+    window: Window,
+    axis: Axis,
+    prior: float | GapEstimate | None,
+    settings: OutputErrorSettings,
+    machine: FactorPrior | None = None,
+) -> Search:
     """Fit a window as `estimate` does; raises InvalidInput as it does."""
-    return _fit(window, _checked(window, axis), axis, prior, settings)[0]
+    theta_m = _checked(window, axis)
+    axis, settings = _known(axis, settings, machine)
+    return _fit(window, theta_m, axis, prior, settings)[0]
+
+
+def _known(
+    axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None
+) -> tuple[Axis, OutputErrorSettings]:
+    """The axis with the ratio that is known of it, and the settings with that ratio's spread."""
+    if machine is None or axis.backlash_kind is BacklashKind.FREE:
+        return axis, settings
+    mean, std = machine.pitch
+    return axis.scaled({"p": math.exp(mean)}), replace(settings, ratio=std)
+
+
+def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) -> MachineReading | None:
+    """The machine with the ratio that a window leaves possible; None where that was known nearly as well before.
+
+    Moves between the same two places tell a ratio hardly, and their errors of rounding repeat: many such windows would
+    only seem to tell more.
+    """
+    (mean, known), std = machine.pitch, calibration * possible.ratio_std
+    return machine.with_pitch(mean + possible.ratio, std).reading if std < _TELLS * known else None
 
 
 def _fit(

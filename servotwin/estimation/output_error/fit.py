@@ -123,20 +123,23 @@ def descend(
     problem: FitProblem, start: Array, noise: Autoregression, free: Flags, steps: int, rate: float = 0.0
 ) -> Fit:
     """Levenberg-Marquardt from a start; only `free` (u,) unknowns move."""
-    limits = problem.limits()
-    values, damping = np.clip(start, -limits, limits), 1e-3
+    most = problem.limits()
+    least = np.where([unknown.positive for unknown in problem.model.unknowns], 0.0, -most)
+    values, damping = np.clip(start, least, most), 1e-3
     residual, rows, raw = whitened_rows(problem, values, noise, free, rate)
     cost, count = float(residual @ residual), 1
     for _ in range(steps):
         size = np.linalg.norm(rows, axis=1)
-        use = np.flatnonzero(free & (size > 0.0))
+        uphill = rows @ residual
+        held = ((values <= least) & (uphill > 0.0)) | ((values >= most) & (uphill < 0.0))
+        use = np.flatnonzero(free & (size > 0.0) & ~held)
         scaled = rows[use] / size[use, None]
         matrix, downhill = scaled @ scaled.T, scaled @ residual
         better = False
         while damping < 1e6 and not better:
             step = np.zeros(values.size)
             step[use] = -np.linalg.solve(matrix + damping * np.eye(use.size), downhill) / size[use]
-            ahead = np.clip(values + step, -limits, limits)
+            ahead = np.clip(values + step, least, most)
             ahead[HALF] = abs(ahead[HALF])
             move = (ahead - values) @ rows
             if -float(move @ (2.0 * residual + move)) <= _GAIN * cost / residual.size:

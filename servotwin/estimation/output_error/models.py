@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.estimation.output_error.shaft import run_shaft
+from servotwin.hybrid.compiled import bare
 from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
 from servotwin.plant.signals import Array
@@ -45,12 +46,13 @@ class Unknown(NamedTuple):
     """One unknown of a model: name, standard deviation beforehand (inf: nothing known), and unit of its size.
 
     The unit is "load" (m or rad at the load), "speed" (that per s), "time" (s), "factor" (a logarithm), or "damping": a
-    factor on a number that is hardly ever known.
+    factor on a number that is hardly ever known. A `positive` one is never below 0.
     """
 
     name: str
     std: float
     unit: str
+    positive: bool = False
 
 
 class FittedModel(Protocol):
@@ -275,7 +277,7 @@ def exponential(matrix: Array) -> Array:
 
 @dataclass(frozen=True)
 class PlayModel:
-    """One mass on a rigid screw: the play operator."""
+    """One mass on a rigid screw: the play operator, and the lag of its encoder."""
 
     axis: Axis
     priors: Priors
@@ -292,19 +294,43 @@ class PlayModel:
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]:
-        """Half gap, offset of the position, delay, ratio, first place of the screw."""
-        return (*_common(self.priors), Unknown("first place", math.inf, "load"))
+        """Half gap, offset of the position, delay, ratio, first place of the screw, lag of the position.
+
+        Both encoders' electronics delay, and filter: a lag that is not fitted is taken for gap and delay.
+        """
+        return (
+            *_common(self.priors),
+            Unknown("first place", math.inf, "load"),
+            Unknown("lag", self.priors.delay, "time", positive=True),
+        )
 
     def start(self, half: float, offset: float, first: tuple[float, float]) -> Array:
         """Unknowns (u,) for a first position of the mass."""
-        return np.array([half, offset, 0.0, 0.0, first[0]])
+        return np.array([half, offset, 0.0, 0.0, first[0], 0.0])
 
     def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
         """Motion under the motor's motion (N,) at the load, for unknowns (u,); there is nothing to observe."""
         del measured, rate
-        half, offset, _, ratio, first = values.tolist()
+        half, offset, _, ratio, first, lag = values.tolist()
         driven, half = math.exp(ratio) * drive + offset, math.exp(ratio) * abs(half)
         place = play(driven, 2.0 * half, first)
         lead = driven - place
         sides = np.where(np.abs(lead) >= half * (1.0 - 1e-9), np.sign(lead), 0.0).astype(np.int8)
-        return Motion(place, np.gradient(place, interval), place, sides)
+        return Motion(lagged(place, lag / interval), np.gradient(place, interval), place, sides)
+
+
+def lagged(values: Array, samples: float) -> Array:
+    """A signal (N,) behind a first-order lag of a number of samples, straight between them."""
+    out = np.empty(values.size)
+    decay = math.exp(-1.0 / samples) if samples > 0.0 else 0.0
+    slope = samples * (1.0 - decay)
+    out[0] = values[0]
+    lag(values, decay, 1.0 - slope, slope - decay, out)
+    return out
+
+
+@bare
+def lag(values: Array, decay: float, now: float, before: float, out: Array) -> None:
+    """`lagged` into `out` (N,), of which the first is there."""
+    for i in range(1, values.size):
+        out[i] = decay * out[i - 1] + now * values[i] + before * values[i - 1]

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.output_error.fit import Fit, Search, descend, only_rounding
-from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.models import DELAY, HALF, RATIO, Flags
 from servotwin.plant.signals import Array
 
 _FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next, of the gap, and their growth
@@ -28,14 +28,31 @@ _STEPS, _DEEPER = 15, 8
 _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
 _INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
 _IMPOSSIBLE = 200.0  # rise of the cost in noise, over its variance; in rounding the cost doubles
+_WALL = 0.1  # of that rise: what may be a wall
 _PATIENCE = 0.1  # logarithm of a ratio of gaps
 
 
 class PossibleHalf(NamedTuple):
-    """Half gap that a window leaves possible, m or rad at the load: mean and standard deviation."""
+    """Half gap that a window leaves possible, m or rad at the load: mean and standard deviation.
+
+    Attributes
+    ----------
+    mean, std : float
+    unknowns : (u,) array
+        Means of all unknowns.
+    ratio_std : float
+        Standard deviation of the logarithm of the transmission's ratio.
+    """
 
     mean: float
     std: float
+    unknowns: Array
+    ratio_std: float
+
+    @property
+    def ratio(self) -> float:
+        """Logarithm of the transmission's ratio over the model's."""
+        return float(self.unknowns[RATIO])
 
 
 def possible_half(found: Search) -> PossibleHalf | None:
@@ -55,8 +72,27 @@ def possible_half(found: Search) -> PossibleHalf | None:
         widths = np.minimum(widths, [_BELL * fit.std(HALF, found.free) for fit in fits])
         weights = widths * _in_noise(found, fits)
     weights /= weights.sum()
-    mean = float(weights @ halves)
-    return PossibleHalf(mean, math.sqrt(float(weights @ ((halves - mean) ** 2 + widths**2 / 12.0))))
+    values = np.array([fit.values for fit in fits])
+    half = _moments(weights, halves, widths / math.sqrt(12.0))
+    _, ratio_std = _moments(weights, values[:, RATIO], np.array([_ratio_std(found, fit, rounding) for fit in fits]))
+    return PossibleHalf(*half, weights @ values, ratio_std)
+
+
+def _moments(weights: Array, values: Array, spreads: Array) -> tuple[float, float]:
+    """Mean and standard deviation of values (f,) that have spreads of their own."""
+    mean = float(weights @ values)
+    return mean, math.sqrt(float(weights @ ((values - mean) ** 2 + spreads**2)))
+
+
+def _ratio_std(found: Search, fit: Fit, rounding: bool) -> float:
+    """Standard deviation of the ratio's logarithm at the half gap of a fit."""
+    free = found.free.copy()
+    free[HALF] = False
+    std, known = fit.std(RATIO, free), found.problem.model.unknowns[RATIO].std
+    if not rounding:
+        return std
+    told = max(0.0, std**-2 - known**-2) * min(1.0, _INDEPENDENT / fit.raw.size)
+    return 1.0 / math.sqrt(told + known**-2)
 
 
 def _deepest(found: Search, fit: Fit, width: float) -> Fit:
@@ -97,8 +133,18 @@ def _profile(found: Search, side: float, rise: float) -> Iterator[Fit]:
         start = fit.values.copy()
         start[HALF] = best * math.exp(side * share)
         fit = descend(found.problem, start, found.noise, free, _STEPS)
+        if fit.cost > found.best.cost + _WALL * rise:
+            fit = min((fit, *_a_sample_away(found, fit, free)), key=lambda one: one.cost)
         likely = share if fit.cost < found.best.cost + rise else likely
         yield fit
+
+
+def _a_sample_away(found: Search, fit: Fit, free: Flags) -> Iterator[Fit]:
+    """Fits at the same half gap with a delay of a sample less or more."""
+    for samples in (-1.0, 1.0):
+        start = fit.values.copy()
+        start[DELAY] += samples * found.problem.interval
+        yield descend(found.problem, start, found.noise, free, _STEPS)
 
 
 def _prior(found: Search, fit: Fit) -> float:

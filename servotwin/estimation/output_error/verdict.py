@@ -82,7 +82,8 @@ def judge(
     growth = grown(found, settings.gap_rate / unit)
     floor = 0.5 * _ROUNDED * problem.count
     total = math.hypot(_DOUBT * std, settings.model_share * half, floor, growth, _RATCHET * jitter)
-    mismatches = _mismatches(found, settings.gap_rate / unit, settings.model_share * half)
+    likely = best.values if possible is None else possible.unknowns
+    mismatches = _mismatches(found, likely, settings.gap_rate / unit, settings.model_share * half)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     single = one_flank(found)
@@ -118,8 +119,11 @@ def _rival(found: Search, half: float, total: float, unit: float) -> str:
     return ""
 
 
-def _mismatches(found: Search, rate: float, least: float) -> tuple[str, ...]:
-    """List the signs that the model is not that of the machine; a `least` error (m or rad at the load) is none."""
+def _mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple[str, ...]:
+    """List the signs that the model is not that of the machine; a `least` error (m or rad at the load) is none.
+
+    `likely` (u,) are the unknowns as the window makes them likely: errors of rounding bend those of the best fit.
+    """
     best, problem = found.best, found.problem
     sentences = []
     variation = float(np.std(problem.position))
@@ -131,22 +135,22 @@ def _mismatches(found: Search, rate: float, least: float) -> tuple[str, ...]:
         sentences.append(
             f"the model leaves motion of {100.0 * slow / best.values[HALF]:.0f} % of half the gap unexplained"
         )
-    sentences += unusual_numbers(found)
+    sentences += unusual_numbers(found, likely)
     sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
     return tuple(sentences)
 
 
-def unusual_numbers(found: Search) -> tuple[str, ...]:
-    """List the numbers of the model that would have to be far off what is known of them."""
-    best, problem, sentences = found.best, found.problem, list[str]()
+def unusual_numbers(found: Search, likely: Array) -> tuple[str, ...]:
+    """List the unknowns (u,), as they are `likely`, that would have to be far off what is known of them."""
+    problem, sentences = found.problem, list[str]()
     limits = problem.limits()
     for i, unknown in enumerate(problem.model.unknowns):
-        size = abs(float(best.values[i]))
+        size = abs(float(likely[i]))
         known = math.isfinite(unknown.std) and unknown.unit != "damping"
         if known and (size > _UNUSUAL * unknown.std or size >= limits[i]):
             late = unknown.unit == "time"
-            change = f"{1e3 * best.values[i]:+.3g} ms" if late else f"{100.0 * math.expm1(best.values[i]):+.2g} %"
+            change = f"{1e3 * likely[i]:+.3g} ms" if late else f"{100.0 * math.expm1(likely[i]):+.2g} %"
             sentences.append(f"the {unknown.name} would be off by {change}")
     return tuple(sentences)
 

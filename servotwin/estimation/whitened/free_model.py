@@ -29,6 +29,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 FACTORS = ("k/m", "c/m", "pitch", "mass ratio")
+PITCH = FACTORS.index("pitch")
 FREEDOM = (0.1, 0.5, 0.05, 0.1)  # relative standard deviations of the factors where nothing else is known of them
 LARGEST = 4.0  # standard deviations by which a factor may move
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
@@ -67,6 +68,18 @@ class FactorPrior:
         """Make a prior of plain numbers, bit for bit."""
         covariance = np.array(numbers.covariance).reshape(len(numbers.factors), -1)
         return cls(np.array(numbers.factors), covariance, numbers.softness)
+
+    def with_pitch(self, mean: float, std: float) -> FactorPrior:
+        """The same with other knowledge of the pitch alone, of its logarithm."""
+        means, covariance = self.mean.copy(), self.covariance.copy()
+        covariance[PITCH], covariance[:, PITCH] = 0.0, 0.0
+        means[PITCH], covariance[PITCH, PITCH] = mean, std**2
+        return replace(self, mean=means, covariance=covariance)
+
+    @property
+    def pitch(self) -> tuple[float, float]:
+        """Mean and standard deviation of the pitch's logarithm."""
+        return float(self.mean[PITCH]), math.sqrt(self.covariance[PITCH, PITCH])
 
     @property
     def reading(self) -> MachineReading:
