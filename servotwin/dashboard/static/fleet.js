@@ -257,6 +257,7 @@ export class FleetPage {
     const now = this.live.now(), link = linkOf(row, now);
     setText(cells.servo.lastChild, row.gap === null && !row.status ? "no estimate yet" : statusText(row.status));
     pair(cells.gap, rowGapText(row), travelText(row.gap, row));
+    cells.gap.classList.toggle("known", row.gap !== null);
     pair(cells.rate, rateText(row.rate, row.rate_interval, this.unit), row.rate === null ? "no trend yet" : "");
     pair(cells.limit, limitText(row), limitInterval(row));
     pair(cells.version, String(none(row.version_in_force, "–")), row.version_sent !== null && row.version_sent !== row.version_in_force ? `${row.version_sent} sent` : "");
