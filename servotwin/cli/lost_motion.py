@@ -26,7 +26,7 @@ from servotwin.estimation.kinematic.travel import StatedTravel, in_stated_unit
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
-from servotwin.plant.plants import resolve_plant
+from servotwin.plant.plants import Plant, resolve_plant
 
 _Answer = tuple[RecordedLog, TransmissionGap]
 _DATED = 3e8  # s since 1970: smaller times are no dates
@@ -73,17 +73,10 @@ def show(
     machine = None if axis is None else resolve_plant(axis)
     given = dates_of(dates, len(logs))
     answers = []
+    asked = partial(_answered, columns=columns, machine=machine, stiff=stiff, dynamics=dynamics, travel=travel)
     for path in logs:
         with console.status(path.name) as status:
-            tell = partial(_tell, status, path.name)
-            log = read_recording(path, columns, partial(_tell_samples, tell))
-            tell("models")
-            recording, lost = log.recording, estimate_lost_motion(log.recording)
-            if travel is not None:
-                recording, lost = in_stated_unit(recording, lost, travel)
-                log = replace(log, recording=recording)
-            found = gap_of_recording(recording, lost, machine, stiff=stiff, dynamics=dynamics, tell=tell)
-            answers.append((log, found))
+            answers.append(asked(path, partial(_tell, status, path.name)))
     if page is not None:
         log, found = answers[-1]
         said = Text.from_markup(headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
@@ -92,18 +85,7 @@ def show(
     stamps = [_date(log, day) for (log, _), day in zip(answers, given, strict=True)]
     wear = _wear(answers, stamps)
     if as_json:
-        rows = [
-            as_dict(log, found) | {"date": _iso(stamp.time), "date_from": stamp.origin}
-            for (log, found), stamp in zip(answers, stamps, strict=True)
-        ]
-        if isinstance(wear, _Wear):
-            rows[-1] |= {
-                "growth_of": wear.quantity,
-                "growth_logs": wear.logs,
-                "growth_per_year_load": wear.growth.per_year,
-                "growth_interval_load": list(wear.growth.interval),
-            }
-        print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))
+        _print_json(answers, stamps, wear)
         return
     for log, found in answers:
         _print(console, log, found)
@@ -111,6 +93,26 @@ def show(
         console.print(_change(before, after), highlight=False)
     if wear:
         console.print(_said(wear, answers[-1][0].recording.load_unit), highlight=False)
+
+
+def _answered(
+    path: Path,
+    tell: Callable[[str], object],
+    *,
+    columns: RecordingColumns,
+    machine: Plant | None,
+    stiff: bool,
+    dynamics: bool,
+    travel: StatedTravel | None,
+) -> _Answer:
+    """Read a log and estimate its gap."""
+    log = read_recording(path, columns, partial(_tell_samples, tell))
+    tell("models")
+    recording, lost = log.recording, estimate_lost_motion(log.recording)
+    if travel is not None:
+        recording, lost = in_stated_unit(recording, lost, travel)
+        log = replace(log, recording=recording)
+    return log, gap_of_recording(recording, lost, machine, stiff=stiff, dynamics=dynamics, tell=tell)
 
 
 def dates_of(text: str | None, logs: int) -> list[float | None]:
@@ -221,6 +223,21 @@ def _tell_samples(tell: Callable[[str], object], samples: int) -> None:
 
 def _tell(status: Any, name: str, what: str) -> None:
     status.update(f"{name}: {what}")
+
+
+def _print_json(answers: Sequence[_Answer], stamps: Sequence[_Stamp], wear: _Wear | str) -> None:
+    rows = [
+        as_dict(log, found) | {"date": _iso(stamp.time), "date_from": stamp.origin}
+        for (log, found), stamp in zip(answers, stamps, strict=True)
+    ]
+    if isinstance(wear, _Wear):
+        rows[-1] |= {
+            "growth_of": wear.quantity,
+            "growth_logs": wear.logs,
+            "growth_per_year_load": wear.growth.per_year,
+            "growth_interval_load": list(wear.growth.interval),
+        }
+    print(json.dumps(rows[0] if len(rows) == 1 else rows, indent=2, allow_nan=False))
 
 
 def as_dict(log: RecordedLog, found: TransmissionGap) -> dict[str, Any]:

@@ -106,10 +106,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     for name, rows in new.items():
         if not rows.all():
             found[f"repeats of a {name} that is written more often than it is measured"] = int(np.sum(~rows))
-    # Where one channel has news, its repeats of another stay: what a hold delays is the fit's lag.
-    told = np.any(list(new.values()), axis=0) | np.any(np.diff(table[:, 1:], axis=0, prepend=np.nan) != 0.0, axis=1)
-    if not all(rows.all() for rows in new.values()):
-        keep(told, REPEATED)
+    keep(_telling(table[:, 1:], list(new.values())), REPEATED)
     if gaps := pauses(table[:, 0]):
         found["pauses longer than five intervals"] = len(gaps)
     return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found, parted)
@@ -122,6 +119,16 @@ def _alone_at_the_end(time: Array) -> _Mask:
     if intervals.size > 1:
         result[-1] = intervals[-1] > _STALE * np.median(intervals) > 0.0
     return result
+
+
+def _telling(table: Array, new: Sequence[_Mask]) -> _Mask:
+    """False for rows in which no channel is new, and none differs from the row before.
+
+    Where one channel has news, repeats of another stay: what a hold delays is the fit's lag.
+    """
+    if all(rows.all() for rows in new):
+        return np.ones(len(table), dtype=np.bool_)
+    return np.any([*new, *(np.diff(table, axis=0, prepend=np.nan) != 0.0).T], axis=0)
 
 
 def _new(values: Array) -> _Mask:

@@ -23,8 +23,8 @@ from servotwin.plant.transmission import FREE
 PAUSE = 12.0
 """Usual intervals, over which nothing says how the machine moved."""
 _ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
-# Of the motion: of 30 simulated logs of screws, gantries and telescopes, held by friction, 0 were on the other flank,
-# and 0.03 to 0.6 of 33 logs of drives and joints whose loads roll on, whatever the play was found to be.
+# Of the motion: in 24 simulated logs of screws, gantries and telescopes, held by friction, none is on the other flank,
+# and 3 to 64 % in 32 logs of drives and joints whose loads roll on.
 _OTHER_FLANK = 0.01
 _STROKE, _WINDOW, _LEAST = 0.1, 0.1, 7  # of the motor's range; of a stroke, and samples, at least, of a parabola
 _AT_REST = 0.05  # of the fastest motion

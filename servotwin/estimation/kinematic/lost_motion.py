@@ -14,7 +14,7 @@ from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
 from servotwin.estimation.kinematic.local import LocalGap, drift_of, local_gaps
-from servotwin.estimation.kinematic.models import Model, ModelScore, chosen
+from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, undecided
 from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import (
@@ -335,6 +335,7 @@ def _answer(
             of_none=(best.rms / comparisons[-1].rms) ** 2 if comparisons[-1].rms else 1.0,
             accelerated=INERTIA in best.model.used,
             lead=_lead(prepared),
+            richer=tuple(each.gap for each in undecided(best, comparisons[:-1])),
             reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),
         ),
         recording.motor_unit,

@@ -136,6 +136,12 @@ def chosen(comparisons: Sequence[ModelScore]) -> ModelScore:
     return best
 
 
+def undecided(best: ModelScore, comparisons: Sequence[ModelScore]) -> tuple[ModelScore, ...]:
+    """The models that contain the chosen one and would be chosen if the log were longer."""
+    wider = [each for each in comparisons if set(best.model.used) < set(each.model.used)]
+    return tuple(each for each in wider if 1.0 - _gain(best, each).share > _WORTH)
+
+
 class _Gain(NamedTuple):
     """Mean square error of a model over that of a simpler one, and standard errors by which it is less."""
 

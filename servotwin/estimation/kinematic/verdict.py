@@ -54,6 +54,8 @@ class KinematicFit(NamedTuple):
         From the least to the largest lead of the motor over the load: no gap that the load takes up is larger.
     accelerated : bool
         The model has wind-up by acceleration.
+    richer : tuple of float
+        Gaps of richer models that predict unseen strokes better, but not by enough to be chosen.
     lead : float
         s, by which the load would be ahead of the motor, if by more than two samples; or 0.
     """
@@ -70,6 +72,7 @@ class KinematicFit(NamedTuple):
     reach: float
     accelerated: bool
     lead: float
+    richer: tuple[float, ...] = ()
 
     @property
     def differs(self) -> bool:
@@ -93,7 +96,9 @@ class KinematicVerdict(NamedTuple):
 
 def verdict(fit: KinematicFit, unit: str) -> KinematicVerdict:
     """Judge a fit; `unit` is the motor's."""
-    low, high = fit.gap - fit.half, fit.gap + fit.half
+    # What the log does not decide the interval leaves open: a lag of half a sample in a log of few counts, for one.
+    gaps = (fit.gap, *fit.richer)
+    low, high = min(gaps) - fit.half, max(gaps) + fit.half
     none = low <= 0.0 or not fit.of_none < 1.0
     if fit.left > max(_LEFT_AT_MOST * fit.gap, _COUNTS * fit.quantisation):
         reason = (

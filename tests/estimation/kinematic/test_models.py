@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, trials
+from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, trials, undecided
 
 
 def scored(name, squares):
@@ -36,3 +36,13 @@ def test_each_model_is_told_with_what_speaks_for_it(scores):
 def test_where_no_gap_predicts_as_well_that_is_said(scores):
     assert trials((*scores[:-1], scored("no gap, lag", [0.5, 0.6, 0.5, 0.6])))[-1].evidence.startswith("no gap is need")
     assert trials(()) == ()
+
+
+def test_a_richer_model_that_predicts_better_but_not_for_sure_is_undecided():
+    rigid = scored("rigid", [4.0, 1.0, 3.8, 4.1])
+    better, worse = (
+        ModelScore(Model(name, (*rigid.model.used, name)), 0.1, np.array(squares), 1.0)
+        for name, squares in (("lag", [1.0, 4.0, 3.0, 1.0]), ("cycle", [4.0, 1.0, 3.8, 4.1]))
+    )
+    assert undecided(rigid, (rigid, better, worse)) == (better,)
+    assert undecided(better, (rigid, better, worse)) == ()

@@ -64,3 +64,16 @@ def test_weightings_that_differ_by_less_than_a_hundredth_widen_the_interval_and_
     far = verdict(fit._replace(by_travel=1.02), "rad")
     assert far.status is GapStatus.MODEL_MISMATCH
     assert far.interval[1] == 1.4
+
+
+def test_a_richer_model_that_may_be_right_widens_the_interval():
+    # A gap of two counts, and a lag that nearly shows: 2.3 to 4.3 counts, ok, for 2.
+    spread = Spread(*(np.full(300, 1.0) for _ in range(3)), 10)
+    numbers = {"simpler": {}, "spread": spread, "half": 0.3, "quantisation": 0.1, "left": 0.02, "rms": 0.02}
+    fit = KinematicFit(
+        gap=1.0, by_travel=1.0, of_none=0.1, reach=1.4, accelerated=False, lead=0.0, richer=(0.75,), **numbers
+    )
+    judged = verdict(fit, "rad")
+    assert judged.status is GapStatus.OK
+    assert judged.interval == pytest.approx((0.45, 1.3))
+    assert verdict(fit._replace(richer=(0.2,)), "rad").status is GapStatus.UNIDENTIFIABLE
