@@ -100,7 +100,7 @@ def test_a_spike_is_told_from_noise_and_counts():
     for angle in (moving_angle(), noisy, 0.05 * np.round(noisy / 0.05), rng.normal(size=5000)):
         assert faults_of(angle) == ()
         spiked = angle.copy()
-        spiked[2300] += 10.0 * np.std(angle)
+        spiked[2300] += 20.0 * np.std(angle)
         (sentence,) = faults_of(spiked)
         assert "2300" in sentence
     spiked = moving_angle()
