@@ -94,6 +94,22 @@ def test_a_motor_that_friction_held_until_its_voltage_stepped_was_not_held_by_it
     assert faults_of(angle) == ()
 
 
+def test_a_spike_is_told_from_noise_and_counts():
+    rng = np.random.default_rng(3)
+    noisy = moving_angle() + 0.05 * rng.normal(size=5000)
+    for angle in (moving_angle(), noisy, 0.05 * np.round(noisy / 0.05), rng.normal(size=5000)):
+        assert faults_of(angle) == ()
+        spiked = angle.copy()
+        spiked[2300] += 20.0 * np.std(angle)
+        (sentence,) = faults_of(spiked)
+        assert "2300" in sentence
+    spiked = moving_angle()
+    spiked[2300] -= 0.1  # a small one, no jump of a wrapped encoder
+    (sentence,) = faults_of(spiked)
+    assert "theta_m leaves its neighbours by" in sentence
+    assert "in sample 2300 alone" in sentence
+
+
 def test_a_ramp_of_the_gap_is_refused_or_lies_within_the_interval():
     for case in corrupted_windows("ramp of 2 deg/s", 6, 11):
         estimate = estimate_gap(case.window, case.servo)

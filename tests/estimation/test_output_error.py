@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
 from exploration import explored, extent, sized
+from scipy.signal import lfilter
 
 from benchmarks.axis_windows import SCREW, SHAFT, screw_case, shaft_case, tally
 from servotwin.control.controller import Controller

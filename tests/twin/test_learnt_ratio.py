@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ TWO_PLACES, MANY_PLACES = (1.0, -1.0, 1.0), (1.0, -0.6, 0.2, -1.0, 0.8, -0.3, 1.
 def creeping(places: Sequence[float]) -> Array:
     """Motor's angle (N,) of an axis that goes to places, shares of 150 um, 1 s each."""
     ends, time = 150e-6 / STAGE.p * np.array(places), np.arange(1000) / 1000.0
-    parts = [b + (a - b) * np.exp(-8.0 * time) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    parts = [b + (a - b) * np.exp(-8.0 * time) for a, b in pairwise(ends)]
     return np.concatenate(parts)
 
 

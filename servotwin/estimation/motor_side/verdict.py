@@ -30,7 +30,11 @@ def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedFit:
     left = float(np.std(best.raw) / np.std(shut.raw))
     if reason := _unseen(found, shut, left, settings):
         return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(reason,))
-    mismatches = unusual_numbers(found, found.best.values) + _unusual_friction(found) + differing_halves(found, settings.gap_rate / unit)
+    mismatches = (
+        unusual_numbers(found, found.best.values)
+        + _unusual_friction(found)
+        + differing_halves(found, settings.gap_rate / unit)
+    )
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     std = best.std(HALF, found.free)

@@ -99,9 +99,7 @@ def fit(
     return _fit(window, theta_m, axis, prior, settings)[0]
 
 
-def _known(
-    axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None
-) -> tuple[Axis, OutputErrorSettings]:
+def _known(axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None) -> tuple[Axis, OutputErrorSettings]:
     """The axis with the ratio that is known of it, and the settings with that ratio's spread."""
     if machine is None or axis.backlash_kind is BacklashKind.FREE:
         return axis, settings

@@ -29,7 +29,7 @@ _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distr
 _INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
 _IMPOSSIBLE = 200.0  # rise of the cost in noise, over its variance; in rounding the cost doubles
 _WALL = 0.1  # of that rise: what may be a wall
-_PATIENCE = 0.1  # logarithm of a ratio of gaps
+_PATIENCE = 0.03  # logarithm of a ratio of gaps
 
 
 class PossibleHalf(NamedTuple):

@@ -11,6 +11,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
+from servotwin.estimation.core.visible import counted
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.fit import gaps_to_try
 from servotwin.estimation.whitened.gate import slow
@@ -23,6 +24,7 @@ from servotwin.plant.signals import Array
 
 _FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; share of the fastest motion there
 _JUMP = 50.0  # times the usual fastest motion
+_SPIKE, _SHOWN, _SPIKE_COUNTS = 8.0, 0.01, 2.0  # of the median step, of the motion's range; counts
 # Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
 _REPEATED, _ABRUPT, _LEAP = 4, 4.0, 2.0
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
@@ -49,7 +51,28 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
             f"{name} jumps by {factor * steps[index]:.6g} {unit} between samples {index} and {index + 1}: a wrapped "
             "encoder, or samples are missing"
         )
-    return _saturation(name, samples, steps, factor, unit) or _repeating(name, steps)
+    return (
+        _saturation(name, samples, steps, factor, unit)
+        or _repeating(name, steps)
+        or _spike(name, samples, factor, unit)
+    )
+
+
+def _spike(name: str, samples: Array, factor: float, unit: str) -> str:
+    """Describe a sample that leaves its neighbours and comes back at once; empty without one.
+
+    No motion does: at its crests both steps are small. Noise does by a few of its standard deviations, which the median
+    step is, and a counter by one count.
+    """
+    steps, span = np.diff(samples), float(np.ptp(samples))
+    back = np.where(steps[1:] * steps[:-1] < 0.0, np.minimum(np.abs(steps[1:]), np.abs(steps[:-1])), 0.0)
+    index = int(np.argmax(back))
+    size, least = float(back[index]), max(_SPIKE * float(np.median(np.abs(steps))), _SHOWN * span)
+    if size <= least or size <= _SPIKE_COUNTS * counted(samples):
+        return ""
+    return (
+        f"{name} leaves its neighbours by {factor * size:.6g} {unit} in sample {index + 1} alone: a fault of the sensor"
+    )
 
 
 def _usual(steps: Array) -> float:
