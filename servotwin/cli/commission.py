@@ -7,11 +7,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from servotwin.cli.commission_json import WORDS, as_dict, units_of
 from servotwin.commissioning.commission import CommissionedAxis, commission
 from servotwin.commissioning.scenario_file import scenario_of
 from servotwin.errors import InvalidInput
@@ -20,22 +20,11 @@ from servotwin.estimation.inverse_dynamics.closed_loop import FittedLaw
 from servotwin.estimation.inverse_dynamics.fit import ParameterFit
 from servotwin.estimation.inverse_dynamics.fitted_pid import FittedPid
 from servotwin.estimation.inverse_dynamics.identify import GivenLaw
-from servotwin.estimation.kinematic.wind_up import gap_within
-from servotwin.logs.drive_recordings import DriveColumns, DriveLog
+from servotwin.logs.drive_recordings import DriveColumns
 from servotwin.plant.axis import Axis
 from servotwin.runtime import files
 
 _DECIMALS = 8  # smaller numbers are shown with a power of ten
-_WORDS = {
-    "inertia": "inertia",
-    "viscous": "viscous friction",
-    "coulomb": "Coulomb friction",
-    "offset": "offset",
-    "viscous_forward": "viscous, forwards",
-    "coulomb_forward": "Coulomb, forwards",
-    "viscous_backward": "viscous, backwards",
-    "coulomb_backward": "Coulomb, backwards",
-}
 
 
 @dataclass(frozen=True)
@@ -154,8 +143,8 @@ def headline(found: CommissionedAxis) -> str:
 
 
 def _lines(found: CommissionedAxis, fit: ParameterFit) -> list[str]:
-    units = _units(found)
-    return [f"{_WORDS[name]} {_number(fit, name)} {units[name]}" for name in fit.names]
+    units = units_of(found)
+    return [f"{WORDS[name]} {_number(fit, name)} {units[name]}" for name in fit.names]
 
 
 def _number(fit: ParameterFit, name: str) -> str:
@@ -165,18 +154,6 @@ def _number(fit: ParameterFit, name: str) -> str:
     if decimals > _DECIMALS:
         return f"{value:.6g} ± {half:.2g}"
     return " ± ".join(f"{round(each, decimals):.{max(0, decimals)}f}" for each in (value, half))
-
-
-def _units(found: CommissionedAxis) -> dict[str, str]:
-    recording = found.logs[0].recording
-    force, position = recording.force_unit, recording.unit
-    if found.force_per_command is not None:
-        inertia, viscous = ("kg m^2", "N m s/rad") if recording.rotary else ("kg", "N s/m")
-    else:
-        inertia, viscous = f"{force} s^2/{position}", f"{force} s/{position}"
-    return {
-        name: inertia if name == "inertia" else viscous if name.startswith("viscous") else force for name in (*_WORDS,)
-    }
 
 
 def _print(console: Console, found: CommissionedAxis) -> None:
@@ -202,7 +179,7 @@ def _print(console: Console, found: CommissionedAxis) -> None:
 
 
 def _table(found: CommissionedAxis) -> Table:
-    units, drive = _units(found), found.drive
+    units, drive = units_of(found), found.drive
     table = Table("parameter (± 95 %)", "inverse dynamics", "simulated loop", "unit", box=None, pad_edge=False)
     refined = drive.refinement
     pairs = [
@@ -214,7 +191,7 @@ def _table(found: CommissionedAxis) -> Table:
             if first is drive.asymmetric and name == "inertia":
                 continue
             shown = "-" if second is None else _number(second, name)
-            table.add_row(_WORDS[name], _number(first, name), shown, units[name])
+            table.add_row(WORDS[name], _number(first, name), shown, units[name])
     errors = [f"{100.0 * first.relative_error:.2f}" for first, _ in pairs]
     table.add_row(
         "command not explained",
@@ -242,20 +219,6 @@ def _law(law: FittedLaw, found: CommissionedAxis) -> str:
         f"controller: position gain {law.position_gain:.5g} 1/s, velocity gain {law.velocity_gain / scale:.5g} "
         f"{command} s/{unit}{reset}, speed filter {1e3 * law.speed_filter:.3g} ms; {left}"
     )
-
-
-def _law_dict(law: FittedLaw | None) -> dict[str, Any] | None:
-    if law is None:
-        return None
-    if isinstance(law, FittedPid):
-        return {"kind": "pid", "kp": law.Kp, "ki": law.Ki, "kd": law.Kd, "filter_time_s": law.Tf}
-    return {
-        "kind": "cascade",
-        "position_gain_per_s": law.position_gain,
-        "velocity_gain": law.velocity_gain,
-        "integral_time_s": law.integral_time,
-        "speed_filter_s": law.speed_filter,
-    }
 
 
 def _remarks(found: CommissionedAxis) -> list[str]:
@@ -320,88 +283,9 @@ def _shaft_lines(found: CommissionedAxis) -> list[str]:
         load, motor = split["load_inertia"], split["motor_inertia"]
         lines.append(
             f"shaft: {load:.4g} ± {split.half_width('load_inertia'):.2g} (95 %) behind and {motor:.4g} before it, "
-            f"{_units(found)['inertia']}; stiffness {shaft.stiffness(load):.4g}, "
+            f"{units_of(found)['inertia']}; stiffness {shaft.stiffness(load):.4g}, "
             f"damping {shaft.shaft_damping(load):.4g}"
         )
     else:
         lines.append("shaft: taken as rigid: in this log its elasticity cannot be told from the gap")
     return lines
-
-
-def _shaft_dict(found: CommissionedAxis) -> dict[str, Any] | None:
-    shaft, split = found.drive.shaft, found.drive.split
-    if shaft is None:
-        return None
-
-    def number(value: float) -> float | None:
-        return value if math.isfinite(value) else None
-
-    load = math.nan if split is None else split["load_inertia"]
-    return {
-        "resonance_hz": number(shaft.resonance),
-        "resonance_std_hz": number(shaft.resonance_std),
-        "damping_ratio": number(shaft.damping),
-        "delay_s": shaft.delay,
-        "delay_std_s": shaft.delay_std,
-        "coherent_up_to_hz": shaft.highest,
-        "load_inertia": number(load),
-        "motor_inertia": None if split is None else split["motor_inertia"],
-        "stiffness": number(shaft.stiffness(load)),
-        "damping": number(shaft.shaft_damping(load)),
-    }
-
-
-def _gap_dict(log: DriveLog) -> dict[str, Any] | None:
-    if log.lost_motion is None:
-        return None
-    found = gap_within(log.lost_motion, None)
-    lost = found.lost
-    known = all(map(math.isfinite, (lost.at_load, *lost.interval_load)))
-    return {
-        "status": found.status.value,
-        "lost_motion_load": lost.at_load if known else None,
-        "lost_motion_interval_load": list(lost.interval_load) if known else None,
-        "interval_load": list(found.interval_load) if known else None,
-        "unit": log.recording.unit,
-    }
-
-
-def as_dict(found: CommissionedAxis) -> dict[str, Any]:
-    """Make the JSON object; null where there is no number."""
-    drive, units = found.drive, _units(found)
-    refined = drive.refinement
-
-    def fit(each: ParameterFit) -> dict[str, Any]:
-        parameters = {
-            name: {
-                "value": each[name],
-                "std": each.std(name),
-                "half_width_95": each.half_width(name),
-                "unit": units[name],
-            }
-            for name in each.names
-        }
-        shared = {"relative_error": each.relative_error, "condition": each.condition}
-        return {"parameters": parameters, **shared}
-
-    return {
-        "logs": [log.recording.source.removeprefix("log ") for log in found.logs],
-        "corner_hz": [band.corner for band in drive.bands],
-        "inverse_dynamics": {"symmetric": fit(drive.symmetric), "asymmetric": fit(drive.asymmetric)},
-        "simulated_loop": None
-        if refined is None
-        else {
-            "symmetric": fit(refined.symmetric),
-            "asymmetric": fit(refined.asymmetric),
-            "position_error": refined.simulated.position_error,
-            "force_error": refined.simulated.force_error,
-            "converged": refined.converged,
-        },
-        "controller": _law_dict(drive.law),
-        "shaft": _shaft_dict(found),
-        "gap": _gap_dict(found.logs[0]),
-        "force_per_command": found.force_per_command,
-        "doubts": list(drive.doubts),
-        "late": drive.late or None,
-        "next_experiment": str(drive.advice),
-    }

@@ -11,14 +11,14 @@ from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, TypeAlias, Unpack
+from typing import Annotated, Any, NamedTuple, Unpack
 
 import numpy as np
 
 from servotwin.config.keys import check, items_of, key, settings
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps, read, values_of
-from servotwin.control.controller import Controller, ControllerChanges
+from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, filtered_pid
 from servotwin.errors import InvalidInput
 from servotwin.plant import loop
@@ -28,11 +28,11 @@ from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
 from servotwin.plant.numbers import tolerance_of
+from servotwin.plant.servo_changes import PerMass, ServoChanges
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.runtime.notebook import html_table
 
-PerMass: TypeAlias = float | tuple[float, ...]
 _PLANT = (
     "J", "L", "R", "k_T", "k_B", "p", "k_d", "n", "m", "k", "c", "encoder_resolution", "position_resolution",
 )  # fmt: skip
@@ -49,25 +49,6 @@ class Control(NamedTuple):
     C: Any
     loop: Any
     closed_loop: Any
-
-
-class ServoChanges(ControllerChanges, total=False):
-    """The keywords of `Servo.replace`: the fields of `Servo` and of its `Controller`, each of them optional."""
-
-    m: PerMass
-    k: PerMass
-    c: PerMass
-    J: float
-    p: float
-    L: float
-    R: float
-    k_T: float
-    k_B: float
-    controller: AnyController
-    n: int
-    k_d: float
-    encoder_resolution: float
-    position_resolution: float
 
 
 @settings("servo")

@@ -21,7 +21,8 @@ from servotwin.plant.basis import BacklashKind, Stribeck
 from servotwin.plant.motor import Motor
 from servotwin.plant.plants import Plant
 from servotwin.plant.rest import Rest
-from servotwin.plant.servo import PerMass, Servo
+from servotwin.plant.servo import Servo
+from servotwin.plant.servo_changes import PerMass
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
 

@@ -18,7 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite, needed_fields
 from servotwin.messages.legacy import upgrade
-from servotwin.redesign.certified.certificate import verification_of
+from servotwin.redesign.certified.verification import verification_of
 from servotwin.redesign.design import decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 from servotwin.twin.lookups import LookupState

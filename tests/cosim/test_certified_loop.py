@@ -9,7 +9,8 @@ import pytest
 from servotwin.cosim import Loop, cosimulate
 from servotwin.cosim.scenario import Recording, Scenario
 from servotwin.estimation.estimate import GapStatus
-from servotwin.redesign.certified.certificate import Certificate, verification_of
+from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.verification import verification_of
 from servotwin.redesign.registry import certified_policy
 from servotwin.twin.settings import TwinSettings
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
-from servotwin.messages import Verification
 from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.uncertainty import LARGEST_DELAY
@@ -381,22 +380,3 @@ class NotVerified:
 
     reason: str
     best: Certificate | None = None
-
-
-def verification_of(certificate: Certificate) -> Verification:
-    """Summarise a certificate for an update, without its computing time: equal twins send equal bytes."""
-    return Verification(
-        members=certificate.members,
-        looked_at=certificate.looked_at,
-        settled=certificate.settled,
-        tail=certificate.tail,
-        overshoot=certificate.overshoot,
-        Ms=certificate.Ms,
-        crossover=certificate.crossover,
-        phase_margin=certificate.phase_margin,
-        saturated=certificate.saturated,
-        settled_least=certificate.settled_least,
-        confidence=certificate.confidence if certificate.settled_least else 0.0,
-        Ms_worst=0.0 if certificate.loop is None else certificate.loop.Ms_worst,
-        phase_margin_worst=0.0 if certificate.loop is None else certificate.loop.phase_margin_worst,
-    )
