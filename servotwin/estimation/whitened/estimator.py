@@ -222,9 +222,9 @@ def fit_gap_only(
     if made.broken:
         return made
     here = servo if machine is None else adapted(servo, machine.mean)
-    channels = made.angle, window.position, window.sample_rate
-    _, points = coarse_search(*channels, here, _start(prior), made.settings)
-    return replace(made, servo=here, aligned=align_and_fit(*channels, here, points, made.settings))
+    position, rate = window.position, window.sample_rate
+    _, points = coarse_search(made.angle, position, rate, here, _start(prior), made.settings)
+    return replace(made, servo=here, aligned=align_and_fit(made.angle, position, rate, here, points, made.settings))
 
 
 def _unfitted(
