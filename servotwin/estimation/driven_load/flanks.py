@@ -22,7 +22,6 @@ from servotwin.plant.transmission import FREE
 
 PAUSE = 12.0
 """Usual intervals, over which nothing says how the machine moved."""
-_ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
 # Of the motion: in 24 simulated logs of screws, gantries and telescopes, held by friction, none is on the other flank,
 # and 3 to 64 % in 32 logs of drives and joints whose loads roll on.
 _OTHER_FLANK = 0.01
@@ -62,7 +61,8 @@ def with_forces(recording: EncoderRecording, found: TransmissionGap, machine: Pl
     if not share > _OTHER_FLANK or found.status is GapStatus.LOWER_BOUND:
         return found
     lost = found.lost
-    lead = 0.0 if lost.curves is None else float(np.ptp(np.quantile(lost.curves.lead, _ENDS)))
+    # The largest lead with the lag left in, and its single samples: a gap that a fit takes for a lag is in it too.
+    lead = float(np.ptp(recording.motor - recording.load / lost.ratio))
     reason = (
         f"in {100.0 * share:.2g} % of the motion the inertia of --axis's load is larger than its friction: there it "
         "runs ahead of its motor, to the other flank of the gap, which no model without dynamics has"
