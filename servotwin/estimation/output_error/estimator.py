@@ -81,7 +81,8 @@ def estimate(
     found, noise = _fit(window, theta_m, axis, prior, settings)
     unit, possible = 2.0 / axis.p, possible_half(found)
     stated = _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
-    if machine is None or possible is None or not stated.ok:
+    # A spread that is small beside the motor's travel only is too large to tell a ratio.
+    if machine is None or possible is None or not (stated.ok and stated.std <= settings.largest_share * stated.gap):
         return stated
     return replace(stated, machine=_taught(machine, possible, settings.calibration))
 
