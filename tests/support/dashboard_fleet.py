@@ -65,6 +65,13 @@ def wearing_fleet(folder: Path, ended: float, others: int = 0, service: str = ""
     return path
 
 
+def recorded_windows(folder: Path, seconds: float) -> tuple[WindowMessage, ...]:
+    """Windows of `WEARING`, also of the time after what `wearing_fleet` stores."""
+    scenario = folder / "longer.toml"
+    scenario.write_text(SCENARIO)
+    return st.cosimulate(st.Scenario.load(scenario).replace(duration=seconds)).windows
+
+
 def _wear(path: Path, store: Store, begun: float) -> None:
     """Let a deployed twin work on what the edge of a co-simulation sent."""
     scenario = path.parent / "scenario.toml"
