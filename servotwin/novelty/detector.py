@@ -261,7 +261,9 @@ def _relearnt(state: NoveltyState, cut: Cut, rules: NoveltyRules) -> Chart:
         return with_fewer_windows(state.chart, rules.relearn)
     if state.update_gap is None or cut.gap is None:
         return restarted(state.chart)
-    return restarted(state.chart, state.chart.gap + cut.gap - state.update_gap, 1.0 / (rules.settle * rules.settle))
+    return restarted(
+        state.chart, state.chart.gap + cut.gap - state.update_gap, 1.0 / (rules.baseline_move * rules.baseline_move)
+    )
 
 
 def _rested(state: NoveltyState, leads: list[float]) -> NoveltyState:

@@ -175,11 +175,11 @@ class NoveltyRules:
             "less.",
         ),
     ] = None
-    settle: Annotated[
+    baseline_move: Annotated[
         float,
         key(
-            "settle_deg",
-            "settle_rad",
+            "baseline_move_deg",
+            "baseline_move_rad",
             above=0.0,
             help="Largest move of the baseline by an update whose window was not scored.",
         ),
