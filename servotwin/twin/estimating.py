@@ -56,7 +56,7 @@ def stated_machine(settings: TwinSettings) -> FactorPrior:
 
 
 def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
-    """What is known of a machine before its first window; None: it is not learnt, and keeps the numbers of its model.
+    """Knowledge of a machine before its first window; None: it is not learnt, and keeps the numbers of its model.
 
     Of one mass behind a rigid transmission only the ratio shows; it is known better where nothing is stated of it.
     """

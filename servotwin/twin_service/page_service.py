@@ -26,7 +26,7 @@ _READERS = 2
 
 
 class PageService:
-    """What the pages of the dashboard ask for, apart from the work for the machines.
+    """Service of what the dashboard's pages ask for, apart from the work for the machines.
 
     Parameters
     ----------
