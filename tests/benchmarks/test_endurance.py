@@ -115,7 +115,10 @@ def test_an_outbox_that_cannot_be_read_is_no_empty_one(tmp_path: Path, monkeypat
 
 
 def test_a_process_that_ends_without_a_fault_is_counted_once(tmp_path: Path) -> None:
-    for code, alone in (("raise SystemExit(2)", 1), ("import time; time.sleep(60)", 0)):
+    # The one that ends does so the first time only: what it is killed in must still run.
+    seen, sleep = tmp_path / "seen", "import time; time.sleep(60)"
+    ends = f"import os\nif not os.path.exists({str(seen)!r}):\n open({str(seen)!r}, 'w').close(); os._exit(2)\n{sleep}"
+    for code, alone in ((ends, 1), (sleep, 0)):
         member = Member(tmp_path, tmp_path / "log", "-c", code)
         member.start()
         if alone:
