@@ -36,17 +36,18 @@ def test_a_version_waits_is_approved_and_the_machine_is_rolled_back(open_page, t
     windows = [window for window in recorded_windows(tmp_path, SECONDS + 20.0) if window.start >= SECONDS - 1.0]
     page = open_page(login=ENGINEER)
     open_machine(page, WEARING)
-    before = page.locator("[aria-label=Updates] tbody tr").count()
+    updates = page.locator("[aria-label=Updates] tbody tr")
+    updates.nth(3).wait_for()  # the page has the machine's four versions
     act(page, "Ask first", "its first week")
     has_text(page, f"{PANEL} [role=status]", "Each new version waits for an engineer's approval")
     assert page.locator(f"{PANEL} button", has_text="Approve").is_disabled()
     send(twin, windows[0])
     has_text(page, f"{PANEL} .waiting", "A new version waits for approval")
-    assert page.locator("[aria-label=Updates] tbody tr").count() == before
+    assert updates.count() == 4
     assert serious_faults(page) == []
     act(page, "Approve", "the gap is plausible")
     has_text(page, f"{PANEL} tbody", f"approved the proposal of window {windows[0].sequence}")
-    page.wait_for_function(f"document.querySelectorAll('[aria-label=Updates] tbody tr').length === {before + 1}")
+    updates.nth(4).wait_for()
     page.locator(f"{PANEL} select").select_option("fallback")
     act(page, "Roll back to", "it hums")
     has_text(page, f"{PANEL} tbody tr", "refused: the policy has no fallback set: name a version")
