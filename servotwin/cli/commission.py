@@ -166,7 +166,7 @@ def _print(console: Console, found: CommissionedAxis) -> None:
             f"{name}: {recording.duration:.4g} s at {recording.rate:g} Hz ({parts})", markup=False, highlight=False
         )
         for defect, count in log.found.items():
-            console.print(f"  {count} {defect}", style="dim", highlight=False)
+            console.print(f"  {defect}: {count}", style="dim", highlight=False)
         console.print(
             f"  motion up to {band.motion:.3g} Hz; low-pass at {band.corner:.3g} Hz, then one sample in "
             f"{band.decimation}",

@@ -289,7 +289,7 @@ def _print(console: Console, log: RecordedLog, found: TransmissionGap) -> None:
     lost, recording, unit = found.lost, log.recording, log.recording.load_unit
     console.print(f"{recording.source.removeprefix('log ')}: {read_line(log)}", markup=False)
     for defect, count in log.found.items():
-        console.print(f"  {count} {defect}", style="dim", highlight=False)
+        console.print(f"  {defect}: {count}", style="dim", highlight=False)
     console.print(headline(found, unit, recording.motor_unit), highlight=False)
     for reason in found.reasons:
         console.print(f"  {reason}", style="yellow", highlight=False)

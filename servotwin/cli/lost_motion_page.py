@@ -89,5 +89,5 @@ def _html(log: RecordedLog, found: TransmissionGap, headline: str, images: list[
         images=images,
         unit=unit,
         models=model_rows(found),
-        defects=[(str(count), defect) for defect, count in log.found.items()],
+        defects=[(defect, str(count)) for defect, count in log.found.items()],
     )

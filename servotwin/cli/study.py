@@ -90,7 +90,7 @@ def convert(
         run(log, output)
         return
     for defect, count in convert_recording(log, output, columns).items():
-        print(f"{count} {defect}")
+        print(f"{defect}: {count}")
 
 
 def identify(

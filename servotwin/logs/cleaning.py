@@ -21,8 +21,8 @@ MEASURED = ("motor", "load")
 _STEPS = (0.1, 0.9)  # quantiles of its steps, which differ
 
 
-OUT_OF_ORDER, SAME_TIME = "out of order in time", "at the time of the sample before"
-REPEATED = "left out that repeat the one before in every column"
+OUT_OF_ORDER, SAME_TIME = "samples out of order in time", "samples at the time of the one before"
+REPEATED = "samples that repeat the one before in every column"
 """Names of defects."""
 
 
@@ -74,19 +74,19 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             found[defect] = int(np.sum(~kept))
             table = table[kept]
 
-    keep(np.isfinite(table.sum(axis=1)), "without a number in some column")
+    keep(np.isfinite(table.sum(axis=1)), "samples without a number in some column")
     if first and len(table) > 2:
         intervals = np.diff(table[:, 0])
         usual = float(np.median(np.abs(intervals)))
         stale = int(intervals[0] > _STALE * usual) if usual > 0.0 else 0
         kept = np.ones(len(table), dtype=np.bool_)
         kept[:stale] = False
-        keep(kept, "stale, long before all others")
+        keep(kept, "stale samples, long before all others")
     keep(in_order(table[:, 0]), OUT_OF_ORDER)
-    keep(~_alone_at_the_end(table[:, 0]), "with a time stamp far behind all others")
+    keep(~_alone_at_the_end(table[:, 0]), "samples with a time stamp far behind all others")
     table[:, 0], shared = spread(table)
     if shared:
-        found["with the time stamp of the sample before, spread between stamps"] = shared
+        found["samples with the time stamp of the one before, spread between stamps"] = shared
     keep(np.diff(table[:, 0], prepend=-np.inf) > 0.0, SAME_TIME)
     parted: list[float] = []
     for place, name in enumerate(names, 1):
@@ -98,10 +98,13 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
                 parted += lost
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
-        keep(~outliers(table[:, place]), f"spikes of {name}")
+        keep(
+            ~outliers(table[:, place]),
+            f"samples in spikes of {name}" if name in MEASURED else f"samples in short pulses of {name}",
+        )
     for place, name in enumerate(names, 1):
         if name in MEASURED:
-            keep(~frozen(table[:, place]), f"of a {name} that stood still until it jumped")
+            keep(~frozen(table[:, place]), f"samples of a {name} that stood still until it jumped")
     new = {name: _new(table[:, place]) for place, name in enumerate(names, 1) if name in MEASURED}
     for name, rows in new.items():
         if not rows.all():

@@ -118,7 +118,7 @@ class LogClock:
         if not self._unit and before == 0:
             self._epoch = _seen_epoch(times)
         if self._epoch is not None:
-            name = f"with times in {self._epoch.name}"
+            name = f"samples with times in {self._epoch.name}"
             self.found[name] = self.found.get(name, 0) + size
             result = times * self._epoch.unit + self._epoch.begin
         else:

@@ -15,8 +15,8 @@ from servotwin.plant.signals import Array
 MOST = 1_500_000
 """Samples that are held; a longer log is thinned."""
 _BULK = (0.01, 0.99)  # quantiles of an angle, between which no spike counts
-THINNED = "left out of a long log, between stretches at its full rate"
-PARTED = "apart from the longest part: in a pause turns of an angle that wraps may have been lost"
+THINNED = "samples left out of a long log, between stretches at its full rate"
+PARTED = "samples outside the longest part (in a pause an angle that wraps may have lost turns)"
 
 
 class Gathering:
@@ -68,7 +68,9 @@ class Gathering:
         table = table if table.size else np.empty((0, 1 + len(self._names)))
         found = dict(self._found) | ({THINNED: self._kept.dropped} if self._kept.dropped else {})
         for name, turn in self._guessed.items():
-            found[f"{unwrapped_turns(name)}: its jumps show a turn of {turn:.8g}"] = found.pop(unwrapped_turns(name), 0)
+            found[f"{unwrapped_turns(name)} (its jumps show a turn of {turn:.8g})"] = found.pop(
+                unwrapped_turns(name), 0
+            )
         if self._parted:
             places = np.split(np.arange(len(table)), np.searchsorted(table[:, 0], self._parted))
             longest = max(places, key=len)

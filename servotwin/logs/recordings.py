@@ -21,10 +21,10 @@ from servotwin.logs.log import read_blocks, read_columns
 from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
 from servotwin.plant.signals import Array
 
-CUT = "last row without its end: the file may have been cut off there"
+CUT = "last row without its end (the file may have been cut off there)"
 _LEAST = 100  # samples
 _BLOCK = 1_000_000  # samples that are cleaned at a time
-TURNED = "in a log with the newest first, which was turned round"
+TURNED = "samples of a log with the newest first, which was turned round"
 _BACKWARDS = 0.9  # of the steps in time
 _JOINED = 0.3  # of the samples: so many out of order are no accident of a clock
 _LEFT = 0.3  # of the samples, at least: with fewer the log is not what it seems
@@ -200,7 +200,7 @@ def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str
     whole = size - sum(clean.found.get(defect, 0) for defect in (THINNED, PARTED, REPEATED))
     if left >= max(_LEAST, _LEFT * whole):
         return
-    what = "; ".join(f"{count} {defect}" for defect, count in clean.found.items()) or "the log is short"
+    what = "; ".join(f"{defect}: {count}" for defect, count in clean.found.items()) or "the log is short"
     first = next(iter(damaged.items()), None)
     where = f"; column {first[0]!r}, {first[1]}" if first else ""
     raise InvalidInput(

@@ -39,7 +39,7 @@ def test_a_clock_that_is_set_back_keeps_most_of_the_log():
 def test_the_newest_sample_may_come_first(tmp_path):
     log = log_of(tmp_path, MADE.time[::-1], MADE.motor[::-1], MADE.load[::-1])
     assert np.array_equal(log.recording.motor, MADE.motor)
-    assert list(log.found) == ["in a log with the newest first, which was turned round"]
+    assert list(log.found) == ["samples of a log with the newest first, which was turned round"]
 
 
 @pytest.mark.parametrize("stamp", [0.02, 1.0])
@@ -52,7 +52,7 @@ def test_stamps_that_are_coarser_than_the_samples_are_spread(tmp_path, stamp):
 def test_samples_that_were_written_twice_count_once(tmp_path):
     log = log_of(tmp_path, *(np.repeat(each, 2) for each in (MADE.time, MADE.motor, MADE.load)))
     assert log.recording.time.size == MADE.time.size
-    assert log.found == {"at the time of the sample before": MADE.time.size}
+    assert log.found == {"samples at the time of the one before": MADE.time.size}
 
 
 def test_one_stamp_for_all_samples_is_told(tmp_path):
@@ -66,7 +66,10 @@ def test_a_channel_that_stood_still_for_a_while_is_left_out_for_as_long(tmp_path
     held = values[part].copy()
     held[700:860] = held[700]
     log = log_of(tmp_path, **{**values, part: held})
-    assert log.found == {f"of a {part} that stood still until it jumped": 159, "pauses longer than five intervals": 1}
+    assert log.found == {
+        f"samples of a {part} that stood still until it jumped": 159,
+        "pauses longer than five intervals": 1,
+    }
 
 
 def test_excursions_of_a_few_samples_are_left_out():
@@ -106,7 +109,7 @@ def test_counts_that_wrap_are_unwrapped_and_said_to(tmp_path):
     counts = np.round(MADE.motor * 4096 / (2.0 * np.pi))
     log = log_of(tmp_path, motor=np.mod(counts, 4096), columns=RecordingColumns(motor_unit="counts"))
     assert np.ptp(log.recording.motor - counts) == 0.0
-    assert "turns of motor that were unwrapped: its jumps show a turn of 4096" in log.found
+    assert "turns of motor that were unwrapped (its jumps show a turn of 4096)" in log.found
 
 
 def test_nothing_is_left_out_of_a_clean_log_for_its_stamps():

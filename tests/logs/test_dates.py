@@ -92,7 +92,7 @@ def test_comments_and_blank_lines_between_rows_are_left_out_and_lines_are_counte
     path = tmp_path / "log.csv"
     path.write_text("\n".join(["time,motor,load", *rows, "", ""]))
     log = read_recording(path, RecordingColumns())
-    assert log.found == {"without a number in some column": 1}
+    assert log.found == {"samples without a number in some column": 1}
     assert log.recording.time.size == MADE.time.size - 1
     assert next(csv_blocks(path, ["load"])).damaged == {"load": "line 202: 'broken'"}
 

@@ -59,7 +59,7 @@ def test_a_block_that_begins_before_the_last_one_ended_is_cut(made):
         gathering.add(made.time[part], {"motor": made.motor[part], "load": made.load[part]})
     clean = gathering.cleaned()
     assert np.array_equal(clean.time, made.time[:2000])
-    assert clean.found == {"out of order in time": 100}
+    assert clean.found == {"samples out of order in time": 100}
 
 
 def test_a_thinned_log_keeps_its_turning_points_and_its_gap(made):

@@ -209,11 +209,11 @@ def test_defects_are_mended_and_counted(tmp_path, made):
     log = read_recording(path, RecordingColumns())
     assert log.found.pop("turns of motor that were unwrapped") > 5
     assert log.found == {
-        "without a number in some column": 1,
-        "stale, long before all others": 1,
-        "out of order in time": 1,
-        "at the time of the sample before": 1,
-        "spikes of load": 1,
+        "samples without a number in some column": 1,
+        "stale samples, long before all others": 1,
+        "samples out of order in time": 1,
+        "samples at the time of the one before": 1,
+        "samples in spikes of load": 1,
         "pauses longer than five intervals": 1,
     }
     motor = np.interp(log.recording.time, made.time, made.motor)
@@ -228,7 +228,7 @@ def test_a_log_that_ends_within_a_line_is_said_to(tmp_path, made):
         path.write_bytes(content)
         log = read_recording(path, RecordingColumns())
         assert any("may have been cut off" in each for each in log.found) is (content is not whole)
-        assert log.found.get("without a number in some column", 0) == numbers
+        assert log.found.get("samples without a number in some column", 0) == numbers
         assert log.recording.time.size == made.time.size - numbers
 
 
@@ -380,7 +380,7 @@ def test_a_foreign_log_is_converted_without_its_defects(tmp_path, made):
     options = ["--motor", "qa", "--load", "qb"]
     result = CliRunner().invoke(app, ["convert", str(path), str(tmp_path / "clean.npz"), *options])
     assert result.exit_code == 0, result.output
-    assert "1 without a number in some column" in result.output
+    assert "samples without a number in some column: 1" in result.output
     log = read_recording(tmp_path / "clean.npz", RecordingColumns())
     assert (log.recording.motor_unit, log.recording.load_unit) == ("rad", "um")
     assert not log.found

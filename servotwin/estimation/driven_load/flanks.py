@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import savgol_filter
 
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus
 from servotwin.estimation.kinematic.lost_motion import LostMotion
@@ -99,6 +98,9 @@ def share_on_other_flank(recording: EncoderRecording, lost: LostMotion, machine:
 
 def _motion(time: Array, position: Array, interval: float, window: int) -> Array:
     """(2, m) speed and acceleration of parabolas through so many samples."""
+    # Here, because scipy.signal takes long to import and most logs need no dynamics.
+    from scipy.signal import savgol_filter
+
     grid = np.arange(time[0], time[-1], interval)
     even = np.interp(grid, time, position)
     if even.size <= window:

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.signal import lfilter
 
 from servotwin.control.controller import Controller
 from servotwin.estimation.kinematic.recording import EncoderRecording
@@ -265,6 +264,9 @@ class DrivenLoad:
 
     def quasi_static_misfit(self, predicted: Array, rate: float) -> Array:
         """(m,) misfit of a model that predicts the load (N,) from the motor alone, under the same observer."""
+        # Here, because scipy.signal takes long to import and most logs need no dynamics.
+        from scipy.signal import lfilter
+
         place, speed = 2.0 * rate * self.interval, rate * rate * self.interval
         # Corrections of position and speed by shares of the error: a filter of second order from misfit to misfit.
         step = self.interval

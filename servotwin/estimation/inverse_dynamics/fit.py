@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.conditioning import DriveMotion, RegressionBand, filtered_rows
@@ -65,7 +65,7 @@ class ParameterFit:
     def half_width(self, name: str) -> float:
         """Half the 95 % interval of a parameter."""
         freedom = max(float(self.freedom[self.names.index(name)]), 1.0)
-        return float(student.ppf(0.975, freedom)) * self.std(name)
+        return float(stdtrit(freedom, 0.975)) * self.std(name)
 
 
 def regressors(motion: DriveMotion) -> Array:

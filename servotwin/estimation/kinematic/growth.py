@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from servotwin.estimation.estimate import NORMAL_95
 
@@ -59,5 +59,5 @@ def growth(dates: ArrayLike, gaps: ArrayLike, stds: ArrayLike) -> GapGrowth | No
     slope = float(np.sum(weights * (years - middle) * values)) / moment
     left = values - np.average(values, weights=weights) - slope * (years - middle)
     scatter = float(np.sum(weights * left**2)) / (values.size - 2)
-    deviations = float(student.ppf(0.975, values.size - 2)) if scatter > 1.0 else NORMAL_95
+    deviations = float(stdtrit(values.size - 2, 0.975)) if scatter > 1.0 else NORMAL_95
     return GapGrowth(slope, math.sqrt(max(scatter, 1.0) / moment), deviations)

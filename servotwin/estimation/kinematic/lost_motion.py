@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
@@ -314,7 +314,7 @@ def _answer(
     residual, ratio = values[0] - fit.coefficients @ values[places], float(fit.coefficients[0])
     motor_count, load_count = counts_of(recording)
     quantisation = math.hypot(motor_count, load_count / abs(ratio)) / math.sqrt(12.0)
-    quantile = float(student.ppf(1.0 - _CHANCE, max(spread.units - 1, 1)))
+    quantile = float(stdtrit(max(spread.units - 1, 1), 1.0 - _CHANCE))
     left = structured(prepared, residual) / abs(ratio)
     # Counts and what the model leaves are the same in every cycle: the bootstrap does not see that they shift the gap.
     shift, of_model = _SHIFT * (by_travel - gap), sensitivity(values, places, side, gap)
