@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 _FRESH_S = 1.0
 """s for which a claim that was read counts where other processes of the service may have accepted a newer one."""
+_KIND = "alarm"
+"""Kind of the evidence of a conflict."""
 _SUPERSEDED = "another edge of this servo has taken over"
 
 
@@ -125,7 +127,7 @@ class EdgeClaims:
         if (servo, claim.run) in self._reported:
             return
         await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
-        self._metrics.evidence.add("alarm")
+        self._metrics.evidence.add(_KIND)
         self._reported[servo, claim.run] = None
         if len(self._reported) > MAX_SERVOS:
             self._reported.popitem(last=False)

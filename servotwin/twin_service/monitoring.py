@@ -126,7 +126,7 @@ class RefusalLog:
 
     def write(self, code: str, **about: Any) -> None:
         """Write a line, or count it; the next line of the code tells how many were `omitted`."""
-        now = self._monotonic()
+        log, now = self._log, self._monotonic()
         lines, at = self._lines.get(code, (_REFUSAL_LINES, now))
         lines = min(_REFUSAL_LINES, lines + _REFUSAL_LINES_PER_S * (now - at))
         written = lines >= 1.0
@@ -135,7 +135,7 @@ class RefusalLog:
             self._omitted[code] += 1
             return
         omitted = {"omitted": self._omitted.pop(code)} if code in self._omitted else {}
-        self._log.info("refused", extra={**about, "code": code, **omitted})
+        log.info("refused", extra={**about, "code": code, **omitted})
 
 
 class Metrics:
