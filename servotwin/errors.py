@@ -1,4 +1,4 @@
-"""Error of servotwin for input that the user has to mend."""
+"""Errors of servotwin that end a command with one sentence."""
 
 
 class InvalidInput(ValueError):
@@ -6,3 +6,7 @@ class InvalidInput(ValueError):
 
     The command line shows it without a traceback and ends with exit code 2.
     """
+
+
+class ResourceUnavailable(RuntimeError):
+    """One sentence on a resource that cannot be used now, such as a database; the command line treats it likewise."""

@@ -17,7 +17,7 @@ import typer
 from typer.core import TyperGroup
 
 from servotwin.cli import deployed, design, study
-from servotwin.errors import InvalidInput
+from servotwin.errors import InvalidInput, ResourceUnavailable
 from servotwin.runtime.extras import EXTRAS, missing_extra
 
 INVALID, INTERRUPTED = 2, 130
@@ -39,7 +39,7 @@ class _Commands(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         try:
             return super().invoke(ctx)
-        except InvalidInput as error:
+        except (InvalidInput, ResourceUnavailable) as error:
             _end(f"error: {error}", INVALID)
         except _UsageError as error:
             _end(_usage(error), INVALID)

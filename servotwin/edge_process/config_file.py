@@ -39,14 +39,17 @@ def load(path: str | os.PathLike[str]) -> EdgeConfig:
     InvalidInput
         The file is missing or not TOML, a key is unknown or missing, or its value is not allowed.
     """
-    config = read_config(read_toml(path))
     _check_complete(Path(path))
+    config = read_config(read_toml(path))
     return replace(config, folder=Path(path).resolve().parent)
 
 
 def _check_complete(path: Path) -> None:
     """Refuse a written file that was cut short: its last tables would have their defaults; raises InvalidInput."""
-    lines = path.read_text(encoding="utf-8").splitlines()
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return  # whoever reads it as TOML says why
     if _BEGIN in lines and _END not in lines:
         raise InvalidInput(f"{path}: is cut short: its line {_END!r} is missing; copy the edge's folder again")
 

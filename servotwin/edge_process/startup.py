@@ -81,7 +81,7 @@ def next_boot(path: Path, random: bytes) -> str:
     """
     count = _count(path) + 1
     with suppress(OSError):
-        replace_file(path, f"{count}\n".encode("ascii"), durable=True)
+        replace_file(path, f"{count}\n".encode("ascii"), durable=True, mode=0o600)
     return f"b{count}-{random.hex()}"
 
 

@@ -16,7 +16,7 @@ from sqlalchemy.exc import ArgumentError, DataError, DBAPIError, IntegrityError,
 from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.pool import QueuePool
 
-from servotwin.errors import InvalidInput
+from servotwin.errors import InvalidInput, ResourceUnavailable
 
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
@@ -35,7 +35,7 @@ _LOST_RACES = ("40001", "40P01")
 """SQLSTATE of a serialization failure and of a deadlock."""
 
 
-class StoreUnavailable(RuntimeError):
+class StoreUnavailable(ResourceUnavailable):
     """The database cannot be read or written now: a full or read-only disk, a lost connection. One sentence."""
 
 

@@ -129,11 +129,10 @@ def select_by_name(*columns: sa.ColumnElement[Any]) -> sa.Select[Any]:
     return query.where(messages.c.servo == sa.bindparam("_servo"), messages.c.key.in_(keys))
 
 
-def _min_or_max(column: sa.Column[Any], name: str, *, least: bool) -> sa.ColumnElement[Any]:
-    """Minimum or maximum of a column and a value, either of which may be null."""
+def _earlier(column: sa.Column[Any], name: str) -> sa.ColumnElement[Any]:
+    """Minimum of a column and a value, either of which may be null."""
     value = sa.bindparam(name, type_=sa.Double)
-    taken = column > value if least else column < value
-    return sa.case((column.is_(None), value), (taken, value), else_=column)
+    return sa.case((column.is_(None), value), (column > value, value), else_=column)
 
 
 _MARK_READY = (
@@ -141,9 +140,10 @@ _MARK_READY = (
     .where(twins.c.servo == sa.bindparam("_servo"))
     .values(
         windows=twins.c.windows + sa.bindparam("_windows", type_=sa.BigInteger),
-        last_message=_min_or_max(twins.c.last_message, "_last_message", least=False),
-        ready=_min_or_max(twins.c.ready, "_ready", least=True),
-        verification_ready=_min_or_max(twins.c.verification_ready, "_verification_ready", least=True),
+        # Not the latest time: a clock that was ahead and is right again would hide for as long that an edge is away.
+        last_message=sa.func.coalesce(sa.bindparam("_last_message", type_=sa.Double), twins.c.last_message),
+        ready=_earlier(twins.c.ready, "_ready"),
+        verification_ready=_earlier(twins.c.verification_ready, "_verification_ready"),
     )
 )
 

@@ -88,9 +88,9 @@ class AlarmWebhook:
             if kind in ALARMS:
                 self._queue(alarm_post(result.servo, kind, record.status, self._wall(), record.version))
 
-    def announce(self, kind: str, sentence: str) -> None:
-        """Queue an alarm of the twin itself, which concerns every machine."""
-        self._queue(alarm_post(OF_ALL, kind, sentence, self._wall()))
+    def announce(self, kind: str, sentence: str, servo: str = OF_ALL) -> None:
+        """Queue an alarm of the twin itself, which concerns one machine or all."""
+        self._queue(alarm_post(servo, kind, sentence, self._wall()))
 
     async def run(self) -> None:
         """Post what waits."""

@@ -86,6 +86,7 @@ class AccessControl:
         self._readers = {} if verifiers is None else verifiers.readers
         servos = () if verifiers is None else verifiers.servos.values()
         self._known = frozenset((*servos, *self._readers.values()))
+        self._servo_of = {} if verifiers is None else {each: name for name, each in verifiers.servos.items()}
 
     def check_servo(self, servo: str, token: bytes | None) -> None:
         """Check that a token is that of a servo.
@@ -117,6 +118,13 @@ class AccessControl:
             return _digest(token) in self._known
         except RequestRejected:
             return False
+
+    def servo_of(self, token: bytes | None) -> str:
+        """Name of the servo with a token; empty: it is no servo's."""
+        try:
+            return self._servo_of.get(_digest(token), "")
+        except RequestRejected:
+            return ""
 
     @property
     def open(self) -> bool:

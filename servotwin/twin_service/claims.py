@@ -22,6 +22,8 @@ log = logging.getLogger(__name__)
 
 _FRESH_S = 1.0
 """s for which a claim that was read counts where other processes of the service may have accepted a newer one."""
+_KIND = "alarm"
+"""Kind of the evidence of a conflict."""
 _SUPERSEDED = "another edge of this servo has taken over"
 
 
@@ -48,6 +50,8 @@ class EdgeClaims:
         Other processes write the store too.
     software : str
         Version of servotwin.
+    announce : callable
+        Called with the kind and the sentence of an alarm, and the servo.
     samples_per_window, bytes_per_day : int
         Limits that edges are told; 0: none.
     """
@@ -61,12 +65,13 @@ class EdgeClaims:
         clocks: Clocks,
         shared: bool,
         software: str,
+        announce: Callable[[str, str, str], None],
         samples_per_window: int = 0,
         bytes_per_day: int = 0,
     ) -> None:
         self._samples_per_window, self._bytes_per_day = samples_per_window, bytes_per_day
         self._store, self._executor, self._evict, self._metrics = store, executor, evict, metrics
-        self._clocks, self._shared, self._software = clocks, shared, software
+        self._clocks, self._shared, self._software, self._announce = clocks, shared, software, announce
         self._known: OrderedDict[str, _Known] = OrderedDict()
         self._reported: OrderedDict[tuple[str, str], None] = OrderedDict()
 
@@ -117,10 +122,12 @@ class EdgeClaims:
         """Report that an edge runs which was superseded: at each of its questions, and once in the evidence."""
         self._metrics.rejected.add(Refusal.SUPERSEDED.value)
         log.warning("conflict", extra={"servo": servo, "run": claim.run, "newer": newest.run})
+        sentence = f"conflict: two edges of this servo run, {claim.run} and {newest.run}; the newer one counts"
+        self._announce("conflict", sentence, servo)
         if (servo, claim.run) in self._reported:
             return
-        sentence = f"conflict: two edges of this servo run, {claim.run} and {newest.run}; the newer one counts"
         await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
+        self._metrics.evidence.add(_KIND)
         self._reported[servo, claim.run] = None
         if len(self._reported) > MAX_SERVOS:
             self._reported.popitem(last=False)

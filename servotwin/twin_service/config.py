@@ -200,6 +200,15 @@ class ServiceConfig:
     polls_per_servo: Annotated[
         int, key(minimum=1, maximum=_MOST, help="Largest number of long polls of one servo open at once.")
     ] = 8
+    connections_per_servo: Annotated[
+        int,
+        key(
+            minimum=4,
+            maximum=_MOST,
+            help="Largest number of connections with one servo's token open at once; a further one closes the oldest. "
+            "Not behind a proxy.",
+        ),
+    ] = 64
     watchers: Annotated[
         int, key(minimum=0, maximum=_MOST, help="Largest number of dashboards that watch the fleet at once.")
     ] = 100

@@ -23,7 +23,7 @@ from servotwin.messages import Refusal
 from servotwin.messages.codec import ENCODINGS
 from servotwin.twin_service.auth import bearer_token
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
-from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.monitoring import Metrics, RefusalLog
 from servotwin.twin_service.openapi import JSON, MAX_INTEGER, MSGPACK, Operation, openapi_document
 
 log = logging.getLogger(__name__)
@@ -291,6 +291,7 @@ class HttpApp:
         self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan, own_names: bool = False
     ) -> None:
         self._metrics, self.lifespan, self._own_names = metrics, lifespan, own_names
+        self._refusals = RefusalLog(log)
         declared = list(routes)
         # Encoded once: the routes do not change.
         document = msgspec.json.encode(
@@ -344,8 +345,8 @@ class HttpApp:
         """Error body; the rejection is counted, and logged without the body of the request."""
         code, status = rejected.refusal.value, rejected.status
         self._metrics.rejected.add(code)
-        about = {"servo": request.path.get("servo", "")[:64], "code": code, "why": rejected.detail}
-        log.info("refused", extra={**about, "method": request.method, "status": status})
+        servo = request.path.get("servo", "")[:64]
+        self._refusals.write(code, servo=servo, why=rejected.detail, method=request.method, status=status)
         headers = {"retry-after": "1"} if status in (429, 503) else {}
         if status == 401:
             headers["www-authenticate"] = "Bearer"

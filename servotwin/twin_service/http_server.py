@@ -68,7 +68,7 @@ class _LimitedHttpProtocol(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         if self._connection is not None:
-            self._connection.leave()
+            self._connection.end()
         self._stop_timer()
         self._stop_drain()
         super().connection_lost(exc)

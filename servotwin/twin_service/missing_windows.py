@@ -116,6 +116,8 @@ class MissingWindows:
     metrics : Metrics
     wall : callable
         s since the epoch.
+    announce : callable
+        Called with the kind and the sentence of an alarm, and the servo.
     """
 
     def __init__(
@@ -126,9 +128,10 @@ class MissingWindows:
         notify: Callable[[str], None],
         metrics: Metrics,
         wall: Callable[[], float],
+        announce: Callable[[str, str, str], None],
     ) -> None:
         self._store, self._executor, self._sequences = store, executor, sequences
-        self._notify, self._metrics, self._wall = notify, metrics, wall
+        self._notify, self._metrics, self._wall, self._announce = notify, metrics, wall, announce
 
     async def run(self) -> None:
         """Look for holes every few seconds."""
@@ -156,6 +159,8 @@ class MissingWindows:
         self._metrics.missing.add(by=number)
         about = {"servo": boot[0], "boot": boot[1], "first": first, "last": last, "windows": number}
         log.warning("windows missing", extra=about)
+        these = f"window {first} of boot {boot[1]}" if first == last else f"windows {first} to {last} of boot {boot[1]}"
+        self._announce("windows missing", f"{these} did not come, although later ones did", boot[0])
         self._notify(boot[0])
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import collections
 import logging
 import sys
+import time
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
@@ -24,6 +25,7 @@ _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0
 _WATCHED = ("alarm", "failed", "fallback", "withdrawn")
 """Kinds of evidence that an operator must see."""
 _POSTED = ("taken", "refused", "dropped")
+_REFUSAL_LINES, _REFUSAL_LINES_PER_S = 100.0, 1.0
 _Labels = tuple[str, ...]
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
 """Attributes that every log record has."""
@@ -103,6 +105,37 @@ class Histogram:
             yield Sample(below, {"le": end}, "_bucket")
         yield Sample(self._sum, suffix="_sum")
         yield Sample(below, suffix="_count")
+
+
+class RefusalLog:
+    """Log lines of refused requests: of each code the first hundred, then one a second.
+
+    Whoever sends refused requests in a loop, a stranger too, must not fill the disk with lines; all are counted.
+
+    Parameters
+    ----------
+    log : Logger
+    monotonic : callable
+        s.
+    """
+
+    def __init__(self, log: logging.Logger, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._log, self._monotonic = log, monotonic
+        self._lines: dict[str, tuple[float, float]] = {}
+        self._omitted = collections.Counter[str]()
+
+    def write(self, code: str, **about: Any) -> None:
+        """Write a line, or count it; the next line of the code tells how many were `omitted`."""
+        log, now = self._log, self._monotonic()
+        lines, at = self._lines.get(code, (_REFUSAL_LINES, now))
+        lines = min(_REFUSAL_LINES, lines + _REFUSAL_LINES_PER_S * (now - at))
+        written = lines >= 1.0
+        self._lines[code] = lines - written, now
+        if not written:
+            self._omitted[code] += 1
+            return
+        omitted = {"omitted": self._omitted.pop(code)} if code in self._omitted else {}
+        log.info("refused", extra={**about, "code": code, **omitted})
 
 
 class Metrics:

@@ -35,7 +35,7 @@ from servotwin.twin_service.http_edge import LongPolls, seal_messages
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.live_views import LiveIntake
-from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.monitoring import Metrics, RefusalLog
 
 log = logging.getLogger(__name__)
 
@@ -76,6 +76,7 @@ class MqttRequestHandler:
     ) -> None:
         self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
         self._claims, self._live = claims, live
+        self._refusals = RefusalLog(log)
 
     def decode(self, servo: str, data: bytes) -> ReceivedRequest | bytes | None:
         """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
@@ -123,7 +124,7 @@ class MqttRequestHandler:
 
     def _count(self, servo: str, code: Refusal, why: str) -> None:
         self._metrics.rejected.add(code.value)
-        log.info("refused", extra={"servo": servo, "code": code.value, "why": why})
+        self._refusals.write(code.value, servo=servo, why=why)
 
 
 class MqttServer:

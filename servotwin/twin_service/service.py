@@ -21,7 +21,7 @@ from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
-from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
+from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.config import SQLITE
@@ -95,7 +95,7 @@ class TwinService:
         )
         sequences = SequenceWatch(self.clocks.monotonic)
         self._missing = MissingWindows(
-            store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall
+            store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce
         )
         has_servo = _servo_test(twin.servos)
         self.ingest = self._make_ingest(has_servo, sequences)
@@ -163,6 +163,7 @@ class TwinService:
             self.clocks,
             self._shared,
             __version__,
+            self._announce,
             samples_per_window=config.samples_per_window,
             bytes_per_day=0 if math.isinf(config.megabytes_per_day) else round(config.megabytes_per_day * 1e6),
         )
@@ -200,7 +201,7 @@ class TwinService:
         self._spawn(self.pages.what_if.run())
         if self.webhook is not None:
             self._spawn(self.webhook.run())
-            self._spawn(self._announce_damage(self.webhook))
+            self._spawn(self._announce_damage())
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -299,20 +300,24 @@ class TwinService:
                 figures = {"lag": round(backlog.lag, 1), "waiting": backlog.messages}
                 if lagging and not before:
                     log.warning("updates lag", extra=figures)
-                    if self.webhook is not None:
-                        # Always in the same words, so that a lag that comes and goes is not posted each time.
-                        longest = (
-                            f"new messages of a servo wait for longer than lag_limit_s = {self.config.lag_limit_s:g} s"
-                        )
-                        self.webhook.announce("lag", longest)
+                    # Always in the same words, so that a lag that comes and goes is not posted each time.
+                    limit = f"lag_limit_s = {self.config.lag_limit_s:g} s"
+                    self._announce("lag", f"new messages of a servo wait for longer than {limit}")
                 if before and not lagging:
                     log.info("updates lag no longer", extra=figures)
 
-    async def _announce_damage(self, webhook: AlarmWebhook) -> None:
-        """Post that the store is damaged, once it is."""
+    def _announce(self, kind: str, sentence: str, servo: str = OF_ALL) -> None:
+        """Post an alarm, where there is a webhook."""
+        if self.webhook is not None:
+            self.webhook.announce(kind, sentence, servo)
+
+    async def _announce_damage(self) -> None:
+        """Post that the store has lost messages, if it has, and that it is damaged, once it is."""
+        if self.watch.lost:
+            self._announce("the store has lost messages", self.watch.lost)
         while not self.watch.fault:
             await asyncio.sleep(_REFRESH_S)
-        webhook.announce("store damaged", f"it is not written any more: {self.watch.fault}")
+        self._announce("store damaged", f"it is not written any more: {self.watch.fault}")
         await asyncio.Event().wait()
 
     async def _apply_retention(self) -> None:

@@ -65,7 +65,7 @@ class StoreWatch:
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked = 0
-        self.fault, self.rounds = "", 0
+        self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
         """Commit a message, unless the store is damaged; raises StoreUnavailable."""
@@ -128,6 +128,7 @@ class StoreWatch:
         if newest >= noted:
             return
         log.error("the store has lost messages", extra={"had": noted, "has": newest})
+        self.lost = f"its newest message is number {newest}, and it once had number {noted}"
         after = ""
         while summaries := self._store.servos(after):
             after = summaries[-1].servo

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from servotwin.twin_service.auth import AccessControl, bearer_token
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.http_app import cookie_of
+from servotwin.twin_service.servo_connections import ServoConnections
 from servotwin.twin_service.sessions import COOKIE, OperatorAccess
 
 _GRACE_S = 2.0
@@ -25,18 +26,30 @@ class UnauthenticatedLimit:
     most, per_address : int
         Connections in all, of which one address may have half; and from one address, of those that are older than a
         grace period.
+    of_servos : ServoConnections
+        Counts those that have shown a servo's token.
     """
 
-    def __init__(self, access: AccessControl, operators: OperatorAccess, most: int, per_address: int) -> None:
+    def __init__(
+        self,
+        access: AccessControl,
+        operators: OperatorAccess,
+        most: int,
+        per_address: int,
+        of_servos: ServoConnections,
+    ) -> None:
         self._access, self._operators, self._most, self._per_address = access, operators, most, per_address
         self._of = Counter[str]()
+        self.of_servos = of_servos
 
     @classmethod
     def of(cls, config: ServiceConfig, access: AccessControl, operators: OperatorAccess) -> UnauthenticatedLimit | None:
         """Limit of a service; None where nobody has a token, or where a proxy shares connections among clients."""
         if config.tokens is None or config.behind_proxy:
             return None
-        return cls(access, operators, config.unauthenticated_connections, config.unauthenticated_per_address)
+        of_servos = ServoConnections(config.connections_per_servo)
+        most, per_address = config.unauthenticated_connections, config.unauthenticated_per_address
+        return cls(access, operators, most, per_address, of_servos)
 
     @property
     def open(self) -> int:
@@ -68,9 +81,13 @@ class UnauthenticatedLimit:
         session = cookie_of(cookies, COOKIE)
         return session is not None and self._operators.session_name(session) is not None
 
+    def servo_of(self, authorization: bytes | None) -> str:
+        """Name of the servo whose token this header holds; empty: it is none's."""
+        return "" if authorization is None else self._access.servo_of(bearer_token(authorization))
+
 
 class UnauthenticatedConnection:
-    """One connection, until it shows a token or a session, or ends.
+    """One connection, until it shows a token or a session, or ends; with a servo's token it counts for that servo.
 
     Parameters
     ----------
@@ -82,16 +99,25 @@ class UnauthenticatedConnection:
 
     def __init__(self, limit: UnauthenticatedLimit, address: str, close: Callable[[], None]) -> None:
         self._limit, self._address, self._close = limit, address, close
-        self._counted = True
+        self._counted, self._servo = True, ""
         self._timer = asyncio.get_running_loop().call_later(_GRACE_S, self._check)
 
     def show(self, authorization: bytes | None, cookies: bytes | None) -> None:
         """Note two headers of a request."""
-        if self._counted and self._limit.knows(authorization, cookies):
-            self.leave()
+        if not self._counted or not self._limit.knows(authorization, cookies):
+            return
+        self._leave()
+        if servo := self._limit.servo_of(authorization):
+            self._servo = servo
+            self._limit.of_servos.enter(servo, self, self._close)
 
-    def leave(self) -> None:
-        """End: it is none any more, or its connection is closed."""
+    def end(self) -> None:
+        """End: the connection is closed."""
+        self._leave()
+        if self._servo:
+            self._limit.of_servos.leave(self._servo, self)
+
+    def _leave(self) -> None:
         if self._counted:
             self._counted = False
             self._timer.cancel()

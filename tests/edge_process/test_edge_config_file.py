@@ -182,14 +182,13 @@ def test_a_file_of_the_version_before_is_read_and_written_as_it_was() -> None:
 def test_a_written_file_that_was_cut_short_is_refused_wherever_it_ends(tmp_path: Path) -> None:
     """Without its last tables the edge would run, and watch nothing."""
     path, text = tmp_path / "edge.toml", edge_toml(read_config(parse_toml(PLAIN, "edge.toml")))
-    lines = text.splitlines(keepends=True)
-    said = []
-    for number in range(1, len(lines)):
-        path.write_text("".join(lines[:number]))
+    first = len(text.splitlines(keepends=True)[0])
+    # At the end of a line, and in the middle of one: a key without a value is no TOML, and it is not what is wrong.
+    for length in range(first, len(text.rstrip()), 7):
+        path.write_text(text[:length])
         with pytest.raises(InvalidInput) as refused:
             load(path)
-        said.append(str(refused.value))
-    assert said[-1] == f"{path}: is cut short: its line '# end' is missing; copy the edge's folder again"
+        assert str(refused.value) == f"{path}: is cut short: its line '# end' is missing; copy the edge's folder again"
     for whole in (text, f"{text}# mine\n", "\n".join(line for line in text.splitlines() if line[:1] != "#")):
         path.write_text(whole)
         load(path)

@@ -66,6 +66,11 @@ def test_the_cursor_only_rises(handler: FrameHandler) -> None:
     assert handler._outbox.number("cursor") == 7
 
 
+def test_the_count_of_boots_is_its_owner_s_alone(tmp_path: Path) -> None:
+    next_boot(tmp_path / "boots", bytes(8))
+    assert (tmp_path / "boots").stat().st_mode & 0o777 == 0o600
+
+
 def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> None:
     file = tmp_path / "boots"
     assert [next_boot(file, bytes([k])) for k in range(3)] == ["b1-00", "b2-01", "b3-02"]

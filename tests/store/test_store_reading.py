@@ -70,6 +70,14 @@ def test_the_summary_of_a_servo(store: Store) -> None:
     assert store.servo("nobody") is None
 
 
+def test_the_last_message_is_the_one_that_came_last_though_the_clock_was_set_back(store):
+    store.put([window(sequence=0, received=1e6)])
+    store.put([window(sequence=1, received=200.0), letter(received=201.0)])
+    assert store.servo("a").last_message == 201.0
+    store.put([verification(received=300.0)])
+    assert store.servo("a").last_message == 201.0, "a verification is the twin's own"
+
+
 def test_a_window_with_its_body(store: Store) -> None:
     store.put([window(body=b"packed")._replace(encoding="zstd")])
     result = store.window("a", "boot", 1)

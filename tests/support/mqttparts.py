@@ -86,7 +86,9 @@ class Twin:
         limiter = RateLimiter(1e6, 1e6, self._loop.time)
         gate = EdgeGate(AccessControl(VERIFIERS), known, limiter, limiter)
         executor = StoreExecutor()
-        claims = EdgeClaims(self.store, executor, self.polls.evict, self.metrics, Clocks(), True, "test")
+        claims = EdgeClaims(
+            self.store, executor, self.polls.evict, self.metrics, Clocks(), True, "test", lambda *_: None
+        )
         self.views = LiveViews(self._loop.time, lambda _: None, 5, 5)
         live = LiveIntake(claims, self.views, self._loop.time)
         handler = MqttRequestHandler(gate, ingest, self.polls, claims, live, lambda: None, self.metrics)

@@ -11,14 +11,14 @@ from pathlib import Path
 import httpx
 import msgspec
 import pytest
-from service_system import ENGINEER, OPERATOR, bearer, place, served, twin_file, window
+from service_system import ENGINEER, MSGPACK, OPERATOR, bearer, place, served, twin_file, window
 
 from servotwin.cli.alarm_test import post_test_alarm
 from servotwin.errors import InvalidInput
-from servotwin.messages import encode
+from servotwin.messages import EdgeClaim, encode
 from servotwin.store.records import Backlog, EvidenceRecord, WorkResult
 from servotwin.store.store import open_store
-from servotwin.twin_service import alarm_webhook, service
+from servotwin.twin_service import alarm_webhook, missing_windows, service
 from servotwin.twin_service.alarm_webhook import AlarmWebhook, announced
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.service import TwinService
@@ -278,6 +278,33 @@ def test_damage_of_the_store_and_a_lag_are_posted_once(tmp_path, monkeypatch, ca
         ("twin", "twin: store damaged: it is not written any more: page 7 is damaged"),
     ]
     assert {"updates lag", "updates lag no longer"} <= set(caplog.messages)
+
+
+def test_a_second_edge_missing_windows_and_a_store_that_lost_messages_are_posted(tmp_path, monkeypatch):
+    monkeypatch.setattr(missing_windows, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(missing_windows, "_LOOK_S", 1e9)
+    (tmp_path / "twin.db-newest").write_text("9\n")
+
+    async def body(url):
+        async with served(with_webhook(tmp_path, url)) as (system, client):
+            for sequence in (0, 3):
+                await client.put(place(window(sequence)), content=encode(window(sequence)), headers=bearer())
+            await system._missing.look()
+            for claim in (EdgeClaim("ax-1", "one", 0, 1), EdgeClaim("ax-1", "two", 0, 2), *2 * [older]):
+                await client.post("/v1/servos/ax-1/claim", content=encode(claim), headers={**bearer(), **MSGPACK})
+            assert system.metrics.evidence.values["alarm",] == 1
+            async with asyncio.timeout(60.0):
+                while system.metrics.webhook.values["taken",] < 3:
+                    await asyncio.sleep(0.02)
+
+    older = EdgeClaim("ax-1", "one", 1)
+    with receiver(200) as (url, received):
+        asyncio.run(body(url))
+    assert sorted(post["text"] for _, _, post in received) == [
+        "ax-1: conflict: two edges of this servo run, one and two; the newer one counts",
+        "ax-1: windows missing: windows 1 to 2 of boot b did not come, although later ones did",
+        "twin: the store has lost messages: its newest message is number 0, and it once had number 9",
+    ]
 
 
 def test_what_a_twin_could_not_process_is_posted(tmp_path):

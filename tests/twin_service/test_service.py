@@ -111,6 +111,18 @@ def test_windows_may_come_in_any_order(serving):
     serving(body)
 
 
+def test_a_stranger_who_knocks_in_a_loop_does_not_fill_the_log(serving, caplog):
+    caplog.set_level("INFO")
+
+    async def body(system, client):
+        for _ in range(300):
+            assert code(await client.put(place(window()), content=b"x")) == (401, "bad_token")
+        assert system.metrics.rejected.values[("bad_token",)] == 300
+
+    serving(body)
+    assert 100 <= caplog.messages.count("refused") < 200
+
+
 def test_tokens_decide_who_may_read_and_write(serving):
     async def body(_system, client):
         path = place(window())

@@ -30,7 +30,7 @@ from servotwin.twin_service.limits import (
     RequestRejected,
     SampleTimeLimiter,
 )
-from servotwin.twin_service.monitoring import Counter, Gauge, Histogram, Metrics, configure_logging
+from servotwin.twin_service.monitoring import Counter, Gauge, Histogram, Metrics, RefusalLog, configure_logging
 from servotwin.twin_service.twin_file import read_twin
 
 
@@ -221,6 +221,23 @@ def test_a_log_line_is_one_json_object_whatever_it_holds():
         "servotwin.test",
     )
     assert "ValueError: it" in second["exception"]
+
+
+def test_a_flood_of_refusals_writes_few_lines_and_tells_how_many_it_left_out(caplog):
+    caplog.set_level(logging.INFO)
+    clock = [0.0]
+    refusals = RefusalLog(logging.getLogger("servotwin.test"), lambda: clock[0])
+    for _ in range(5000):
+        refusals.write("bad_token", servo="ax-1")
+    assert len(caplog.records) == 100
+    refusals.write("too_many", servo="ax-1")
+    assert caplog.records[-1].code == "too_many", "a flood of one code hides no other"
+    clock[0] = 2.0
+    for _ in range(3):
+        refusals.write("bad_token", servo="ax-2")
+    first, second = caplog.records[101:]
+    assert (first.servo, first.omitted) == ("ax-2", 4900)
+    assert not hasattr(second, "omitted")
 
 
 def test_polls_read_the_store_only_when_there_may_be_a_message():

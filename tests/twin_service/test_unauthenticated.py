@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
-from service_system import OPERATOR, TOKEN, served, twin_file
+from service_system import OPERATOR, OTHER, TOKEN, served, twin_file
 
 from servotwin.twin_service import unauthenticated
 from servotwin.twin_service.http_server import HttpServer, listening_socket
@@ -138,3 +138,24 @@ def test_without_tokens_and_behind_a_proxy_no_connection_is_limited(tmp_path: Pa
     assert asyncio.run(limit("", False)) is None
     assert asyncio.run(limit("behind_proxy = true", True)) is None
     assert asyncio.run(limit("", True)) is not None
+
+
+def test_a_servos_token_holds_a_bounded_number_of_connections_and_the_newest_live(tmp_path: Path) -> None:
+    async def body(connect: Connect) -> None:
+        held = [await connect(TOKEN) for _ in range(4)]
+        other, operator = await connect(OTHER), [await connect(OPERATOR) for _ in range(5)]
+        for reader, _ in (*held, other, *operator):
+            assert await answer(reader)
+        newer = [await connect(TOKEN) for _ in range(2)]
+        for reader, _ in newer:
+            assert b"200" in await answer(reader)
+        assert [await is_closed(reader) for reader, _ in held[:2]] == [True, True]
+        for reader, _ in (*held[2:], *newer, other, *operator):
+            assert not reader.at_eof()
+        # One that has ended makes room.
+        held[2][1].close()
+        await asyncio.sleep(0.2)
+        assert b"200" in await answer((await connect(TOKEN))[0])
+        assert not held[3][0].at_eof()
+
+    serving(tmp_path, "connections_per_servo = 4", body)
