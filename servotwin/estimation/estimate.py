@@ -79,9 +79,9 @@ class UnknownRatio:
     Attributes
     ----------
     known, needed : float
-        Standard deviation of its logarithm: as the window leaves it, and with which the window would show the gap.
+        Standard deviation of its logarithm: before the window, and with which the window would show the gap.
     widest : float
-        rad, largest gap that the window leaves possible (95 %).
+        rad, largest gap of the window within what is known of the ratio (95 %).
     """
 
     known: float

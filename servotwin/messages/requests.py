@@ -71,9 +71,14 @@ class Probe(Struct, frozen=True, omit_defaults=True, tag="probe"):
         return len(self.places) * self.strokes * self.hold_s
 
     @property
+    def teaches(self) -> bool:
+        """True where its moves differ in length: they tell the transmission's ratio too."""
+        return self.places != THERE_AND_BACK
+
+    @property
     def window_reason(self) -> str:
-        """Reason of its window: teaching where its moves differ in length."""
-        return PROBE if self.places == THERE_AND_BACK else TEACHING
+        """Reason of its window."""
+        return TEACHING if self.teaches else PROBE
 
 
 Ask = LongerWindow | Probe

@@ -134,8 +134,10 @@ def _unknown_ratio(
     room = (allowed / settings.calibration) ** 2 - left**2
     if not room > 0.0 or possible.slope == 0.0:
         return None
-    widest = possible.mean + NORMAL_95 * settings.calibration * possible.std
-    return UnknownRatio(possible.ratio_std, math.sqrt(room) / abs(possible.slope), unit * widest)
+    # Errors of rounding repeat with the motion: what such a window seems to tell of the ratio does not count.
+    known, slope = found.problem.model.unknowns[RATIO].std, possible.slope
+    widest = possible.mean - slope * possible.ratio + NORMAL_95 * (abs(slope) * known + left)
+    return UnknownRatio(known, math.sqrt(room) / abs(slope), unit * widest)
 
 
 def _not_told(ratio: UnknownRatio) -> str:
