@@ -24,7 +24,8 @@ _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper
 _ABSENT = "; where absent {:g} s on the paper's servo, scaled to the time of another"
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
 _ALLOWANCE = 2.0  # a teaching move tells the ratio so many times better than needed, in errors that are independent
-_LESSONS = 3  # teaching moves that were made in vain, after which another is useless
+_LESSONS = 3  # moves of different lengths that were made in vain, after which an engineer is told
+_RAREST = 20  # times that the pause between these doubles
 
 
 @settings("excitation")
@@ -150,6 +151,8 @@ class WindowSummary:
         The transmission's ratio, where the window does not tell the gap from it.
     noise : float
         m, root mean square of what the estimate leaves unexplained; NaN: not known.
+    taught : bool
+        True where it told the ratio.
     """
 
     time: float
@@ -159,6 +162,7 @@ class WindowSummary:
     slack: float = 0.0
     ratio: UnknownRatio | None = None
     noise: float = math.nan
+    taught: bool = False
 
 
 @dataclass(frozen=True)
@@ -174,7 +178,7 @@ class ExcitationState:
     probed : float
         s, time of the last request for a probing move.
     lessons : int
-        Moves of different lengths that the edge has accepted, since a window that showed the gap.
+        Moves of different lengths that the edge has accepted, since a window that told the ratio.
     """
 
     misses: int = 0
@@ -237,7 +241,7 @@ class ExcitationPolicy:
         if window.status not in _SILENT:
             known = window.status is GapStatus.OK
             why = "the window shows the gap" if known else "the window is at odds with the model, which no motion cures"
-            return Decision(replace(state, misses=0, lessons=0 if known else state.lessons), None, why)
+            return Decision(replace(state, misses=0, lessons=0 if window.taught else state.lessons), None, why)
         state = replace(state, misses=state.misses + 1)
         if window.ratio is not None:
             return self._teach(state, window, window.ratio)
@@ -287,16 +291,20 @@ class ExcitationPolicy:
         return Decision(after, LongerWindow(s.window, s.pre_trigger), why)
 
     def _teach(self, state: ExcitationState, window: WindowSummary, ratio: UnknownRatio) -> Decision:
-        """Request moves of different lengths; a longer window of the same moves would tell no more."""
+        """Request moves of different lengths; a longer window of the same moves would tell no more.
+
+        After each that was in vain the pause is twice as long: a gap may be too small for now.
+        """
         if state.misses < self.settings.after:
             return Decision(state, None, self._missed(state))
         shortest, size = self.lengths(window, ratio)
         missed = f"{self._missed(state)}, because the ratio is known to {100.0 * ratio.known:.2g} %"
         missed += f" and {100.0 * ratio.needed:.2g} % are needed"
         prevented = self._prevented(state.teaching, size)
-        if state.lessons >= _LESSONS:
-            prevented = f"{state.lessons} probing moves of different lengths did not tell it"
-        if why_not := prevented or self._wait(state, window):
+        wait = self._wait(state, window, 2.0 ** min(state.lessons, _RAREST))
+        if wait and not prevented and state.lessons >= _LESSONS:
+            prevented = f"{state.lessons} probing moves of different lengths did not tell it, or were cut short"
+        if why_not := prevented or wait:
             return Decision(state, None, f"{missed}, and {why_not}", prevented)
         share, s = shortest / size, self.settings
         ask = Probe(size, s.times.hold, s.strokes, (share, 0.0, 1.0, 1.0 - share, 1.0, 0.0))
@@ -326,9 +334,9 @@ class ExcitationPolicy:
             return f"a probing move must be {self._shown(needed)}, and at most {self._shown(most)} are allowed"
         return ""
 
-    def _wait(self, state: ExcitationState, window: WindowSummary) -> str:
-        """Reason for which a probing move has to wait; empty where there is none."""
-        pause, since = self.settings.times.interval, window.time - state.probed
+    def _wait(self, state: ExcitationState, window: WindowSummary, longer: float = 1.0) -> str:
+        """Reason for which a probing move has to wait, for a pause so many times `longer`; empty where there is none."""
+        pause, since = longer * self.settings.times.interval, window.time - state.probed
         if since < pause:
             return f"the last probing move was requested {since:.3g} s ago, and {pause:g} s must lie between two"
         return ""
