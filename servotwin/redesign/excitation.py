@@ -67,7 +67,7 @@ class ExcitationSettings:
         key(
             "hold_s",
             above=0.0,
-            help=f"Duration of a probing move, and of the window after its return{_ABSENT.format(_HOLD)}.",
+            help=f"Time at each place of a probing move, and of the window after its return{_ABSENT.format(_HOLD)}.",
         ),
     ] = None
     strokes: Annotated[int, key(minimum=1, help="Number of moves there and back.")] = 1
