@@ -39,9 +39,6 @@ NAME, CERTIFIED = "axes", "axes-certified"
 WORN = 10.0
 """Largest gap over the healthy one."""
 LEVELS, CERTIFIED_STEPS = 12, 4
-_MOVES = (0.6, 0.9)
-"""Part of a half period in which the gap moves to its next level: after the windows that end 0.55 past a step."""
-
 
 class Duty(NamedTuple):
     """What a preset does.
@@ -61,6 +58,9 @@ class Duty(NamedTuple):
         Largest error of the screw's lead, relative. Where it is stated, steps do not tell it from the gap.
     probe : float
         Largest probing move that the twin may request, m or rad; 0: none.
+    moves : (float, float)
+        Part of a half period in which the gap moves to its next level: after the windows that end 0.55 past a step, and
+        after a probing move that follows from one of these.
     """
 
     gap: float
@@ -70,6 +70,7 @@ class Duty(NamedTuple):
     hold: int = 1
     lead: float = 0.0
     probe: float = 0.0
+    moves: tuple[float, float] = (0.6, 0.9)
 
 
 _ARC_SECOND = math.radians(1.0 / 3600.0)
@@ -78,7 +79,7 @@ DUTIES: Mapping[str, Duty] = {
     "ball-screw": Duty(5e-6, 0.4),
     "robot-joint": Duty(math.radians(0.05), 4.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
-    "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3, lead=6e-3, probe=2e-4),
+    "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3, lead=6e-3, probe=2e-4, moves=(0.86, 0.98)),
     "micro-positioner": Duty(200e-9, 3.0, 0.95, 1.5, 3),
     "gantry": Duty(5e-5, 5.0),
     "emps": Duty(1e-5, 1.0),
@@ -142,7 +143,7 @@ class PresetMachine:
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
         for place in range(1, count) if self.worn[0] != self.worn[1] else ():
-            begin, end = (duty.half_period * (place * duty.hold - 1.0 + part) for part in _MOVES)
+            begin, end = (duty.half_period * (place * duty.hold - 1.0 + part) for part in duty.moves)
             rise, length = levels[place] - levels[place - 1], end - begin
             times += [begin, end]
             pieces += [[levels[place - 1], 0.0, 3.0 * rise / length**2, -2.0 * rise / length**3]]
@@ -355,7 +356,7 @@ def _line(ran: Sequence[Mapping[str, Any]], machines: Sequence[Mapping[str, Any]
     estimates = [each for machine in ran for each in machine["estimates"]]
     windows = sum(len(machine["statuses"]) for machine in ran)
     false = sum(not each["near"] and not each["inside"] for each in estimates)
-    worst = max((each["error"] / each["gap"] for each in estimates if not each["near"]), default=0.0)
+    worst = max((each["error"] / each["gap"] for each in estimates if each["gap"] and not each["near"]), default=0.0)
     steady = [each for each in estimates if each["steady"]]
     return [
         str(windows),

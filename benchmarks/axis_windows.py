@@ -1,7 +1,7 @@
 """Windows of random axes whose shaft is free in the gap, or of one mass on a rigid screw, and the estimates from them.
 
-``python -m benchmarks.axis_windows SEED COUNT`` prints one line for each kind; with ``shaft`` or ``screw`` after them, for
-these only.
+``python -m benchmarks.axis_windows SEED COUNT`` prints one line for each kind; with ``shaft`` or ``screw`` after them,
+for these only.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ from msgspec import Meta, Struct
 from servotwin.messages.checks import Count, Name, Text, require
 
 PROBE, TEACHING = "probe", "teaching"
-"""Reasons of the windows of a probing move: there and back, and to several places, so that its moves differ in length."""
+"""Reasons of the windows of a probing move: there and back, and to several places, in moves of different lengths."""
 _MAX_SECONDS = 600.0
 """Longest window or probe that a request may name, s; an edge's own limits are tighter."""
 THERE_AND_BACK = (1.0, 0.0)

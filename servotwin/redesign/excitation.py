@@ -335,7 +335,7 @@ class ExcitationPolicy:
         return ""
 
     def _wait(self, state: ExcitationState, window: WindowSummary, longer: float = 1.0) -> str:
-        """Reason for which a probing move has to wait, for a pause so many times `longer`; empty where there is none."""
+        """Reason for which a probing move has to wait, for a pause so many times `longer`; empty: none."""
         pause, since = longer * self.settings.times.interval, window.time - state.probed
         if since < pause:
             return f"the last probing move was requested {since:.3g} s ago, and {pause:g} s must lie between two"
