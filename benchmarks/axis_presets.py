@@ -40,6 +40,7 @@ WORN = 10.0
 """Largest gap over the healthy one."""
 LEVELS, CERTIFIED_STEPS = 12, 4
 
+
 class Duty(NamedTuple):
     """What a preset does.
 
