@@ -3,9 +3,18 @@
 from dataclasses import replace
 
 import msgspec
+import pytest
+from stage_scenario import stage
 
+from servotwin.cosim import cosimulate
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading, UnknownRatio, interval_95, no_estimate
-from servotwin.estimation.learning.wear import Wear
+from servotwin.estimation.learning.wear import Expectation, Wear
+from servotwin.messages import encode
+from servotwin.twin.context import context_of
+from servotwin.twin.estimating import DecodedWindow, estimator_of
+from servotwin.twin.evidence import GapEstimateRecord
+from servotwin.twin.evidence_rows import rows
+from servotwin.twin.replay import replay
 from servotwin.twin.state import TwinState, Versions, decode_state, encode_state
 from servotwin.twin.untold_ratio import UntoldRatio
 
@@ -46,3 +55,16 @@ def test_the_state_of_an_earlier_version_has_none() -> None:
     document = msgspec.msgpack.decode(encode_state(state))
     del document["ratio"]
     assert decode_state("axis", msgspec.msgpack.encode(document)).ratio == UntoldRatio()
+
+
+@pytest.mark.slow
+def test_an_estimate_that_does_not_tell_the_ratio_is_replayed_bit_for_bit() -> None:
+    scenario = stage((20261126, 2), None, duration=10.0).scenario
+    (message,) = cosimulate(scenario).windows
+    settings = scenario.twin.on(scenario.model)
+    expected = Expectation(0.0)
+    estimate = DecodedWindow.of(message).estimate(estimator_of(scenario.model, settings), expected)
+    assert estimate.ratio is not None
+    (row,) = rows([GapEstimateRecord(message, estimate, expected, None)], 1, "context")
+    found = replay(encode(message), row.body, context_of(scenario.model, settings)[1])
+    assert (found.same, found.differs, found.estimate.ratio) == (True, (), estimate.ratio)
