@@ -25,11 +25,13 @@ from servotwin.commissioning.edge_settings import Recording
 from servotwin.cosim import Cosimulation, Loop, SimulatedMachine
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
+from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.simulation import Run, Simulation
 from servotwin.twin.settings import TwinSettings
 
@@ -37,8 +39,6 @@ NAME, CERTIFIED = "axes", "axes-certified"
 WORN = 10.0
 """Largest gap over the healthy one."""
 LEVELS, CERTIFIED_STEPS = 12, 4
-_MOVES = (0.6, 0.9)
-"""Part of a half period in which the gap moves to its next level: after the windows that end 0.55 past a step."""
 
 
 class Duty(NamedTuple):
@@ -55,6 +55,13 @@ class Duty(NamedTuple):
         overshoot touches one flank in each step, so that a window must hold two of them.
     hold : int
         Half periods of each level of the gap. Windows longer than a half period overlap: one of them sees each move.
+    lead : float
+        Largest error of the screw's lead, relative. Where it is stated, steps do not tell it from the gap.
+    probe : float
+        Largest probing move that the twin may request, m or rad; 0: none.
+    moves : (float, float)
+        Part of a half period in which the gap moves to its next level: after the windows that end 0.55 past a step, and
+        after a probing move that follows from one of these.
     """
 
     gap: float
@@ -62,6 +69,9 @@ class Duty(NamedTuple):
     before: float = 0.05
     window: float = 0.5
     hold: int = 1
+    lead: float = 0.0
+    probe: float = 0.0
+    moves: tuple[float, float] = (0.6, 0.9)
 
 
 _ARC_SECOND = math.radians(1.0 / 3600.0)
@@ -70,7 +80,7 @@ DUTIES: Mapping[str, Duty] = {
     "ball-screw": Duty(5e-6, 0.4),
     "robot-joint": Duty(math.radians(0.05), 4.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
-    "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3),
+    "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3, lead=6e-3, probe=2e-4, moves=(0.86, 0.98)),
     "micro-positioner": Duty(200e-9, 3.0, 0.95, 1.5, 3),
     "gantry": Duty(5e-5, 5.0),
     "emps": Duty(1e-5, 1.0),
@@ -134,7 +144,7 @@ class PresetMachine:
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
         for place in range(1, count) if self.worn[0] != self.worn[1] else ():
-            begin, end = (duty.half_period * (place * duty.hold - 1.0 + part) for part in _MOVES)
+            begin, end = (duty.half_period * (place * duty.hold - 1.0 + part) for part in duty.moves)
             rise, length = levels[place] - levels[place - 1], end - begin
             times += [begin, end]
             pieces += [[levels[place - 1], 0.0, 3.0 * rise / length**2, -2.0 * rise / length**3]]
@@ -170,7 +180,9 @@ class PresetMachine:
         model, duty = self.model, DUTIES[self.name]
         most = _AMPLITUDES[1] * duty.gap
         ranges = Uncertainty(gap=(0.0, 1.5 * WORN * duty.gap / model.p), step=(_AMPLITUDES[0] * duty.gap, 2.0 * most))
-        rate = self.rate
+        rate, probe = self.rate, duty.probe
+        excitation = ExcitationSettings(probe=probe) if probe else None
+        own = TwinSettings(policy="paper", k_dz=0.0, excitation=excitation)
         return Scenario(
             servo=model,
             duration=self.duration,
@@ -180,8 +192,9 @@ class PresetMachine:
                 sample_rate=rate,
                 window=_whole(duty.window * duty.half_period, rate),
                 pre_trigger=_whole(duty.before * duty.half_period, rate),
+                probe=ProbeLimits(probe) if probe else None,
             ),
-            twin=TwinSettings(uncertainty=ranges) if self.certified else TwinSettings(policy="paper", k_dz=0.0),
+            twin=TwinSettings(uncertainty=ranges, excitation=excitation) if self.certified else own,
         )
 
     def alone(self) -> Run:
@@ -218,8 +231,11 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 
 
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
-    plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
-    return PresetMachine(name, plant, DUTIES[name].gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
+    errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, DUTIES[name]
+    amplitude = duty.gap * math.exp(random.uniform(*np.log(_AMPLITUDES)))
+    if duty.lead:
+        errors["p"] = 1.0 + duty.lead * random.uniform(-1.0, 1.0)
+    return PresetMachine(name, model.scaled(errors), amplitude)
 
 
 def with_twin(machine: PresetMachine) -> Loop:
@@ -262,6 +278,7 @@ def measured(machine: PresetMachine) -> dict[str, Any]:
             for each, (first, gap, last) in zip(loop.estimates, true.tolist(), strict=True)
             if each.ok
         ],
+        "windows": [window.reason for window in loop.windows],
         "sent": len(loop.updates),
         "applied": len(loop.applied),
         "fallbacks": len(loop.fallbacks),
@@ -340,7 +357,7 @@ def _line(ran: Sequence[Mapping[str, Any]], machines: Sequence[Mapping[str, Any]
     estimates = [each for machine in ran for each in machine["estimates"]]
     windows = sum(len(machine["statuses"]) for machine in ran)
     false = sum(not each["near"] and not each["inside"] for each in estimates)
-    worst = max((each["error"] / each["gap"] for each in estimates if not each["near"]), default=0.0)
+    worst = max((each["error"] / each["gap"] for each in estimates if each["gap"] and not each["near"]), default=0.0)
     steady = [each for each in estimates if each["steady"]]
     return [
         str(windows),

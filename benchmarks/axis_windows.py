@@ -1,6 +1,7 @@
 """Windows of random axes whose shaft is free in the gap, or of one mass on a rigid screw, and the estimates from them.
 
-``python -m benchmarks.axis_windows SEED COUNT`` prints one line for each kind.
+``python -m benchmarks.axis_windows SEED COUNT`` prints one line for each kind; with ``shaft`` or ``screw`` after them,
+for these only.
 """
 
 from __future__ import annotations
@@ -179,12 +180,12 @@ def tally(make: Callable[[np.random.Generator, str], AxisCase], kind: str, count
     return result
 
 
-def main(seed: int, count: int) -> None:
-    """Print a line for each kind."""
+def main(seed: int, count: int, only: str = "") -> None:
+    """Print a line for each kind, or for those of shafts or screws only."""
     for name, make, kinds in (("shaft", shaft_case, SHAFT), ("screw", screw_case, SCREW)):
-        for kind in kinds:
+        for kind in kinds if only in ("", name) else ():
             print(f"{name}, {kind}: {tally(make, kind, count, seed)}", flush=True)
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]), int(sys.argv[2]))
+    main(int(sys.argv[1]), int(sys.argv[2]), *sys.argv[3:])

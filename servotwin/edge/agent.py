@@ -238,7 +238,7 @@ class Agent:
         self._requests, answer = decide(request, self._requests, s, here, self._at_rest())
         move = self.probe
         if move is not None and move is not before:
-            self._open_window = _OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, "probe")
+            self._open_window = _OpenWindow(max(0, move.first - self._requests.pre_trigger), move.last, move.reason)
             self._expected = self._reference + self.offset
         self._twin_answered(request.servo)
         return [ScheduledMessage(self.samples, answer)]

@@ -25,38 +25,41 @@ class ProbeLimits:
 
 @dataclass(frozen=True, slots=True)
 class ProbingMove:
-    """Offset added to the reference: `size` for `hold` samples, 0 for as many, `strokes` times.
+    """Offsets added to the reference, each for `hold` samples.
 
     Parameters
     ----------
     first : int
         First sample of the move.
-    size : float
+    offsets : tuple of float
         m.
-    hold, strokes : int
-        Samples at each offset, and number of repetitions.
+    hold : int
+        Samples at each offset.
+    reason : str
+        Reason of its window.
     """
 
     first: int
-    size: float
+    offsets: tuple[float, ...]
     hold: int
-    strokes: int
+    reason: str
 
     @classmethod
     def of(cls, probe: Probe, first: int, rate: float) -> "ProbingMove":
         """Make the requested move from sample `first` on, at `rate` Hz."""
-        return cls(first, probe.size, max(1, round(probe.hold_s * rate)), probe.strokes)
+        offsets = probe.strokes * tuple(share * probe.size for share in probe.places)
+        return cls(first, offsets, max(1, round(probe.hold_s * rate)), probe.window_reason)
 
     @property
     def last(self) -> int:
         """First sample after the move."""
-        return self.first + 2 * self.strokes * self.hold
+        return self.first + len(self.offsets) * self.hold
 
     def offset(self, sample: int) -> float:
         """Offset at a sample, m."""
         if not self.first <= sample < self.last:
             return 0.0
-        return 0.0 if (sample - self.first) // self.hold % 2 else self.size
+        return self.offsets[(sample - self.first) // self.hold]
 
     def changes(self) -> Iterator[tuple[int, float]]:
         """Yield the samples at which the offset changes, with the new offset (m)."""

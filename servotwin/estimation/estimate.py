@@ -69,6 +69,26 @@ class MachineReading:
     softness: tuple[float, float] = (0.0, 0.0)
 
 
+@dataclass(frozen=True)
+class UnknownRatio:
+    """The transmission's ratio, where a window does not tell the gap from it and would show the gap with it.
+
+    Steps between the same two places tell one number of the two: at rest the load has moved by the ratio times the
+    motor's travel, less the gap. Moves of different lengths tell both.
+
+    Attributes
+    ----------
+    known, needed : float
+        Standard deviation of its logarithm: before the window, and with which the window would show the gap.
+    widest : float
+        rad, largest gap of the window within what is known of the ratio (95 %).
+    """
+
+    known: float
+    needed: float
+    widest: float
+
+
 @dataclass(frozen=True, repr=False)
 class GapEstimate:
     """Total gap estimated from one window.
@@ -101,6 +121,8 @@ class GapEstimate:
         The encoder's offset, read from this window or carried from earlier ones; None: not used.
     machine : MachineReading, optional
         The machine's own numbers; None: the model was taken as it is.
+    ratio : UnknownRatio, optional
+        None: the window tells the gap from the ratio, or would not show the gap with a known ratio either.
     """
 
     gap: float
@@ -117,6 +139,7 @@ class GapEstimate:
     evaluations: int = 0
     offset: OffsetReading | CarriedOffset | None = None
     machine: MachineReading | None = None
+    ratio: UnknownRatio | None = None
 
     def __post_init__(self) -> None:
         # Estimates go into messages and logs, which take plain floats only, not numpy scalars.

@@ -9,7 +9,17 @@ SI units throughout. Values that are not known, or bounds that do not exist, are
 from servotwin.messages.checks import NAME_PATTERN, InvalidMessage, Refusal, finite
 from servotwin.messages.claims import PROTOCOL, ClaimStatus, EdgeClaim
 from servotwin.messages.codec import MAX_BYTES, Message, ParameterMessage, decode, encode
-from servotwin.messages.requests import Answer, Ask, LongerWindow, Probe, Request, RequestOutcome, Resend
+from servotwin.messages.requests import (
+    PROBE,
+    TEACHING,
+    Answer,
+    Ask,
+    LongerWindow,
+    Probe,
+    Request,
+    RequestOutcome,
+    Resend,
+)
 from servotwin.messages.responses import LearntResponse
 from servotwin.messages.setting import AnyGains, Band, CascadeGains, Gains, LinearGains, Setting
 from servotwin.messages.updates import (
@@ -40,7 +50,9 @@ __all__ = [
     "KNOWN_FIELDS",
     "MAX_BYTES",
     "NAME_PATTERN",
+    "PROBE",
     "PROTOCOL",
+    "TEACHING",
     "Acknowledge",
     "Answer",
     "AnyGains",

@@ -8,8 +8,12 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text, require
 
+PROBE, TEACHING = "probe", "teaching"
+"""Reasons of the windows of a probing move: there and back, and to several places, in moves of different lengths."""
 _MAX_SECONDS = 600.0
 """Longest window or probe that a request may name, s; an edge's own limits are tighter."""
+THERE_AND_BACK = (1.0, 0.0)
+"""Places of a move to its size and back, as shares of the size."""
 
 
 class LongerWindow(Struct, frozen=True, tag="window"):
@@ -31,32 +35,50 @@ class LongerWindow(Struct, frozen=True, tag="window"):
         )
 
 
-class Probe(Struct, frozen=True, tag="probe"):
-    """Request for one probing move of the reference, there and back, while it rests.
+class Probe(Struct, frozen=True, omit_defaults=True, tag="probe"):
+    """Request for one probing move of the reference, to places near it and back, while it rests.
+
+    An edge that knows no `places` moves there and back.
 
     Attributes
     ----------
     size : float
-        m, added to the reference.
+        m, largest offset that is added to the reference.
     hold_s : float
-        s at the offset, and s of observation after each return.
+        s at each place; those after the last return are for observation.
     strokes : int
-        Number of moves there and back.
+        Number of times that the places are visited.
+    places : tuple of float
+        Offsets in their order, as shares of the size; the last one is 0.
     """
 
     size: float
     hold_s: float
     strokes: Annotated[int, Meta(ge=1, le=16)] = 1
+    places: Annotated[tuple[Annotated[float, Meta(ge=-1.0, le=1.0)], ...], Meta(min_length=2, max_length=16)] = (
+        THERE_AND_BACK
+    )
 
     def __post_init__(self) -> None:
         require(isfinite(self.size) and self.size != 0.0, f"request size {self.size} m is not allowed")
+        require(self.places[-1] == 0.0, f"request places end at {self.places[-1]}: must end at 0")
         require(isfinite(self.hold_s) and self.hold_s > 0.0, f"request hold_s {self.hold_s} s is not allowed")
         require(self.duration <= _MAX_SECONDS, f"request takes {self.duration} s: at most {_MAX_SECONDS} s are allowed")
 
     @property
     def duration(self) -> float:
         """s, from the first move to the end of the last hold."""
-        return 2.0 * self.strokes * self.hold_s
+        return len(self.places) * self.strokes * self.hold_s
+
+    @property
+    def teaches(self) -> bool:
+        """True where its moves differ in length: they tell the transmission's ratio too."""
+        return self.places != THERE_AND_BACK
+
+    @property
+    def window_reason(self) -> str:
+        """Reason of its window."""
+        return TEACHING if self.teaches else PROBE
 
 
 Ask = LongerWindow | Probe

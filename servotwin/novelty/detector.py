@@ -17,12 +17,12 @@ from msgspec import Struct, structs
 from servotwin.edge.recorder import Cut
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.visible import least_travel
-from servotwin.messages import LearntResponse
+from servotwin.messages import PROBE, TEACHING, LearntResponse
 from servotwin.novelty.chart import Chart, add_window, restarted, with_fewer_windows
 from servotwin.novelty.score import EncoderOffset, Score, leads_at_rest, score
 from servotwin.novelty.settings import NoveltyModel, NoveltyRules, NoveltySettings, ResponseMode
 
-PROBE, FIRST, PERIODIC = "probe", "first", "periodic"
+FIRST, PERIODIC = "first", "periodic"
 LOST_MOTION, SCORE, CUSUM = "novelty: lost motion", "novelty: score", "novelty: cusum"
 
 # Names under which the states of earlier versions are stored.
@@ -229,8 +229,8 @@ def _without_score(state: NoveltyState, cut: Cut, settings: NoveltySettings) -> 
 
 def _reason(state: NoveltyState, cut: Cut, settings: NoveltySettings, news: str) -> str:
     """Reason to send, the most important first; empty: none."""
-    if cut.reason == PROBE:
-        return PROBE
+    if cut.reason in (PROBE, TEACHING):
+        return cut.reason
     if news or state.unconditional:
         return news or FIRST
     late = cut.last / settings.model.rate - (state.last_sent or 0.0) >= settings.rules.period_s

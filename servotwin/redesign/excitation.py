@@ -2,7 +2,8 @@
 
 The calmer a loop, the less informative its windows (dual control). A longer window costs only bytes; a move of the
 reference disturbs the machine, so the policy requests it only where the configuration allows it, no larger than needed,
-and rarely. The policy is a pure function of its state and one window; every decision carries its reason.
+and rarely. Windows that do not tell the gap from the ratio of a rigid screw lead to a probing move at once, of moves of
+different lengths. The policy is a pure function of its state and one window; every decision carries its reason.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.estimate import GapStatus, UnknownRatio
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 from servotwin.plant.display_units import MILLIMETRES, DisplayUnit
 
@@ -22,6 +23,9 @@ _ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a litt
 _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
 _ABSENT = "; where absent {:g} s on the paper's servo, scaled to the time of another"
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
+_ALLOWANCE = 2.0  # a teaching move tells the ratio so many times better than needed, in errors that are independent
+_LESSONS = 3  # moves of different lengths that were made in vain, after which an engineer is told
+_RAREST = 20  # times that the pause between these doubles
 
 
 @settings("excitation")
@@ -63,7 +67,7 @@ class ExcitationSettings:
         key(
             "hold_s",
             above=0.0,
-            help=f"Duration of a probing move, and of the window after its return{_ABSENT.format(_HOLD)}.",
+            help=f"Time at each place of a probing move, and of the window after its return{_ABSENT.format(_HOLD)}.",
         ),
     ] = None
     strokes: Annotated[int, key(minimum=1, help="Number of moves there and back.")] = 1
@@ -143,6 +147,12 @@ class WindowSummary:
     slack : float
         m, motion of the reference to which the loop does not react: both thresholds of the dead zone together; NaN: not
         known.
+    ratio : UnknownRatio, optional
+        The transmission's ratio, where the window does not tell the gap from it.
+    noise : float
+        m, root mean square of what the estimate leaves unexplained; NaN: not known.
+    taught : bool
+        True where it told the ratio.
     """
 
     time: float
@@ -150,6 +160,9 @@ class WindowSummary:
     long: bool
     upper: float
     slack: float = 0.0
+    ratio: UnknownRatio | None = None
+    noise: float = math.nan
+    taught: bool = False
 
 
 @dataclass(frozen=True)
@@ -160,15 +173,20 @@ class ExcitationState:
     ----------
     misses : int
         Consecutive uninformative windows, since the last informative one or the last request.
-    window, probing : Stage
+    window, probing, teaching : Stage
+        Of requests for longer windows, for moves there and back, and for moves of different lengths.
     probed : float
         s, time of the last request for a probing move.
+    lessons : int
+        Moves of different lengths that the edge has accepted, since a window that told the ratio.
     """
 
     misses: int = 0
     window: Stage = Stage.OPEN
     probing: Stage = Stage.OPEN
     probed: float = -math.inf
+    teaching: Stage = Stage.OPEN
+    lessons: int = 0
 
     def rebooted(self) -> ExcitationState:
         """State after a boot of the edge, which cuts windows as configured again."""
@@ -181,16 +199,24 @@ class ExcitationState:
         """
         refused = outcome in (RequestOutcome.NOT_ALLOWED, RequestOutcome.TOO_LARGE)
         stage = Stage.REFUSED if refused else Stage.ACCEPTED if outcome is RequestOutcome.ACCEPTED else Stage.OPEN
-        return replace(self, window=stage) if isinstance(ask, LongerWindow) else replace(self, probing=stage)
+        if isinstance(ask, LongerWindow):
+            return replace(self, window=stage)
+        if ask.teaches:
+            return replace(self, teaching=stage, lessons=self.lessons + (stage is Stage.ACCEPTED))
+        return replace(self, probing=stage)
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Decision on a request (None: no request), with its reason."""
+    """Decision on a request (None: no request), with its reason.
+
+    `prevented`: why moves of different lengths, which are needed, will not be requested; empty otherwise.
+    """
 
     state: ExcitationState
     ask: Ask | None
     reason: str
+    prevented: str = ""
 
 
 @dataclass(frozen=True)
@@ -215,8 +241,10 @@ class ExcitationPolicy:
         if window.status not in _SILENT:
             known = window.status is GapStatus.OK
             why = "the window shows the gap" if known else "the window is at odds with the model, which no motion cures"
-            return Decision(replace(state, misses=0), None, why)
+            return Decision(replace(state, misses=0, lessons=0 if window.taught else state.lessons), None, why)
         state = replace(state, misses=state.misses + 1)
+        if window.ratio is not None:
+            return self._teach(state, window, window.ratio)
         if not window.long and state.window is not Stage.REFUSED:
             return self._window(state)
         if state.misses < self.settings.after:
@@ -230,6 +258,16 @@ class ExcitationPolicy:
         within the hold time takes an error of the gap's size.
         """
         return window.slack + self.pitch * (window.upper + self.settings.margin)
+
+    def lengths(self, window: WindowSummary, ratio: UnknownRatio) -> tuple[float, float]:
+        """Lengths of moves that tell the ratio from the gap, m: each crosses the gap, and the second is the size.
+
+        On each flank the motor rests at places as far apart as the two differ: errors of position over this difference
+        make the error of the ratio.
+        """
+        shortest = window.slack + self.pitch * (min(window.upper, ratio.widest) + self.settings.margin)
+        apart = _ALLOWANCE * window.noise / min(ratio.needed, ratio.known)
+        return shortest, shortest + (max(shortest, apart) if math.isfinite(apart) else math.inf)
 
     def _shown(self, move: float) -> str:
         return f"{self.unit.factor * move:.3g} {self.unit.name}"
@@ -252,9 +290,30 @@ class ExcitationPolicy:
         after = replace(state, misses=0, window=Stage.REQUESTED)
         return Decision(after, LongerWindow(s.window, s.pre_trigger), why)
 
+    def _teach(self, state: ExcitationState, window: WindowSummary, ratio: UnknownRatio) -> Decision:
+        """Request moves of different lengths; a longer window of the same moves would tell no more.
+
+        After each that was in vain the pause is twice as long: a gap may be too small for now.
+        """
+        if state.misses < self.settings.after:
+            return Decision(state, None, self._missed(state))
+        shortest, size = self.lengths(window, ratio)
+        missed = f"{self._missed(state)}, because the ratio is known to {100.0 * ratio.known:.2g} %"
+        missed += f" and {100.0 * ratio.needed:.2g} % are needed"
+        prevented = self._prevented(state.teaching, size)
+        wait = self._wait(state, window, 2.0 ** min(state.lessons, _RAREST))
+        if wait and not prevented and state.lessons >= _LESSONS:
+            prevented = f"{state.lessons} probing moves of different lengths did not tell it, or were cut short"
+        if why_not := prevented or wait:
+            return Decision(state, None, f"{missed}, and {why_not}", prevented)
+        share, s = shortest / size, self.settings
+        ask = Probe(size, s.times.hold, s.strokes, (share, 0.0, 1.0, 1.0 - share, 1.0, 0.0))
+        after = replace(state, misses=0, teaching=Stage.REQUESTED, probed=window.time)
+        return Decision(after, ask, f"{missed}: moves of {self._shown(shortest)} and {self._shown(size)} tell it")
+
     def _probe(self, state: ExcitationState, window: WindowSummary) -> Decision:
         s, needed = self.settings, self.needed(window)
-        why_not = self._why_not(state, window, needed)
+        why_not = self._prevented(state.probing, needed) or self._wait(state, window)
         if why_not:
             return Decision(state, None, f"{self._missed(state)}, and {why_not}")
         after = replace(state, misses=0, probing=Stage.REQUESTED, probed=window.time)
@@ -262,20 +321,24 @@ class ExcitationPolicy:
         why += f"a gap of {math.degrees(window.upper):.3g} deg"
         return Decision(after, Probe(needed, s.times.hold, s.strokes), why)
 
-    def _why_not(self, state: ExcitationState, window: WindowSummary, needed: float) -> str:
-        """Reason against a probing move; empty where there is none."""
-        s, since = self.settings, window.time - state.probed
-        if s.probe == 0.0:
+    def _prevented(self, stage: Stage, needed: float) -> str:
+        """Reason for which a move of a size (m) is never requested; empty where there is none."""
+        most = self.settings.probe
+        if most == 0.0:
             return "a probing move is not allowed"
-        if state.probing is Stage.REFUSED:
+        if stage is Stage.REFUSED:
             return "this edge refuses probing moves"
-        pause = s.times.interval
-        if since < pause:
-            return f"the last probing move was requested {since:.3g} s ago, and {pause:g} s must lie between two"
         if not math.isfinite(needed):
             return "gap and dead zone are not bounded well enough to size a probing move"
-        if needed > s.probe:
-            return f"a probing move must be {self._shown(needed)}, and at most {self._shown(s.probe)} are allowed"
+        if needed > most:
+            return f"a probing move must be {self._shown(needed)}, and at most {self._shown(most)} are allowed"
+        return ""
+
+    def _wait(self, state: ExcitationState, window: WindowSummary, longer: float = 1.0) -> str:
+        """Reason for which a probing move has to wait, for a pause so many times `longer`; empty: none."""
+        pause, since = longer * self.settings.times.interval, window.time - state.probed
+        if since < pause:
+            return f"the last probing move was requested {since:.3g} s ago, and {pause:g} s must lie between two"
         return ""
 
 

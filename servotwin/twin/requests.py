@@ -10,7 +10,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.messages import Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
+from servotwin.messages import PROBE, TEACHING, Answer, Probe, Request, RequestOutcome, Setting, WindowMessage
 from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
 from servotwin.redesign.excitation import Decision, ExcitationPolicy, ExcitationState, WindowSummary, long_enough
@@ -130,9 +130,12 @@ class Requests:
         """
         if window.boot != state.boot:
             state = RequestState(boot=window.boot, excitation=state.excitation.rebooted(), attempts=state.attempts)
-        long = window.reason == "probe" or long_enough(*_extent(window), self.policy.settings)
+        long = window.reason in (PROBE, TEACHING) or long_enough(*_extent(window), self.policy.settings)
         upper = min(self.widest, widest, estimate.interval[1])
-        summary = WindowSummary(now, estimate.status, long, upper, _slack(in_force))
+        taught = estimate.ok and estimate.machine is not None
+        summary = WindowSummary(
+            now, estimate.status, long, upper, _slack(in_force), estimate.ratio, estimate.rms, taught
+        )
         decision = self.policy.decide(state.excitation, summary)
         state = replace(state, excitation=decision.state)
         if estimate.ok and state.pending is not None and isinstance(state.pending.ask, Probe):

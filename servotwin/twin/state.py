@@ -26,6 +26,7 @@ from servotwin.twin.oversight import Oversight
 from servotwin.twin.requests import Attempts, RequestState
 from servotwin.twin.responses import ResponseState
 from servotwin.twin.triage import TriageState
+from servotwin.twin.untold_ratio import UntoldRatio
 
 MAX_ENDED_BOOTS = 1000
 """Number of boots that a twin remembers: its state must stay bounded."""
@@ -207,6 +208,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         State of the optional parts; None: the twin has no such part.
     oversight : Oversight
         Effect of engineers' acts.
+    ratio : UntoldRatio
+        Windows that do not tell the gap from the transmission's ratio.
     """
 
     servo: str
@@ -225,6 +228,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     newest: tuple[str, float] | None = None
     introduced: bool = False
     oversight: Oversight = Oversight()
+    ratio: UntoldRatio = UntoldRatio()
 
     def with_sent(self, update: Update, now: float) -> TwinState:
         """Note the first sending of an update, with its setting: the receipt may get lost."""

@@ -43,12 +43,12 @@ from servotwin.twin.answers import (
     take_verification,
     take_wake,
 )
-from servotwin.twin.estimating import OTHER_CONTROLLER, UNUSABLE, DecodedWindow, stated_machine
+from servotwin.twin.asking import ask
+from servotwin.twin.estimating import OTHER_CONTROLLER, DecodedWindow, stated_machine
 from servotwin.twin.evidence import (
     ActRecord,
     AlarmRecord,
     DisturbanceRecord,
-    ExcitationRecord,
     GapEstimateRecord,
     GlanceRecord,
     MachineRecord,
@@ -223,7 +223,7 @@ def _work_on(
         state = replace(state, rests=(*state.rests, learnt.disturbance.bias)[-_RESTS:])
     records.append(RedesignRecord(message, redesign))
     if not learnt.stale and not state.oversight.held:
-        state, requested, decided = _ask(model, state, message, learnt.estimate, arrived, now)
+        state, requested, decided = ask(model, state, message, learnt.estimate, arrived, now)
         others, records = [*others, *requested], [*records, *decided]
     result = _send_redesign(model, state, message, evidence, redesign, now)
     return result._replace(messages=(*result.messages, *others), evidence=(*records, *result.evidence))
@@ -312,21 +312,6 @@ def _compare(model: TwinModel, state: TwinState, decoded: DecodedWindow) -> tupl
         return state, []
     before, count = state.other_controller, 0 if made.agrees else state.other_controller + 1
     return replace(state, other_controller=count), [made.sentence] if count == OTHER_CONTROLLER > before else []
-
-
-def _ask(
-    model: TwinModel, state: TwinState, message: WindowMessage, estimate: GapEstimate, arrived: float, now: float
-) -> tuple[TwinState, tuple[Message, ...], list[Record]]:
-    """Decide if a probing move is asked for after an estimate; return the request, and the records of both."""
-    if model.requests is None or state.requests is None or estimate.method == UNUSABLE:
-        return state, (), []
-    widest = state.wear.expect(model.settings.trend, message.boot, estimate.time, arrived).widest
-    in_force = state.known.get(state.versions.in_force)
-    asking, decision = model.requests.decide(state.requests, message, estimate, widest, in_force, now)
-    state, record = replace(state, requests=asking), ExcitationRecord(message, decision)
-    if decision.ask is None or asking.pending is None:
-        return state, (), [record]
-    return state, (asking.pending,), [record, asking.pending]
 
 
 def _glance(

@@ -101,6 +101,26 @@ def test_a_probing_move_goes_there_and_back_and_has_a_window_of_its_own() -> Non
     assert agent.probe is None
 
 
+def test_a_move_to_several_places_goes_to_each_and_its_window_is_for_teaching() -> None:
+    agent = SendingAgent(settings(pre_trigger_s=0.2))
+    feed(agent, [2e-3] * 30)
+    assert answer(agent, request(ask=Probe(-1e-3, 0.2, 1, (0.4, 0.0, 1.0, 0.6, 1.0, 0.0)))).accepted
+    (window,) = windows(feed(agent, [2e-3] * 40))
+    assert (window.reason, window.start, window.samples) == ("teaching", 2.8, 14)
+    places = [1.6e-3, 2e-3, 1e-3, 1.4e-3, 1e-3, 2e-3]
+    assert references(window) == [2e-3] * 2 + [place for place in places for _ in range(2)]
+    assert [time for time, _ in window.reference_changes] == [3.0, 3.2, 3.4, 3.6, 3.8, 4.0]
+    assert (agent.probe, agent.offset) == (None, 0.0)
+
+
+def test_a_move_to_several_places_is_as_long_as_all_of_them() -> None:
+    agent = SendingAgent(settings())
+    feed(agent, [2e-3] * 30)
+    six = (0.4, 0.0, 1.0, 0.6, 1.0, 0.0)
+    assert answer(agent, request(ask=Probe(1e-3, 0.4, 1, six))).outcome is RequestOutcome.TOO_LARGE
+    assert answer(agent, request(serial=2, ask=Probe(1e-3, 0.3, 1, six))).outcome is RequestOutcome.ACCEPTED
+
+
 def test_the_move_ends_when_the_reference_moves_and_its_window_is_another() -> None:
     agent = SendingAgent(settings(pre_trigger_s=0.2))
     feed(agent, [2e-3] * 30)
@@ -230,7 +250,7 @@ def test_blocks_equal_single_samples(
 
 
 def test_a_move_tells_its_changes() -> None:
-    move = ProbingMove(7, 1e-3, 4, 2)
+    move = ProbingMove.of(Probe(1e-3, 0.4, 2), 7, RATE)
     assert list(move.changes()) == [(7, 1e-3), (11, 0.0), (15, 1e-3), (19, 0.0)]
     assert [move.offset(k) for k in (6, 7, 10, 11, 14, 15, 18, 19, 22, 23)] == [
         0.0, 1e-3, 1e-3, 0.0, 0.0, 1e-3, 1e-3, 0.0, 0.0, 0.0,

@@ -25,6 +25,11 @@ SECONDS = st.floats(1e-3, 9.0)
 ASKS = st.one_of(
     st.builds(lambda length, share: LongerWindow(length, share * length), SECONDS, st.floats(0.0, 0.999)),
     st.builds(Probe, st.floats(1e-9, 1.0) | st.floats(-1.0, -1e-9), SECONDS, st.integers(1, 16)),
+    st.builds(
+        lambda size, places: Probe(size, 1.0, places=(*places, 0.0)),
+        st.floats(1e-9, 1.0),
+        st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=15),
+    ),
 )
 NAMES = st.from_regex(r"\A[A-Za-z0-9][A-Za-z0-9._-]{0,63}\Z")
 COUNTS = st.integers(1, 2**53)
@@ -91,6 +96,9 @@ def test_the_two_kinds_are_distinguished() -> None:
         ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 0.0}}, "hold_s"),
         ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 100.0, "strokes": 4}}, "takes 800.0 s"),
         ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "strokes": 17}}, "strokes"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "places": [1.0, 0.5]}}, "places end at 0.5"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "places": [1.1, 0.0]}}, "places"),
+        ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 101.0, "places": [1.0, 0.2] * 2 + [1.0, 0.0]}}, "takes"),
         ({"ask": {"type": "probe", "size": 1e-4, "hold_s": 1.0, "strokes": 0}}, "strokes"),
     ],
 )
@@ -106,6 +114,15 @@ def test_cut_and_random_bytes_are_refused(noise: bytes) -> None:
     for data in (noise, whole[: len(noise) % len(whole)], whole + noise[:1] if noise else b""):
         with pytest.raises(InvalidMessage):
             decode(data)
+
+
+def test_a_move_there_and_back_has_the_bytes_of_earlier_versions_and_other_places_are_additional() -> None:
+    plain, several = (
+        msgspec.msgpack.decode(encode(msgspec.structs.replace(REQUEST, ask=ask)))["ask"]
+        for ask in (Probe(1e-4, 0.85), Probe(1e-4, 0.85, places=(0.4, 0.0, 1.0, 0.0)))
+    )
+    assert plain == {"type": "probe", "size": 1e-4, "hold_s": 0.85}
+    assert several == plain | {"places": [0.4, 0.0, 1.0, 0.0]}
 
 
 def test_which_outcomes_are_temporary() -> None:

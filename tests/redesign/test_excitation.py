@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.estimate import GapStatus, UnknownRatio
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 from servotwin.redesign.excitation import (
     Decision,
@@ -179,3 +179,77 @@ def test_a_window_is_long_enough_with_the_requested_length_and_pre_trigger() -> 
 def test_bad_settings_are_named(changes: dict[str, float], words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
         ExcitationSettings(**changes)
+
+
+RATIO = UnknownRatio(known=5e-3, needed=1e-3, widest=4.0 * DEG)
+UNTOLD = replace(SHORT, ratio=RATIO, noise=2e-8)
+
+
+def test_windows_that_do_not_tell_the_ratio_lead_to_moves_of_two_lengths_at_once() -> None:
+    """Each crosses the widest gap that the window leaves possible; no longer window is asked for first."""
+    none, ask = asks(ALLOWED, [UNTOLD, UNTOLD])
+    shortest = PITCH * 9.0 * DEG
+    assert none is None
+    assert isinstance(ask, Probe)
+    assert ask.size == pytest.approx(2.0 * shortest)
+    assert ask.places == pytest.approx((0.5, 0.0, 1.0, 0.5, 1.0, 0.0))
+    assert ask.teaches
+
+
+@given(st.floats(1e-9, 1e-6), st.floats(1e-4, 0.1), st.floats(0.0, 20.0 * DEG), st.floats(0.0, 1e-4))
+def test_every_move_crosses_the_gap_and_the_lengths_differ_by_enough(
+    noise: float, needed: float, widest: float, slack: float
+) -> None:
+    seen = replace(UNTOLD, ratio=UnknownRatio(0.1, needed, widest), noise=noise, slack=slack)
+    _, ask = asks(replace(ALLOWED, probe=1.0), [seen, seen])
+    assert isinstance(ask, Probe)
+    places = [share * ask.size for share in (0.0, *ask.places)]
+    lengths = [abs(b - a) for a, b in pairwise(places)]
+    assert min(lengths) >= (slack + PITCH * (widest + 5.0 * DEG)) * (1.0 - 1e-9)
+    assert max(lengths) - min(lengths) >= 2.0 * noise / needed * (1.0 - 1e-9)
+    turns = [(b - a) * (d - c) for (a, b), (c, d) in pairwise(pairwise(places))]
+    assert max(turns) < 0.0
+
+
+@pytest.mark.parametrize(
+    ("settings", "seen", "state", "prevented"),
+    [
+        (ExcitationSettings(), UNTOLD, ExcitationState(), "a probing move is not allowed"),
+        (ExcitationSettings(probe=9e-5), UNTOLD, ExcitationState(), "at most 0.09 mm are allowed"),
+        (ALLOWED, replace(UNTOLD, noise=math.nan), ExcitationState(), "not bounded well enough"),
+        (ALLOWED, UNTOLD, ExcitationState(teaching=Stage.REFUSED), "this edge refuses probing moves"),
+        (ALLOWED, UNTOLD, ExcitationState(probed=-1.0, lessons=3), "3 probing moves of different lengths did not"),
+    ],
+)
+def test_what_prevents_them_is_told(
+    settings: ExcitationSettings, seen: WindowSummary, state: ExcitationState, prevented: str
+) -> None:
+    decision = run(settings, [seen, seen], state)[-1]
+    assert decision.ask is None
+    assert prevented in decision.prevented
+    assert decision.reason.endswith(decision.prevented)
+
+
+def test_they_wait_for_the_pause_between_two_moves_which_prevents_nothing() -> None:
+    decision = run(ALLOWED, [replace(UNTOLD, time=50.0)] * 2, ExcitationState(probed=0.0))[-1]
+    assert (decision.ask, decision.prevented) == (None, "")
+    assert "60 s must lie between two" in decision.reason
+
+
+def test_each_move_in_vain_doubles_the_pause_before_the_next() -> None:
+    state = ExcitationState(probed=0.0, lessons=5)
+    early, late = (run(ALLOWED, [replace(UNTOLD, time=time)] * 2, state)[-1] for time in (32 * 59.0, 32 * 61.0))
+    assert early.ask is None
+    assert isinstance(late.ask, Probe)
+
+
+def test_lessons_count_until_a_window_tells_the_ratio_and_probes_for_the_gap_are_apart() -> None:
+    ask = asks(ALLOWED, [UNTOLD] * 2)[-1]
+    assert isinstance(ask, Probe)
+    state = ExcitationState().answered(ask, RequestOutcome.ACCEPTED)
+    assert (state.lessons, state.teaching, state.probing) == (1, Stage.ACCEPTED, Stage.OPEN)
+    refused = ExcitationState().answered(ask, RequestOutcome.TOO_LARGE)
+    assert (refused.lessons, refused.teaching, refused.probing) == (0, Stage.REFUSED, Stage.OPEN)
+    known = replace(LONG, status=GapStatus.OK)
+    assert run(ALLOWED, [known], state)[-1].state.lessons == 1
+    assert run(ALLOWED, [replace(known, taught=True)], state)[-1].state.lessons == 0

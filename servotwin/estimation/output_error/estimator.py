@@ -186,7 +186,14 @@ def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:
 def _stated(blank: GapEstimate, found: Search, verdict: JudgedFit, unit: float) -> GapEstimate:
     """Fill a blank estimate."""
     rms = float(np.sqrt(np.mean(found.best.raw**2)))
-    made = replace(blank, status=verdict.status, reasons=verdict.reasons, rms=rms, evaluations=found.best.evaluations)
+    made = replace(
+        blank,
+        status=verdict.status,
+        reasons=verdict.reasons,
+        rms=rms,
+        evaluations=found.best.evaluations,
+        ratio=verdict.ratio,
+    )
     gap, total = unit * verdict.half, unit * verdict.std_total
     if verdict.status is GapStatus.LOWER_BOUND:
         return replace(made, gap=gap, interval=(gap, math.inf))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from servotwin.estimation.output_error.shaft import run_shaft
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.axis import Axis
-from servotwin.plant.backlash import play
+from servotwin.plant.backlash import play_samples
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
@@ -73,6 +73,7 @@ class MotionModel(FittedModel, Protocol):
     """Model of the load's motion. The first two unknowns are half gap and offset, at the load."""
 
     def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion: ...
+    def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array: ...
     def start(self, half: float, offset: float, first: tuple[float, float]) -> Array: ...
 
 
@@ -87,6 +88,7 @@ class Priors(NamedTuple):
 
 
 HALF, OFFSET, DELAY, RATIO = range(4)
+LAG = 5  # of `PlayModel`
 
 
 def _common(priors: Priors) -> tuple[Unknown, ...]:
@@ -236,6 +238,10 @@ class ShaftModel:
         position, velocity, end = out[:, :: made.fine]
         return Motion(position + made.zero, velocity, end, sides[:: made.fine])
 
+    def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
+        """Position (N,) of the last mass in `simulate`."""
+        return self.simulate(drive, measured, interval, values, rate).position
+
 
 @lru_cache(maxsize=64)
 def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, Array, Array, int]:
@@ -292,7 +298,7 @@ class PlayModel:
         """Any."""
         return 1.0, 1.0
 
-    @property
+    @cached_property
     def unknowns(self) -> tuple[Unknown, ...]:
         """Half gap, offset of the position, delay, ratio, first place of the screw, lag of the position.
 
@@ -311,12 +317,21 @@ class PlayModel:
     def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
         """Motion under the motor's motion (N,) at the load, for unknowns (u,); there is nothing to observe."""
         del measured, rate
-        half, offset, _, ratio, first, lag = values.tolist()
-        driven, half = math.exp(ratio) * drive + offset, math.exp(ratio) * abs(half)
-        place = play(driven, 2.0 * half, first)
-        lead = driven - place
+        driven, half, place = self._driven(drive, values)
+        lead, lag = driven - place, float(values[LAG])
         sides = np.where(np.abs(lead) >= half * (1.0 - 1e-9), np.sign(lead), 0.0).astype(np.int8)
         return Motion(lagged(place, lag / interval), np.gradient(place, interval), place, sides)
+
+    def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
+        """Position (N,) of the mass in `simulate`."""
+        del measured, rate
+        return lagged(self._driven(drive, values)[2], float(values[LAG]) / interval)
+
+    def _driven(self, drive: Array, values: Array) -> tuple[Array, float, Array]:
+        """Motor (N,) at the load, half gap there, and place (N,) of the screw behind the gap."""
+        half, offset, _, ratio, first, _ = values.tolist()
+        driven, half = math.exp(ratio) * drive + offset, math.exp(ratio) * abs(half)
+        return driven, half, play_samples(driven, np.array([half]), first)
 
 
 def lagged(values: Array, samples: float) -> Array:

@@ -42,17 +42,30 @@ class PossibleHalf(NamedTuple):
         Means of all unknowns.
     ratio_std : float
         Standard deviation of the logarithm of the transmission's ratio.
+    covariance : float
+        Of the half gap and that logarithm.
     """
 
     mean: float
     std: float
     unknowns: Array
     ratio_std: float
+    covariance: float
 
     @property
     def ratio(self) -> float:
         """Logarithm of the transmission's ratio over the model's."""
         return float(self.unknowns[RATIO])
+
+    @property
+    def slope(self) -> float:
+        """Change of the half gap per change of the ratio's logarithm, m or rad at the load."""
+        return self.covariance / self.ratio_std**2
+
+    @property
+    def std_with_ratio(self) -> float:
+        """Standard deviation of the half gap if the ratio were known."""
+        return math.sqrt(max(0.0, self.std**2 - self.slope * self.covariance))
 
 
 def possible_half(found: Search) -> PossibleHalf | None:
@@ -73,9 +86,11 @@ def possible_half(found: Search) -> PossibleHalf | None:
         weights = widths * _in_noise(found, fits)
     weights /= weights.sum()
     values = np.array([fit.values for fit in fits])
-    half = _moments(weights, halves, widths / math.sqrt(12.0))
-    _, ratio_std = _moments(weights, values[:, RATIO], np.array([_ratio_std(found, fit, rounding) for fit in fits]))
-    return PossibleHalf(*half, weights @ values, ratio_std)
+    mean, std = _moments(weights, halves, widths / math.sqrt(12.0))
+    ratios = values[:, RATIO]
+    ratio, ratio_std = _moments(weights, ratios, np.array([_ratio_std(found, fit, rounding) for fit in fits]))
+    covariance = float(weights @ ((halves - mean) * (ratios - ratio)))
+    return PossibleHalf(mean, std, weights @ values, ratio_std, covariance)
 
 
 def _moments(weights: Array, values: Array, spreads: Array) -> tuple[float, float]:

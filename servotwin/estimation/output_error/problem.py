@@ -49,22 +49,22 @@ class Problem:
         """Of the window, s."""
         return self.interval * self.position.size
 
-    @property
+    @cached_property
     def lead(self) -> Array:
         """(N,) motor before the load."""
         return np.asarray(self.drive - self.position)
 
-    @property
+    @cached_property
     def range(self) -> float:
         """Of the lead."""
         return float(np.ptp(self.lead))
 
-    @property
+    @cached_property
     def margin(self) -> int:
         """Samples at either end that do not count, because of the delay."""
         return 1 + math.ceil(self.largest_delay / self.interval)
 
-    @property
+    @cached_property
     def largest_delay(self) -> float:
         """s."""
         known = LARGEST * self.model.unknowns[DELAY].std
@@ -98,7 +98,9 @@ class Problem:
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
         part = slice(self.margin, self.drive.size - self.margin)
-        misfit = np.asarray((self.motion(values, rate).position - self.position)[part])
+        drive = delayed(self.drive, float(values[DELAY]) / self.interval)
+        position = self.model.position(drive, self.position, self.interval, values, rate)
+        misfit = np.asarray((position - self.position)[part])
         misfit[self.unsure] = 0.0
         return misfit
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.estimation.estimate import NORMAL_95, GapStatus
+from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
-from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.models import HALF, RATIO
 from servotwin.estimation.output_error.possible import PossibleHalf
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.plant.signals import Array
@@ -44,6 +44,8 @@ class JudgedFit:
     std, std_total : float
         Of the half gap.
     reasons : tuple of str
+    ratio : UnknownRatio, optional
+        The transmission's ratio, where the window would show the gap with it.
     """
 
     status: GapStatus
@@ -51,6 +53,7 @@ class JudgedFit:
     std: float = math.inf
     std_total: float = math.inf
     reasons: tuple[str, ...] = ()
+    ratio: UnknownRatio | None = None
 
 
 def judge(
@@ -94,20 +97,54 @@ def judge(
         words = "one flank explains the window nearly as well as two"
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
         return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
-    doubts = tuple(filter(None, (_wide(found, half, std, settings, unit), _rival(found, half, total, unit))))
-    status = GapStatus.UNIDENTIFIABLE if doubts else GapStatus.OK
-    return JudgedFit(status, math.nan if doubts else half, std, total, doubts)
+    allowed = _allowed(found, half, settings)
+    doubts = tuple(filter(None, (_wide(std, allowed, unit), _rival(found, half, total, unit))))
+    if not doubts:
+        return JudgedFit(GapStatus.OK, half, std, total)
+    ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
+    reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
+    return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
 
 
-def _wide(found: Search, half: float, std: float, settings: OutputErrorSettings, unit: float) -> str:
+def _allowed(found: Search, half: float, settings: OutputErrorSettings) -> float:
+    """Largest standard deviation with which a half gap counts as known, m or rad at the load."""
+    travel = 0.5 * _TRAVEL * float(np.ptp(found.problem.drive))
+    return max(settings.largest_share * half, 0.5 * settings.counts * found.problem.count, travel)
+
+
+def _wide(std: float, allowed: float, unit: float) -> str:
     if math.isinf(std):
         return "the measurements do not depend on the gap"
-    problem = found.problem
-    travel = 0.5 * _TRAVEL * float(np.ptp(problem.drive))
-    allowed = max(settings.largest_share * half, 0.5 * settings.counts * problem.count, travel)
     if std <= allowed:
         return ""
     return f"the gap is known to {_deg(unit * std)} only, and {_deg(unit * allowed)} are allowed"
+
+
+def _unknown_ratio(
+    found: Search, possible: PossibleHalf, settings: OutputErrorSettings, allowed: float, unit: float
+) -> UnknownRatio | None:
+    """The ratio, where with it the half gap would be known as well as is `allowed`; None: it would not.
+
+    `allowed` (m or rad at the load) is a standard deviation.
+    """
+    free = found.free.copy()
+    free[RATIO] = False
+    given = replace(found, free=free)
+    left = math.hypot(found.best.std(HALF, free), rounded(given), possible.std_with_ratio)
+    room = (allowed / settings.calibration) ** 2 - left**2
+    if not room > 0.0 or possible.slope == 0.0:
+        return None
+    # Errors of rounding repeat with the motion: what such a window seems to tell of the ratio does not count.
+    known, slope = found.problem.model.unknowns[RATIO].std, possible.slope
+    widest = possible.mean - slope * possible.ratio + NORMAL_95 * (abs(slope) * known + left)
+    return UnknownRatio(known, math.sqrt(room) / abs(slope), unit * widest)
+
+
+def _not_told(ratio: UnknownRatio) -> str:
+    return (
+        f"gap and ratio are not told apart: the ratio is known to {100.0 * ratio.known:.2g} %, and "
+        f"{100.0 * ratio.needed:.2g} % would show the gap"
+    )
 
 
 def _rival(found: Search, half: float, total: float, unit: float) -> str:
