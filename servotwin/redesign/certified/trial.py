@@ -10,7 +10,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import law_for_margins, strength
 from servotwin.plant.margins import Margins
-from servotwin.plant.plants import Plant
+from servotwin.plant.plants import Plant, floats
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,
@@ -27,6 +27,8 @@ from servotwin.redesign.certified.uncertainty import Uncertainty
 _LENGTH = 150.0
 # Decay times of the slowest mode: what is left of it is e^-12.
 _DECAYS = 12.0
+# Time constants with which a load that floats in its gap coasts to rest: e^-8 is a sixtieth of what counts as rest.
+_COASTS = 8.0
 _JUDGED = 1.0 / 6.0
 # Samples a second, in units of the crossover and of the frequency of the sensitivity peak (both rad/s).
 _SAMPLING, _RESONANCE = 12.0, 2.0
@@ -84,13 +86,23 @@ def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Tria
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
     loop = nominal_margins(servo, law_for_margins(_reference(servo.controller, laws)))
     crossover = _speed(loop, servo, slowest)
-    duration = max(_LENGTH / crossover, _DECAYS / slowest)
+    duration = max(_LENGTH / crossover, _DECAYS / slowest, _COASTS * coasting_time(servo, uncertainty))
     resonance = loop.Ms_omega if loop.Ms_omega < math.inf else 0.0
     rate = min(max(_SAMPLING * crossover, _RESONANCE * resonance), _MOST_SAMPLES / duration)
     sampled = servo.controller.sample_rate
     if sampled is not None:
         rate = sampled / max(1, round(sampled / rate))
     return Trial(duration, _JUDGED * duration, rate, None, 1.0 / crossover)
+
+
+def coasting_time(servo: Plant, uncertainty: Uncertainty) -> float:
+    """s, longest time constant with which a load that floats in its gap loses its speed; 0 where none floats so, or
+    friction stops it; inf where nothing does."""
+    if not floats(servo) or servo.guide.friction:
+        return 0.0
+    load = servo.load
+    most, least = (1.0 + uncertainty.m) * sum(load.m), (1.0 - uncertainty.c) * load.c[0]
+    return most / least if least else math.inf
 
 
 def _speed(loop: Margins, servo: Plant, slowest: float) -> float:
