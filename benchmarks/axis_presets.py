@@ -4,7 +4,7 @@ The gap grows in levels, between windows where they leave room: a machine that w
 
 ``python -m benchmarks.batch axes --seed 5 --count 45 FILE`` measures the twin's estimates while the preset's own
 controller runs; ``axes-certified`` instead of ``axes`` lets the twin send verified settings to machines worn
-by any amount. The blocks are the presets.
+by any amount. The blocks are the presets, and `two-mass-cascade`, the two-mass drive with a cascade.
 """
 
 from __future__ import annotations
@@ -22,12 +22,13 @@ from rich.table import Table
 
 from benchmarks.batch import Batch
 from servotwin.commissioning.edge_settings import Recording
+from servotwin.control.cascade import Cascade
 from servotwin.cosim import Cosimulation, Loop, SimulatedMachine
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.plant.axis import Axis
+from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.simulation import Run, Simulation
@@ -64,9 +65,19 @@ class Duty(NamedTuple):
     hold: int = 1
 
 
+CASCADED = "two-mass-cascade"
+_CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5, voltage_limit=60.0, sample_rate=2000.0)
+
+
+def machine_of(name: str) -> Axis:
+    """A preset, or the two-mass drive with a cascade in place of its filtered PID."""
+    return Axis.preset("two-mass-drive").replace(controller=_CASCADE) if name == CASCADED else Axis.preset(name)
+
+
 _ARC_SECOND = math.radians(1.0 / 3600.0)
 DUTIES: Mapping[str, Duty] = {
     "two-mass-drive": Duty(2e-3, 10.0),
+    CASCADED: Duty(2e-3, 10.0),
     "ball-screw": Duty(5e-6, 0.4),
     "robot-joint": Duty(math.radians(0.05), 4.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
@@ -119,7 +130,7 @@ class PresetMachine:
     @property
     def model(self) -> Axis:
         """The preset."""
-        return Axis.preset(self.name)
+        return machine_of(self.name)
 
     @property
     def duration(self) -> float:
@@ -201,15 +212,20 @@ def _whole(seconds: float, rate: float) -> float:
     return round(seconds * rate) / rate
 
 
+def _seed(name: str) -> int:
+    """Place of a preset among them; the drive with a cascade has the machines of the one without."""
+    return AXES.index("two-mass-drive" if name == CASCADED else name)
+
+
 def preset_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset whose gap grows."""
-    random, model = np.random.default_rng([seed, list(DUTIES).index(name)]), Axis.preset(name)
+    random, model = np.random.default_rng([seed, _seed(name)]), machine_of(name)
     return [_drawn(name, model, random) for _ in range(count)]
 
 
 def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset with any gap up to the largest, to which the twin sends verified settings."""
-    random = np.random.default_rng([seed, list(DUTIES).index(name), 1])
+    random = np.random.default_rng([seed, _seed(name), 1])
     worn = [float(random.uniform(0.0, WORN)) for _ in range(count)]
     return [
         replace(machine, worn=(gap, gap), steps=CERTIFIED_STEPS, certified=True)

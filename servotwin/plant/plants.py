@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from pathlib import Path
-from typing import TypeAlias, TypeGuard
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import AXES, Axis
-from servotwin.plant.basis import BacklashKind
 from servotwin.plant.servo import PRESETS, Servo
 
 Plant: TypeAlias = Servo | Axis
@@ -66,11 +65,6 @@ def structure_of(plant: Plant) -> tuple[object, ...]:
         *forces,
         *falling,
     )
-
-
-def floats(plant: Plant) -> TypeGuard[Axis]:
-    """True for an axis whose load no spring and no flank holds while it is inside the gap."""
-    return isinstance(plant, Axis) and plant.backlash_kind is BacklashKind.FREE and plant.load.free
 
 
 def check_homogeneous(plant: Plant, described: str) -> None:

@@ -10,7 +10,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import law_for_margins, strength
 from servotwin.plant.margins import Margins
-from servotwin.plant.plants import Plant, floats
+from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,
@@ -21,6 +21,7 @@ from servotwin.redesign.certified.margins import (
     widened,
     with_margins,
 )
+from servotwin.redesign.certified.rest_in_gap import coasting_time
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
 # In units of 1 / crossover: a loop that approaches through a gap creeps, and hunting shows in the end.
@@ -93,16 +94,6 @@ def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Tria
     if sampled is not None:
         rate = sampled / max(1, round(sampled / rate))
     return Trial(duration, _JUDGED * duration, rate, None, 1.0 / crossover)
-
-
-def coasting_time(servo: Plant, uncertainty: Uncertainty) -> float:
-    """s, longest time constant with which a load that floats in its gap loses its speed; 0 where none floats so, or
-    friction stops it; inf where nothing does."""
-    if not floats(servo) or servo.guide.friction:
-        return 0.0
-    load = servo.load
-    most, least = (1.0 + uncertainty.m) * sum(load.m), (1.0 - uncertainty.c) * load.c[0]
-    return most / least if least else math.inf
 
 
 def _speed(loop: Margins, servo: Plant, slowest: float) -> float:
