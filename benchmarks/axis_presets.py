@@ -69,6 +69,11 @@ CASCADED = "two-mass-cascade"
 _CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5, voltage_limit=60.0, sample_rate=2000.0)
 
 
+def duty_of(name: str) -> Duty:
+    """What a preset or the drive with a cascade does."""
+    return DUTIES["two-mass-drive" if name == CASCADED else name]
+
+
 def machine_of(name: str) -> Axis:
     """A preset, or the two-mass drive with a cascade in place of its filtered PID."""
     return Axis.preset("two-mass-drive").replace(controller=_CASCADE) if name == CASCADED else Axis.preset(name)
@@ -77,7 +82,6 @@ def machine_of(name: str) -> Axis:
 _ARC_SECOND = math.radians(1.0 / 3600.0)
 DUTIES: Mapping[str, Duty] = {
     "two-mass-drive": Duty(2e-3, 10.0),
-    CASCADED: Duty(2e-3, 10.0),
     "ball-screw": Duty(5e-6, 0.4),
     "robot-joint": Duty(math.radians(0.05), 4.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
@@ -86,6 +90,7 @@ DUTIES: Mapping[str, Duty] = {
     "gantry": Duty(5e-5, 5.0),
     "emps": Duty(1e-5, 1.0),
 }
+MACHINES = (*DUTIES, CASCADED)
 # Model's errors, relative; amplitudes of the reference in healthy gaps.
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1}
 _AMPLITUDES = (30.0, 100.0)
@@ -125,7 +130,7 @@ class PresetMachine:
 
     def __post_init__(self) -> None:
         if not self.steps:
-            object.__setattr__(self, "steps", LEVELS * DUTIES[self.name].hold)
+            object.__setattr__(self, "steps", LEVELS * duty_of(self.name).hold)
 
     @property
     def model(self) -> Axis:
@@ -135,12 +140,12 @@ class PresetMachine:
     @property
     def duration(self) -> float:
         """Length of the run, s."""
-        return self.steps * DUTIES[self.name].half_period
+        return self.steps * duty_of(self.name).half_period
 
     @property
     def gap(self) -> PiecewiseCubic:
         """Total gap, rad at the motor, level after level."""
-        duty, healthy = DUTIES[self.name], DUTIES[self.name].gap / self.model.p
+        duty, healthy = duty_of(self.name), duty_of(self.name).gap / self.model.p
         count = -(-self.steps // duty.hold)
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
@@ -155,7 +160,7 @@ class PresetMachine:
     @property
     def reference(self) -> SquareWave:
         """To and fro."""
-        return SquareWave(self.amplitude, 2.0 * DUTIES[self.name].half_period)
+        return SquareWave(self.amplitude, 2.0 * duty_of(self.name).half_period)
 
     @property
     def count(self) -> float:
@@ -178,7 +183,7 @@ class PresetMachine:
         InvalidInput
             A twin cannot be had.
         """
-        model, duty = self.model, DUTIES[self.name]
+        model, duty = self.model, duty_of(self.name)
         most = _AMPLITUDES[1] * duty.gap
         ranges = Uncertainty(gap=(0.0, 1.5 * WORN * duty.gap / model.p), step=(_AMPLITUDES[0] * duty.gap, 2.0 * most))
         rate = self.rate
@@ -235,7 +240,7 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
     plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
-    return PresetMachine(name, plant, DUTIES[name].gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
+    return PresetMachine(name, plant, duty_of(name).gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
 
 
 def with_twin(machine: PresetMachine) -> Loop:
@@ -307,7 +312,7 @@ def steps_of(machine: PresetMachine, run: Run) -> dict[str, list[float]]:
     still = _STILL * sizes + _COUNTS * machine.model.position_resolution
     return {
         "settled": (0.5 * np.ptp(last, axis=1) <= still).astype(float).tolist(),
-        "cost": (np.abs(error).mean(axis=1) * DUTIES[machine.name].half_period / sizes).tolist(),
+        "cost": (np.abs(error).mean(axis=1) * duty_of(machine.name).half_period / sizes).tolist(),
         "tail": (np.abs(last).max(axis=1) / sizes).tolist(),
     }
 
@@ -331,7 +336,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     ):
         result.add_column(heading, justify="right")
     notes = []
-    for name in DUTIES:
+    for name in MACHINES:
         machines = [numbers for key, numbers in found.items() if key.split("/")[1] == name]
         refused = sorted({each["refused"] for each in machines if "refused" in each})
         ran = [each for each in machines if "twin" in each]
@@ -391,7 +396,7 @@ def _doubts(ran: Sequence[Mapping[str, Any]]) -> Counter[str]:
 
 
 BATCHES = {
-    NAME: Batch(partial(_units, preset_machines), measured, _show, tuple(DUTIES)),
-    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, tuple(DUTIES)),
+    NAME: Batch(partial(_units, preset_machines), measured, _show, MACHINES),
+    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, MACHINES),
 }
 """For `benchmarks.batch`."""

@@ -10,6 +10,7 @@ import pytest
 
 from benchmarks.axis_presets import DUTIES, certified_machines, judged, measured, preset_machines
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.control.cascade import Cascade
 from servotwin.plant.axis import AXES
 
 ESTIMATED = tuple(name for name in DUTIES if name != "emps")
@@ -28,6 +29,14 @@ def test_every_preset_has_a_duty_and_machines_near_it() -> None:
         # A stepper goes where it is told, and its load follows: none of the numbers that are off is in its model.
         assert (machines[0].plant == machines[0].model) == (name == "stepper-stage")
         assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
+
+
+def test_the_drive_with_a_cascade_is_the_same_machine() -> None:
+    cascaded, (plain,) = certified_machines("two-mass-cascade", 1, 5)[0], certified_machines("two-mass-drive", 1, 5)
+    assert (cascaded.amplitude, cascaded.worn, cascaded.duration) == (plain.amplitude, plain.worn, plain.duration)
+    assert cascaded.plant.load == plain.plant.load
+    assert isinstance(cascaded.model.controller, Cascade)
+    cascaded.scenario().model.check_loop()
 
 
 @pytest.mark.parametrize("name", DUTIES)
