@@ -105,7 +105,8 @@ def linear_law(
         float, key(minimum=0.0, unit="1", help="Factor on what the states in `holds` take in.")
     ] = 1.0,
     B_inside: Annotated[
-        Rows, key(form=Form.OTHER, parse=_rows, help="B inside the dead zone without integral_only; nothing where absent.")
+        Rows,
+        key(form=Form.OTHER, parse=_rows, help="B inside the dead zone without integral_only; nothing where absent."),
     ] = (),
     D_inside: Annotated[tuple[float, ...], key(help="D inside the dead zone without integral_only, likewise.")] = (),
 ) -> LinearLaw:

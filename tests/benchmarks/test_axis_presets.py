@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.axis_presets import DUTIES, certified_machines, judged, measured, preset_machines
-from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.control.cascade import Cascade
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.axis import AXES
 
 ESTIMATED = tuple(name for name in DUTIES if name != "emps")

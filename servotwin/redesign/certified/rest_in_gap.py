@@ -42,9 +42,10 @@ def check_rests(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Non
         return
     load = servo.load
     if not load.c[0]:
+        damping, friction = load.key("c"), load.key("friction")
         raise InvalidInput(
-            f"load.{load.key('c')} = 0: a load that floats in its gap without damping and friction never comes to rest, "
-            f'and no setting is verified; give {load.key("c")} or {load.key("friction")} above 0, or policy = "paper"'
+            f"load.{damping} = 0: a load that floats in its gap without damping and friction never comes to rest, and "
+            f'no setting is verified; give {damping} or {friction} above 0, or policy = "paper"'
         )
     stopped = servo.motor_friction > 0.0 or uncertainty.friction[0] > 0.0
     if not stopped and isinstance(servo.controller, Controller) and not _can_rest(servo, servo.controller, demands):
