@@ -4,7 +4,7 @@ The gap grows in levels, between windows where they leave room: a machine that w
 
 ``python -m benchmarks.batch axes --seed 5 --count 45 FILE`` measures the twin's estimates while the preset's own
 controller runs; ``axes-certified`` instead of ``axes`` lets the twin send verified settings to machines worn
-by any amount. The blocks are the presets.
+by any amount. The blocks are the presets, and `two-mass-cascade`, the two-mass drive with a cascade.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from rich.table import Table
 
 from benchmarks.batch import Batch
 from servotwin.commissioning.edge_settings import Recording
+from servotwin.control.cascade import Cascade
 from servotwin.cosim import Cosimulation, Loop, SimulatedMachine
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.probe import ProbeLimits
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
-from servotwin.plant.axis import Axis
+from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
@@ -74,6 +75,20 @@ class Duty(NamedTuple):
     moves: tuple[float, float] = (0.6, 0.9)
 
 
+CASCADED = "two-mass-cascade"
+_CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5, voltage_limit=60.0, sample_rate=2000.0)
+
+
+def duty_of(name: str) -> Duty:
+    """What a preset or the drive with a cascade does."""
+    return DUTIES["two-mass-drive" if name == CASCADED else name]
+
+
+def machine_of(name: str) -> Axis:
+    """A preset, or the two-mass drive with a cascade in place of its filtered PID."""
+    return Axis.preset("two-mass-drive").replace(controller=_CASCADE) if name == CASCADED else Axis.preset(name)
+
+
 _ARC_SECOND = math.radians(1.0 / 3600.0)
 DUTIES: Mapping[str, Duty] = {
     "two-mass-drive": Duty(2e-3, 10.0),
@@ -85,6 +100,7 @@ DUTIES: Mapping[str, Duty] = {
     "gantry": Duty(5e-5, 5.0),
     "emps": Duty(1e-5, 1.0),
 }
+MACHINES = (*DUTIES, CASCADED)
 # Model's errors, relative; amplitudes of the reference in healthy gaps.
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1}
 _AMPLITUDES = (30.0, 100.0)
@@ -124,22 +140,22 @@ class PresetMachine:
 
     def __post_init__(self) -> None:
         if not self.steps:
-            object.__setattr__(self, "steps", LEVELS * DUTIES[self.name].hold)
+            object.__setattr__(self, "steps", LEVELS * duty_of(self.name).hold)
 
     @property
     def model(self) -> Axis:
         """The preset."""
-        return Axis.preset(self.name)
+        return machine_of(self.name)
 
     @property
     def duration(self) -> float:
         """Length of the run, s."""
-        return self.steps * DUTIES[self.name].half_period
+        return self.steps * duty_of(self.name).half_period
 
     @property
     def gap(self) -> PiecewiseCubic:
         """Total gap, rad at the motor, level after level."""
-        duty, healthy = DUTIES[self.name], DUTIES[self.name].gap / self.model.p
+        duty, healthy = duty_of(self.name), duty_of(self.name).gap / self.model.p
         count = -(-self.steps // duty.hold)
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
@@ -154,7 +170,7 @@ class PresetMachine:
     @property
     def reference(self) -> SquareWave:
         """To and fro."""
-        return SquareWave(self.amplitude, 2.0 * DUTIES[self.name].half_period)
+        return SquareWave(self.amplitude, 2.0 * duty_of(self.name).half_period)
 
     @property
     def count(self) -> float:
@@ -177,7 +193,7 @@ class PresetMachine:
         InvalidInput
             A twin cannot be had.
         """
-        model, duty = self.model, DUTIES[self.name]
+        model, duty = self.model, duty_of(self.name)
         most = _AMPLITUDES[1] * duty.gap
         ranges = Uncertainty(gap=(0.0, 1.5 * WORN * duty.gap / model.p), step=(_AMPLITUDES[0] * duty.gap, 2.0 * most))
         rate, probe = self.rate, duty.probe
@@ -214,15 +230,20 @@ def _whole(seconds: float, rate: float) -> float:
     return round(seconds * rate) / rate
 
 
+def _seed(name: str) -> int:
+    """Place of a preset among them; the drive with a cascade has the machines of the one without."""
+    return AXES.index("two-mass-drive" if name == CASCADED else name)
+
+
 def preset_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset whose gap grows."""
-    random, model = np.random.default_rng([seed, list(DUTIES).index(name)]), Axis.preset(name)
+    random, model = np.random.default_rng([seed, _seed(name)]), machine_of(name)
     return [_drawn(name, model, random) for _ in range(count)]
 
 
 def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset with any gap up to the largest, to which the twin sends verified settings."""
-    random = np.random.default_rng([seed, list(DUTIES).index(name), 1])
+    random = np.random.default_rng([seed, _seed(name), 1])
     worn = [float(random.uniform(0.0, WORN)) for _ in range(count)]
     return [
         replace(machine, worn=(gap, gap), steps=CERTIFIED_STEPS, certified=True)
@@ -231,11 +252,16 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 
 
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
+<<<<<<< HEAD
     errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, DUTIES[name]
     amplitude = duty.gap * math.exp(random.uniform(*np.log(_AMPLITUDES)))
     if duty.lead:
         errors["p"] = 1.0 + duty.lead * random.uniform(-1.0, 1.0)
     return PresetMachine(name, model.scaled(errors), amplitude)
+=======
+    plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
+    return PresetMachine(name, plant, duty_of(name).gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
+>>>>>>> f4b04cd700cfb38ad34b8ceb078202415b196c38
 
 
 def with_twin(machine: PresetMachine) -> Loop:
@@ -308,7 +334,7 @@ def steps_of(machine: PresetMachine, run: Run) -> dict[str, list[float]]:
     still = _STILL * sizes + _COUNTS * machine.model.position_resolution
     return {
         "settled": (0.5 * np.ptp(last, axis=1) <= still).astype(float).tolist(),
-        "cost": (np.abs(error).mean(axis=1) * DUTIES[machine.name].half_period / sizes).tolist(),
+        "cost": (np.abs(error).mean(axis=1) * duty_of(machine.name).half_period / sizes).tolist(),
         "tail": (np.abs(last).max(axis=1) / sizes).tolist(),
     }
 
@@ -332,7 +358,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     ):
         result.add_column(heading, justify="right")
     notes = []
-    for name in DUTIES:
+    for name in MACHINES:
         machines = [numbers for key, numbers in found.items() if key.split("/")[1] == name]
         refused = sorted({each["refused"] for each in machines if "refused" in each})
         ran = [each for each in machines if "twin" in each]
@@ -392,7 +418,7 @@ def _doubts(ran: Sequence[Mapping[str, Any]]) -> Counter[str]:
 
 
 BATCHES = {
-    NAME: Batch(partial(_units, preset_machines), measured, _show, tuple(DUTIES)),
-    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, tuple(DUTIES)),
+    NAME: Batch(partial(_units, preset_machines), measured, _show, MACHINES),
+    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, MACHINES),
 }
 """For `benchmarks.batch`."""

@@ -320,7 +320,10 @@ def parse_toml(text: str, source: str) -> Table:
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A hint such as " (did you mean 'mass_kg'?)", or nothing where no known word is close."""
     words = sorted(known)
-    close = [name for name in words if name.lower() == word.lower()] or difflib.get_close_matches(word, words, n=1)
+    close = [name for name in words if name.lower() == word.lower()]
+    # The same quantity in another unit.
+    close += [name for name in words if "_" in word and name.rpartition("_")[0] == word.rpartition("_")[0]]
+    close += difflib.get_close_matches(word, words, n=1)
     return f" (did you mean '{close[0]}'?)" if close else ""
 
 

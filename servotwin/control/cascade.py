@@ -101,8 +101,8 @@ class Cascade:
     integral_only: Annotated[
         bool,
         key(
-            help="Inside the dead zone only the integral stops; otherwise the command is zero there too, and the loop "
-            "opens."
+            help="Inside the dead zone only the integral stops; otherwise the position loop opens there: the speed "
+            "command is zero, and the velocity loop with its integral brakes the motor."
         ),
     ] = True
     voltage_limit: VoltageLimit = None
@@ -160,8 +160,10 @@ class Cascade:
         step = None if self.sample_rate is None else 1.0 / self.sample_rate
         blocks = _Blocks(step)
         command = self._command(blocks)
+        braking = _Blocks(step)
+        braked = self.replace(position_gain=0.0)._command(braking)
         names = tuple(name for name in _STATES if name in blocks.following)
-        rows = [blocks.following[name] for name in names]
+        rows, inside = ([each.following[name] for name in names] for each in (blocks, braking))
         # A tracking time below one tick would correct too much.
         tracking = max(self.tracking_time or self.integral_time or 1.0, step or 0.0)
         back = (step or 1.0) / tracking
@@ -170,6 +172,8 @@ class Cascade:
             B=tuple(tuple(row.get(each, 0.0) for each in INPUTS) for row in rows),
             C=tuple(command.get(each, 0.0) for each in names),
             D=tuple(command.get(each, 0.0) for each in INPUTS),
+            B_inside=tuple(tuple(row.get(each, 0.0) for each in INPUTS) for row in inside),
+            D_inside=tuple(braked.get(each, 0.0) for each in INPUTS),
             sample_rate=self.sample_rate,
             discrete=step is not None,
             names=names,

@@ -50,6 +50,9 @@ class LinearLaw:
     integral_only : bool
         True: inside, nothing else stops; otherwise the law has neither inputs nor a command there, and what is not
         stopped decays by itself.
+    B_inside, D_inside : (n, 3), (3,)
+        Instead of nothing: B and D inside, without `integral_only`; every state goes on. A cascade's are those of its
+        velocity loop, which brakes the motor there.
     voltage_limit, rate_limit : float, optional
         Largest command (in its unit), and its largest change (unit per s; sampled laws only).
     windup : tuple of float
@@ -89,6 +92,8 @@ class LinearLaw:
     release_time: float = 0.5
     gain: float = 1.0
     integral_share: float = 1.0
+    B_inside: Rows = ()
+    D_inside: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.C)
@@ -96,6 +101,9 @@ class LinearLaw:
         shapes = ("A", (n, n)), ("B", (n, len(INPUTS))), ("C", (n,)), ("D", (len(INPUTS),))
         for name, shape in shapes:
             object.__setattr__(self, name, _numbers(name, getattr(self, name), shape))
+        if len(self.D_inside) or len(self.B_inside):
+            for name, shape in (("B_inside", (n, len(INPUTS))), ("D_inside", (len(INPUTS),))):
+                object.__setattr__(self, name, _numbers(name, getattr(self, name), shape))
         windup = self.windup if len(self.windup) else (0.0,) * n
         object.__setattr__(self, "windup", _numbers("windup", windup, (n,)))
         object.__setattr__(self, "names", tuple(self.names) or tuple(f"x{i + 1}" for i in range(n)))
@@ -208,7 +216,8 @@ class LinearLaw:
     def reads(self, name: str) -> bool:
         """True where the law depends on one of its `INPUTS`."""
         column = INPUTS.index(name)
-        return any(row[column] != 0.0 for row in (*self.B, self.D)) or name == f"y_{self.on}"
+        inside = (*self.B_inside, self.D_inside) if self.D_inside else ()
+        return any(row[column] != 0.0 for row in (*self.B, self.D, *inside)) or name == f"y_{self.on}"
 
     @property
     def static_gain(self) -> float:
@@ -234,6 +243,8 @@ class LinearLaw:
             B=tuple(tuple(taken[i] * value for value in self.B[i]) for i in rows),
             C=tuple(self.gain * self.C[i] / unit[i] for i in rows),
             D=tuple(self.gain * value for value in self.D),
+            B_inside=tuple(tuple(taken[i] * value for value in self.B_inside[i]) for i in rows if self.D_inside),
+            D_inside=tuple(self.gain * value for value in self.D_inside),
             windup=tuple(self.windup[i] * unit[i] / self.gain for i in rows),
             names=tuple(self.names[i] for i in rows),
             holds=self.holds if self.integral_share else (),
@@ -243,6 +254,8 @@ class LinearLaw:
 
     def inside(self) -> LinearLaw:
         """The law that runs inside the dead zone."""
+        if self.D_inside and not self.integral_only:
+            return replace(self, B=self.B_inside, D=self.D_inside)
         n, still = self.n, (0.0,) * len(INPUTS)
         own = [tuple(float(self.discrete and i == j) for j in range(n)) for i in range(n)]
         held = [name in self.holds for name in self.names]

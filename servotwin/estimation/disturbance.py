@@ -150,11 +150,13 @@ def _rests(
     begins: dict[int, int] = {}
     for first, last in stretches:
         begins[last] = min(first, begins.get(last, first))
+    per_sample, creep = servo.command_per_speed * window.sample_rate, _CREEP * scales(servo).voltage
+    steep = per_sample / creep, per_sample / creep / servo.p
     batches: dict[int, _Batches] = {}
     for first, last in stretches:
         if last not in batches:
             batches[last] = _batches(window, size, begins[last], last)
-        rest = _rest(window, servo, size, (last - first) // size, batches[last])
+        rest = _rest(per_sample, steep, size, (last - first) // size, batches[last])
         if rest is not None:
             yield *rest, first, last
 
@@ -177,11 +179,19 @@ def _batches(window: Window, size: int, first: int, last: int) -> _Batches:
     return _Batches(_means(angle, size), position, voltage, ends)
 
 
-def _rest(window: Window, servo: Plant, size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
-    """(bias, std) of the last `count` batches; None where something moves in them."""
-    per_sample, creep = servo.command_per_speed * window.sample_rate, _CREEP * scales(servo).voltage
-    angle, position = batches.angle[-count:], batches.position[-count:]
-    if not (_still(angle, size, per_sample / creep) and _still(position, size, per_sample / creep / servo.p)):
+def _rest(
+    per_sample: float, steep: tuple[float, float], size: int, count: int, batches: _Batches
+) -> tuple[float, float] | None:
+    """(bias, std) of the last `count` batches; None where something moves in them.
+
+    Parameters
+    ----------
+    per_sample : float
+        V of one radian per sample.
+    steep : (float, float)
+        For motor and load, as of `_still`.
+    """
+    if not (_still(batches.angle[-count:], size, steep[0]) and _still(batches.position[-count:], size, steep[1])):
         return None
     speed = per_sample * np.diff(batches.ends[-count - 1 :]) / size
     drive = batches.voltage[-count:] - speed

@@ -104,12 +104,18 @@ def linear_law(
     integral_share: Annotated[
         float, key(minimum=0.0, unit="1", help="Factor on what the states in `holds` take in.")
     ] = 1.0,
+    B_inside: Annotated[
+        Rows,
+        key(form=Form.OTHER, parse=_rows, help="B inside the dead zone without integral_only; nothing where absent."),
+    ] = (),
+    D_inside: Annotated[tuple[float, ...], key(help="D inside the dead zone without integral_only, likewise.")] = (),
 ) -> LinearLaw:
     """Any linear law of reference, y_motor and y_load."""
     rest: dict[str, Any] = {
         "names": names, "enter": enter, "leave": leave, "holds": holds, "integral_only": integral_only,
         "voltage_limit": voltage_limit, "rate_limit": rate_limit, "windup": windup, "feedforward": feedforward,
         "release_time": release_time, "gain": gain, "integral_share": integral_share,
+        "B_inside": B_inside, "D_inside": D_inside,
     }  # fmt: skip
     travel = 1.0 if ratio is None else ratio
     if system is None:

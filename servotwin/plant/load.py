@@ -90,7 +90,11 @@ class Load:
 
     def described(self, name: str) -> str:
         """Name of m, k or c with its key in a file."""
-        return f"{name} ({_KEYS[self.motion][name]})"
+        return f"{name} ({self.key(name)})"
+
+    def key(self, name: str) -> str:
+        """Key of m, k, c or friction in a file."""
+        return _FRICTION_KEYS[self.motion][0] if name == "friction" else _KEYS[self.motion][name]
 
     @staticmethod
     def _positive(name: str, place: int) -> bool:

@@ -16,6 +16,7 @@ from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
 from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.rest_in_gap import check_rests
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy
 from servotwin.redesign.policy import PaperPolicy, Policy
@@ -69,6 +70,7 @@ def policy_of(servo: Plant, options: PolicyOptions) -> Policy:
 def certified_policy(servo: Plant, options: PolicyOptions) -> CertifiedPolicy:
     """Make the certified policy; its largest feedforward cancels the largest stated input bias."""
     check_verifiable(servo)
+    check_rests(servo, options.uncertainty, options.demands)
     low, high = options.uncertainty.input_bias
     limit = max(abs(low), abs(high))
     return CertifiedPolicy(

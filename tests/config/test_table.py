@@ -166,4 +166,5 @@ def test_missing_file_and_folder(tmp_path: Path) -> None:
 def test_did_you_mean() -> None:
     assert did_you_mean("mass", ["mass_kg", "pitch"]) == " (did you mean 'mass_kg'?)"
     assert did_you_mean("zzz", ["mass_kg"]) == ""
+    assert did_you_mean("gap_mm", ["gap_deg", "step_mm"]) == " (did you mean 'gap_deg'?)"
     assert did_you_mean("kp", ["p", "Kp"]) == " (did you mean 'Kp'?)"

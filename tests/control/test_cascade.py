@@ -49,9 +49,8 @@ def test_a_ramp_is_fed_forward_as_its_speed() -> None:
     assert state.command == pytest.approx(0.02 / 0.1, rel=1e-9)
 
 
-@pytest.mark.parametrize("integral_only", [True, False])
-def test_the_dead_zone_stops_the_velocity_integral(integral_only: bool) -> None:
-    law = DRIVE.replace(sample_rate=2e3, integral_only=integral_only).linear()
+def test_the_dead_zone_stops_the_velocity_integral() -> None:
+    law = DRIVE.replace(sample_rate=2e3).linear()
     parameters, state = law.parameters(1e-3), law.start(0.0, 0.0)
     for _ in range(50):
         state = linear_tick(parameters, state, 2e-3, 0.0, 0.0)
@@ -61,8 +60,25 @@ def test_the_dead_zone_stops_the_velocity_integral(integral_only: bool) -> None:
         state = linear_tick(parameters, state, 0.5e-3, 0.0, 0.0)
     assert state.states[place] == stopped != 0.0
     # The notch passes what is constant; the low-pass too.
-    expected = 3.0 * 12.0 * 0.5e-3 / 0.1 + stopped if integral_only else 0.0
-    assert state.command == pytest.approx(expected, rel=1e-9)
+    assert state.command == pytest.approx(3.0 * 12.0 * 0.5e-3 / 0.1 + stopped, rel=1e-9)
+
+
+@pytest.mark.parametrize("on", ["load", "motor"])
+@pytest.mark.parametrize("rate", [None, 2e3])
+def test_an_open_dead_zone_leaves_the_velocity_loop(on: str, rate: float | None) -> None:
+    """Inside, all that is left is the velocity PI on a speed command of what the reference feeds forward."""
+    cascade = DRIVE.replace(on=on, sample_rate=rate, integral_only=False)
+    inside, still = cascade.linear().inside(), cascade.replace(position_gain=0.0).linear()
+    assert (inside.A, inside.B, inside.C, inside.D) == (still.A, still.B, still.C, still.D)
+    assert inside.windup == cascade.linear().windup
+
+
+def test_an_open_dead_zone_brakes_the_motor() -> None:
+    law = Cascade(12.0, 0.1, velocity_gain=3.0, speed_filter=2e-3, sample_rate=2e3, integral_only=False).linear()
+    parameters, state = law.parameters(1e-3), law.start(0.0, 0.0)
+    for k in range(400):
+        state = linear_tick(parameters, state, 0.5e-3, 0.7 * k / 2e3, 0.0)
+    assert state.command == pytest.approx(-3.0 * 0.7, rel=1e-9)
 
 
 def test_the_integral_winds_back_at_the_limit() -> None:

@@ -76,6 +76,12 @@ ZONED = {
     "plain": (CONTINUOUS, None),
     "dead zone": (CONTINUOUS.replace(enter=0.6, leave=1.4), 0.02),
     "dead zone that opens the loop, on the motor": (CONTINUOUS.replace(on="motor", integral_only=False), 0.05),
+    "dead zone that leaves the speed": (
+        CONTINUOUS.replace(
+            integral_only=False, B_inside=[[0.0, 0.0, 0.0], [0.0, 200.0, 0.0]], D_inside=[0.0, -40.0 * 200.0, 0.0]
+        ),
+        0.05,
+    ),
     "limit": (CONTINUOUS.replace(voltage_limit=8.0), None),
     "both": (CONTINUOUS.replace(voltage_limit=8.0, enter=0.6, leave=1.4), 0.02),
 }

@@ -105,9 +105,15 @@ class ContinuousOracle(AxisOracle):
         """Command before the limit."""
         assert self.law is not None
         _, states, y = self.split(x)
-        if not self.law.integral_only and not self.active:
-            return 0.0
+        if self.opened:
+            return float(np.dot(self.law.C, states) + np.dot(self.law.D_inside, y)) if self.law.D_inside else 0.0
         return float(np.dot(self.law.C, states) + np.dot(self.law.D, y))
+
+    @property
+    def opened(self) -> bool:
+        """True inside a dead zone that does not stop the integral only."""
+        assert self.law is not None
+        return not self.law.integral_only and not self.active
 
     def error(self, x: Array) -> float:
         """Error that the dead zone looks at."""
@@ -125,10 +131,10 @@ class ContinuousOracle(AxisOracle):
         assert self.law is not None
         _, states, y = self.split(x)
         n = self.law.n
-        A, B = np.array(self.law.A).reshape(n, n), np.array(self.law.B).reshape(n, 3)
-        driven = A @ states + (0.0 if not self.law.integral_only and not self.active else B @ y)
+        B = self.law.B if not self.opened else self.law.B_inside or np.zeros((n, 3))
+        driven = np.array(self.law.A).reshape(n, n) @ states + np.array(B).reshape(n, 3) @ y
         driven = driven + np.array(self.law.windup) * (self.command(x)[0] - self.wanted(x))
-        if not self.active:
+        if not self.active and not (self.opened and self.law.D_inside):
             driven[[name in self.law.holds for name in self.law.names]] = 0.0
         return np.concatenate([self._axis_rates(t, x), driven])
 

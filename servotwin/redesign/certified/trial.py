@@ -21,12 +21,15 @@ from servotwin.redesign.certified.margins import (
     widened,
     with_margins,
 )
+from servotwin.redesign.certified.rest_in_gap import coasting_time
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
 # In units of 1 / crossover: a loop that approaches through a gap creeps, and hunting shows in the end.
 _LENGTH = 150.0
 # Decay times of the slowest mode: what is left of it is e^-12.
 _DECAYS = 12.0
+# Time constants with which a load that floats in its gap coasts to rest: e^-8 is a sixtieth of what counts as rest.
+_COASTS = 8.0
 _JUDGED = 1.0 / 6.0
 # Samples a second, in units of the crossover and of the frequency of the sensitivity peak (both rad/s).
 _SAMPLING, _RESONANCE = 12.0, 2.0
@@ -84,7 +87,7 @@ def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Tria
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
     loop = nominal_margins(servo, law_for_margins(_reference(servo.controller, laws)))
     crossover = _speed(loop, servo, slowest)
-    duration = max(_LENGTH / crossover, _DECAYS / slowest)
+    duration = max(_LENGTH / crossover, _DECAYS / slowest, _COASTS * coasting_time(servo, uncertainty))
     resonance = loop.Ms_omega if loop.Ms_omega < math.inf else 0.0
     rate = min(max(_SAMPLING * crossover, _RESONANCE * resonance), _MOST_SAMPLES / duration)
     sampled = servo.controller.sample_rate

@@ -1,0 +1,70 @@
+"""Loads that float in their gap: what brings them to rest, how long their simulations last, what is refused."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from servotwin.control.cascade import Cascade
+from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Axis
+from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.rest_in_gap import coasting_time
+from servotwin.redesign.certified.trial import trial_for
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.registry import policy_of
+from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled
+from servotwin.twin.settings import TwinSettings
+
+DRIVE = Axis.preset("two-mass-drive")
+CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, voltage_limit=60.0, sample_rate=2e3, integral_only=False)
+GAPS = np.array([4e-3, 1e-2, 2e-2])
+RANGES = Uncertainty(gap=(0.0, 0.03), step=(0.06, 0.4))
+
+
+def swings(axis: Axis, tolerance: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+    """Half peak-to-peak of load and motor in the last part of a long run after a step, over the gap."""
+    cases = SampledCases(reference=0.2, gap=GAPS, tolerance=tolerance, resolution=axis.position_resolution)
+    found = simulate_sampled(axis, axis.controller, 90.0, cases, ("error", "theta_m"), 100.0, 1)
+    load, motor = (0.5 * np.ptp(found[name][:, -1500:], axis=1) / GAPS for name in ("error", "theta_m"))
+    return load, motor
+
+
+def test_only_a_braked_motor_lets_a_floating_load_come_to_rest() -> None:
+    """The filtered PID knocks from flank to flank; so does a cascade that pushes after every error."""
+    pushing = DRIVE.replace(controller=CASCADE)
+    load, motor = swings(DRIVE.replace(Ki=0.0), 0.0)
+    assert (motor > 0.5).all()
+    assert (load < 0.1).all()
+    assert (swings(pushing, 0.0)[0] > 0.1).all()
+    load, motor = swings(pushing, GAPS)
+    assert (load < 0.01).all()
+    assert (motor < 0.02).all()
+
+
+def test_a_trial_lasts_until_a_floating_load_has_coasted() -> None:
+    joint = Axis.preset("robot-joint")
+    longest = 1.1 * 60.0 / (0.5 * 20.0)
+    assert coasting_time(joint, Uncertainty()) == pytest.approx(longest)
+    assert trial_for(joint, Uncertainty(gap=(0.0, 1.0)), Demands()).duration >= 8.0 * longest
+    for name in ("ball-screw", "telescope", "gantry"):  # friction stops their loads
+        assert coasting_time(Axis.preset(name), Uncertainty()) == 0.0
+
+
+def test_a_law_that_reads_a_floating_load_alone_is_refused_at_once() -> None:
+    with pytest.raises(InvalidInput, match=r'kind = "filtered_pid".*give kind = "cascade".*friction_n_m of the load'):
+        policy_of(DRIVE, TwinSettings(uncertainty=RANGES))
+    policy_of(DRIVE, TwinSettings(policy="paper"))
+    policy_of(DRIVE.replace(controller=CASCADE), TwinSettings(uncertainty=RANGES))
+    policy_of(DRIVE, TwinSettings(uncertainty=RANGES.replace(gap=(0.0, 0.0))))
+    policy_of(DRIVE, TwinSettings(uncertainty=RANGES.replace(friction=(0.5, 1.0))))
+    policy_of(replace(DRIVE, load=replace(DRIVE.load, friction=1.5)), TwinSettings(uncertainty=RANGES))
+
+
+def test_a_load_that_nothing_stops_is_refused_under_any_law() -> None:
+    bare = replace(DRIVE, load=replace(DRIVE.load, c=(0.0,)), controller=CASCADE)
+    assert math.isfinite(coasting_time(bare, RANGES))
+    with pytest.raises(InvalidInput, match=r"load.damping_n_m_s_per_rad = 0.*give damping_n_m_s_per_rad or friction"):
+        policy_of(bare, TwinSettings(uncertainty=RANGES))
+    policy_of(replace(bare, load=replace(bare.load, friction=1.5)), TwinSettings(uncertainty=RANGES))
