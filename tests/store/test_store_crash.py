@@ -43,7 +43,7 @@ def process(role: str, url: str) -> Iterator[Started]:
     started = SERVER.Process(target=store_process.main, args=(role, url, writing))
     started.start()
     writing.close()
-    with reading, open(os.dup(reading.fileno()), encoding="utf-8") as output:
+    with reading, os.fdopen(os.dup(reading.fileno()), encoding="utf-8") as output:
         try:
             yield Started(started, output)
         finally:

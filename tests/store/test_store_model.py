@@ -23,7 +23,6 @@ QUEUES = {
 }
 
 
-
 @cache
 def empty_store() -> bytes:
     """Content of a new store's file: every example would run all migrations again."""

@@ -22,7 +22,6 @@ BODY = bytes(range(256)) * 8
 SERVOS = ("s0", "s1", "s2", "s3")
 
 
-
 class Output:
     """Lines that another process reads."""
 
