@@ -22,7 +22,7 @@ DRIVE = st.Axis(
 )
 
 
-FEW = Demands(machines=20, screened=2, conditions=2, beyond=Beyond(machines=4), settled=0.8)
+FEW = Demands(machines=40, screened=4, conditions=4, beyond=Beyond(machines=8), settled=0.9)
 """A verification that takes a second."""
 
 
@@ -45,7 +45,7 @@ def test_the_paper_s_twin_runs_on_a_torque_drive() -> None:
 @pytest.mark.slow
 def test_verified_settings_reach_a_torque_drive() -> None:
     """Gap, bias and gains as on the servo, the bias in N m."""
-    scenario = st.Scenario.preset("certified").with_servo(DRIVE).replace(duration=60.0)
+    scenario = st.Scenario.preset("certified").with_servo(DRIVE).replace(duration=80.0)
     twin = scenario.twin
     bias = tuple(TORQUE * end for end in twin.uncertainty.input_bias)
     scenario = scenario.replace(
