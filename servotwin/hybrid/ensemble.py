@@ -173,7 +173,7 @@ def _family(stack: AutomatonStack, rows: Array, sample_step: float) -> Automaton
         stack.flows.reshape(len(strides), -1),
         stack.rows.reshape(len(strides), -1),
         stack.resets.reshape(len(stack.resets), -1),
-        np.array(rows, dtype=float).reshape(*rows.shape[:2], -1),
+        np.array(rows, dtype=float, order="C").reshape(*rows.shape[:2], -1),  # another order is compiled anew
         sample_step / strides,
         strides,
     )

@@ -237,7 +237,8 @@ class LiftedEngine:
             tolerance = float(self.inputs.tolerance.coeffs[_piece(self.inputs.tolerance, time, self.rate), 0])
             if tolerance != self.tolerance:
                 self.tolerance, self.loop = tolerance, self.loop._replace(parameters=self.controller.law(tolerance))
-        coefficients = self.inputs.reference.coeffs[piece]
+        # A copy: a read-only array is a type of its own to numba, for which all would be compiled once more.
+        coefficients = self.inputs.reference.coeffs[piece].copy()
         if (friction := self.controller.friction_feedforward) != 0.0:
             # The reference is constant in every piece.
             self.direction = latest_direction(float(coefficients[0]) - self.past, self.direction)

@@ -165,7 +165,7 @@ def test_the_first_send_may_be_planned_for_a_later_sample() -> None:
 @pytest.mark.slow
 def test_the_number_of_tries_is_geometric() -> None:
     """Each try succeeds with probability (1 - loss)^2: mean 1 / p, variance (1 - p) / p^2."""
-    loss, letters = 0.3, 2000
+    loss, letters = 0.3, 500
     exchange = Exchange(LinkSettings(delay_s=0.1, loss=loss), Retry(1.0, 1.0, 1.0))
     for k in range(letters):
         exchange.post(b"%d" % k)

@@ -1,13 +1,12 @@
 """Processes on one store, killed with SIGKILL at any time: acknowledged writes are stored, and stored once."""
 
+import multiprocessing
 import os
-import signal
-import subprocess
-import sys
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from multiprocessing.process import BaseProcess
+from typing import NamedTuple, TextIO
 
 import pytest
 import sqlalchemy as sa
@@ -21,41 +20,53 @@ from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
 
-PROGRAM = Path(store_process.__file__)
+# Its processes begin with the store imported, which takes longer than what they do.
+SERVER = multiprocessing.get_context("forkserver")
+IMPORTED = ["servotwin.store.store", "servotwin.store.group_commit", "psycopg", "pytest"]
+IMPORTED += ["sqlalchemy.dialects.postgresql.psycopg", "sqlalchemy.dialects.sqlite.pysqlite"]
 FAR = 4e9
 """s since the epoch: every lease is over."""
 
 
+class Started(NamedTuple):
+    """A process on a store, and its output."""
+
+    process: BaseProcess
+    output: TextIO
+
+
 @contextmanager
-def process(role: str, url: str) -> Iterator[subprocess.Popen[str]]:
+def process(role: str, url: str) -> Iterator[Started]:
     """One that is killed when the block ends."""
-    command = [sys.executable, str(PROGRAM), role, url]
-    paths = os.pathsep.join((str(PROGRAM.parent), str(PROGRAM.parents[2])))
-    started = subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, start_new_session=True, env={**os.environ, "PYTHONPATH": paths}
-    )
-    with started:
+    SERVER.set_forkserver_preload(IMPORTED)
+    reading, writing = SERVER.Pipe(duplex=False)
+    started = SERVER.Process(target=store_process.main, args=(role, url, writing))
+    started.start()
+    writing.close()
+    with reading, os.fdopen(os.dup(reading.fileno()), encoding="utf-8") as output:
         try:
-            yield started
+            yield Started(started, output)
         finally:
-            kill(started)
+            kill(Started(started, output))
+            started.join()
+            started.close()
 
 
-def kill(started: subprocess.Popen[str]) -> None:
-    if started.poll() is None:
-        os.killpg(started.pid, signal.SIGKILL)
+def kill(started: Started) -> None:
+    """Send SIGKILL."""
+    started.process.kill()
 
 
-def lines(started: subprocess.Popen[str], number: int) -> list[list[str]]:
+def lines(started: Started, number: int) -> list[list[str]]:
     """So many lines of its output."""
-    result = [line.split() for _, line in zip(range(number), started.stdout, strict=False)]
+    result = [line.split() for _, line in zip(range(number), started.output, strict=False)]
     assert len(result) == number, "the process ended by itself"
     return result
 
 
-def rest(started: subprocess.Popen[str]) -> list[list[str]]:
+def rest(started: Started) -> list[list[str]]:
     """Remaining lines of a killed process, without a last one that was cut off."""
-    return [line.split() for line in started.stdout if line.endswith("\n")]
+    return [line.split() for line in started.output if line.endswith("\n")]
 
 
 def finish(store: Store) -> None:

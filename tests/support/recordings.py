@@ -36,3 +36,17 @@ def short_strokes(gap, amplitude, seed, count=1e-4, noise=3e-4, ratio=1.6):
     motor = points[place] + np.diff(points)[place] * (3.0 - 2.0 * share) * share**2
     load = ratio * play(motor, gap) + noise * random.standard_normal(time.size)
     return EncoderRecording(time, np.round(motor / count) * count, load, load_unit="mm")
+
+
+def rows(made):
+    """Time, motor and load of a recording, a row for each sample."""
+    return np.column_stack([made.time, made.motor, made.load])
+
+
+def csv(path, values, header="time_s,motor_rad,load_rad", separator=",", comma=False, comments=()):
+    """Write rows to a table of text; its path."""
+    lines = [*comments, header.replace(",", separator)]
+    lines += [separator.join(f"{value:.9g}" for value in row) for row in values]
+    text = "\n".join(lines) + "\n"
+    path.write_text(text.replace(".", ",") if comma else text)
+    return path

@@ -1,4 +1,4 @@
-"""A process that writes to a store until it is killed, and says what is safe: `python store_process.py ROLE URL`.
+"""A process that writes to a store until it is killed, and says what is safe.
 
 put     windows of servos s0 to s3 from sequence 0 on, through a group commit, from four threads: "NEW s0 17"
 work    claims, and commits an outcome with one piece of evidence and one letter for each message: "DONE 3"
@@ -7,9 +7,9 @@ hold    claims, says what it has ("HELD 5 s0"), and never comes back
 
 import itertools
 import os
-import sys
 import threading
 import time
+from multiprocessing.connection import Connection
 
 from store_cases import outcome, window
 
@@ -21,17 +21,21 @@ LEASE_S = 2.0
 BODY = bytes(range(256)) * 8
 SERVOS = ("s0", "s1", "s2", "s3")
 
-_telling = threading.Lock()
+
+class Output:
+    """Lines that another process reads."""
+
+    def __init__(self, pipe: Connection) -> None:
+        self._pipe, self._telling = pipe, threading.Lock()
+
+    def tell(self, *words: object) -> None:
+        with self._telling:
+            os.write(self._pipe.fileno(), (" ".join(map(str, words)) + "\n").encode())
 
 
-def tell(*words: object) -> None:
-    with _telling:
-        os.write(1, (" ".join(map(str, words)) + "\n").encode())
-
-
-def put_all(group: GroupCommit, servo: str) -> None:
+def put_all(group: GroupCommit, servo: str, output: Output) -> None:
     for sequence in itertools.count():
-        tell(group.put(window(servo, sequence, BODY)).result().name, servo, sequence)
+        output.tell(group.put(window(servo, sequence, BODY)).result().name, servo, sequence)
 
 
 def worked(claim: Lease) -> WorkResult:
@@ -40,32 +44,29 @@ def worked(claim: Lease) -> WorkResult:
     return outcome(claim, *evidence, outgoing=letters)
 
 
-def work(store: Store, group: GroupCommit, owner: str) -> None:
+def work(store: Store, group: GroupCommit, owner: str, output: Output) -> None:
     while True:
         claims = store.lease(owner, 2, LEASE_S, time.time(), per_servo=5)
         futures = [group.commit(worked(claim)) for claim in claims]
-        tell("DONE", sum(future.result() for future in futures))
+        output.tell("DONE", sum(future.result() for future in futures))
         if not claims:
             time.sleep(0.01)
 
 
-def hold(store: Store, owner: str) -> None:
+def hold(store: Store, owner: str, output: Output) -> None:
     for claim in store.lease(owner, 2, LEASE_S, time.time(), per_servo=5):
-        tell("HELD", claim.servo, len(claim.messages))
+        output.tell("HELD", claim.servo, len(claim.messages))
     threading.Event().wait()
 
 
-def main(role: str, url: str) -> None:
-    store = open_store(url)
+def main(role: str, url: str, pipe: Connection) -> None:
+    """Run in a role until the process is killed."""
+    store, output = open_store(url), Output(pipe)
     group, owner = GroupCommit(store), f"process {os.getpid()}"
     if role == "put":
         for servo in SERVOS:
-            threading.Thread(target=put_all, args=(group, servo)).start()
+            threading.Thread(target=put_all, args=(group, servo, output)).start()
     elif role == "work":
-        work(store, group, owner)
+        work(store, group, owner, output)
     else:
-        hold(store, owner)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
+        hold(store, owner, output)

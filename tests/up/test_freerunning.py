@@ -20,7 +20,7 @@ from servotwin.drives.simulated.machine_state import write_speed
 from servotwin.plant.signals import as_pieces
 from servotwin.up.enrolment import Enrolment, enroll
 
-RATE, DURATION, PERIOD, SPEED = 2000.0, 40.0, 4.0, 5.0
+RATE, DURATION, PERIOD, SPEED = 1000.0, 40.0, 4.0, 5.0
 FROM_DEG, TO_DEG = 4.0, 12.0
 TWIN_TABLE = """
 policy = "paper"

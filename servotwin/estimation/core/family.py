@@ -96,7 +96,8 @@ class Sampled:
         """
         start = np.zeros(self.C.shape[1]) if initial is None else initial
         out = np.empty((len(self.D), signal.size))
-        _respond(self.F, self.now, self.after, self.C, self.D, np.ascontiguousarray(signal), start, out)
+        # Read-only or strided signals would be compiled once more.
+        _respond(self.F, self.now, self.after, self.C, self.D, np.require(signal, requirements="CW"), start, out)
         return out
 
     def plain(self, signals: Array) -> Array:

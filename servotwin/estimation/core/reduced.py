@@ -129,6 +129,7 @@ def _run(inputs: Array, weights: BlockWeights) -> Array:
     factor = weights.angles.shape[1]
     blocks = inputs.shape[1] // factor
     out = np.empty((len(inputs), blocks - AVERAGES + 1))
+    inputs = np.ascontiguousarray(inputs)  # as `evaluate` calls it: another order is compiled anew
     run_blocks(inputs, *_arrays(weights), np.empty((factor, blocks)), np.empty((len(weights.angles), blocks)), out)
     return out
 
