@@ -252,16 +252,11 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 
 
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
-<<<<<<< HEAD
-    errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, DUTIES[name]
+    errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, duty_of(name)
     amplitude = duty.gap * math.exp(random.uniform(*np.log(_AMPLITUDES)))
     if duty.lead:
         errors["p"] = 1.0 + duty.lead * random.uniform(-1.0, 1.0)
     return PresetMachine(name, model.scaled(errors), amplitude)
-=======
-    plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
-    return PresetMachine(name, plant, duty_of(name).gap * math.exp(random.uniform(*np.log(_AMPLITUDES))))
->>>>>>> f4b04cd700cfb38ad34b8ceb078202415b196c38
 
 
 def with_twin(machine: PresetMachine) -> Loop:
