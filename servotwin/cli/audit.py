@@ -192,10 +192,11 @@ def _json_client(source: Source) -> Callable[[str], Any]:
     get = _client(source)
 
     def get_json(path: str) -> Any:
+        text = get(path)
         try:
-            return jsons.loads(get(path))
+            return jsons.loads(text)
         except ValueError as error:
-            raise InvalidInput(f"{source.url}: cannot be reached ({error})") from None
+            raise InvalidInput(f"{source.url}: its answer is not JSON ({error}): is that a twin?") from None
 
     return get_json
 

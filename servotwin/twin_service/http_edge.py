@@ -35,6 +35,8 @@ Read = Callable[[str, int], Awaitable[Sequence[OutgoingMessage]]]
 """(servo, serial) -> messages with higher serials, rising."""
 MAX_WAIT_S = 30.0
 """s that an edge may wait."""
+REFUSED_POLL_S = 1.0
+"""s that the refusal of a poll takes."""
 _NEVER = 2**63
 
 
@@ -273,7 +275,7 @@ class EdgeApi:
     async def _get_outgoing(self, request: HttpRequest) -> HttpResponse:
         """Sealed messages with serials above `after`, as soon as there are some; none after `wait` s."""
         servo = request.path["servo"]
-        self._gate.admit_poll(servo, request.token)
+        await self._admit_poll(servo, request.token)
         after, wait = request.integer("after", 0), request.seconds("wait", 0.0)
         if wait > MAX_WAIT_S:
             detail = f"wait = {wait:g} s: at most {MAX_WAIT_S:g} s are allowed"
@@ -282,6 +284,14 @@ class EdgeApi:
         messages = await self._polls.messages(servo, after, wait)
         await self._claims.check(servo, request.claim)  # another edge may have taken over meanwhile
         return msgpack_response(seal_messages(self._gate.verifier(servo), servo, messages))
+
+    async def _admit_poll(self, servo: str, token: bytes | None) -> None:
+        """Check token, name and rate; a refusal takes a second, or whoever polls in a loop would slow all others."""
+        try:
+            self._gate.admit_poll(servo, token)
+        except RequestRejected:
+            await asyncio.sleep(REFUSED_POLL_S)
+            raise
 
     async def _post_claim(self, request: HttpRequest) -> HttpResponse:
         """Answer a question or a claim."""

@@ -3,6 +3,7 @@
 import asyncio
 import re
 import threading
+import time
 import zlib
 from collections.abc import Callable, Coroutine
 from typing import Any
@@ -29,6 +30,7 @@ from servotwin.messages import Acknowledge, Setting, Update, decode, encode
 from servotwin.messages.codec import compress
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import WorkResult
+from servotwin.twin_service import http_edge
 from servotwin.twin_service.auth import read_tokens, write_tokens
 from servotwin.twin_service.limits import RateLimiter
 from servotwin.twin_service.service import TwinService
@@ -335,6 +337,23 @@ def test_invalid_query_arguments_are_refused(serving, query):
         assert code(answer) == (400, "not_understood")
 
     serving(body)
+
+
+def test_whoever_polls_in_a_loop_is_refused_slowly_and_others_are_not(serving, monkeypatch):
+    monkeypatch.setattr(http_edge, "REFUSED_POLL_S", 0.5)
+
+    async def body(_system, client):
+        path = "/v1/servos/ax-1/outgoing"
+        assert (await client.get(path, headers=bearer())).status_code == 200
+        begun = time.monotonic()
+        refused = [asyncio.create_task(client.get(path, headers=bearer(token))) for token in (TOKEN, "guess")]
+        other = await client.get("/v1/servos/ax-2/outgoing", headers=bearer(OTHER))
+        assert other.status_code == 200
+        assert not any(each.done() for each in refused)
+        assert [code(await each) for each in refused] == [(429, "too_many"), (401, "bad_token")]
+        assert time.monotonic() - begun >= 0.5
+
+    serving(body, "rate_limit_per_s = 0.001\nrate_burst = 1")
 
 
 def test_the_number_of_waiting_polls_is_limited(serving):

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from service_system import OPERATOR, OTHER, TOKEN, served, twin_file
 
-from servotwin.twin_service import unauthenticated
+from servotwin.twin_service import http_edge, unauthenticated
 from servotwin.twin_service.http_server import HttpServer, listening_socket
 
 Stream = tuple[asyncio.StreamReader, asyncio.StreamWriter]
@@ -75,6 +75,7 @@ def test_connections_of_an_address_without_a_token_are_bounded_and_edges_are_not
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(unauthenticated, "_GRACE_S", 0.05)
+    monkeypatch.setattr(http_edge, "REFUSED_POLL_S", 0.0)  # shorter than the grace, as it is
 
     async def body(connect: Connect) -> None:
         edges = [await connect(TOKEN) for _ in range(8)]
@@ -95,6 +96,7 @@ def test_a_session_counts_as_authenticated_and_a_forged_one_does_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(unauthenticated, "_GRACE_S", 0.05)
+    monkeypatch.setattr(http_edge, "REFUSED_POLL_S", 0.0)  # shorter than the grace, as it is
 
     async def body(connect: Connect) -> None:
         known, forged = await connect(SESSION), [await connect(f"forged {SESSION}") for _ in range(2)]

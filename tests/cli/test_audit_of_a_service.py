@@ -1,0 +1,58 @@
+"""`servotwin audit --url`: what goes wrong is one sentence that names the cause."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from mosquitto import free_port
+
+from servotwin.cli.audit import Source, audit
+from servotwin.errors import InvalidInput
+
+
+@contextmanager
+def answering(status: int, text: bytes) -> Iterator[str]:
+    """A service with one answer; its URL."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(status)
+            self.end_headers()
+            self.wfile.write(text)
+
+        def log_message(self, *_args: object) -> None:
+            pass
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def said(url: str) -> str:
+    with pytest.raises(InvalidInput) as refused:
+        audit("ax-9", Source(Path("twin.toml"), url, None, None), 20, False, False)
+    return str(refused.value)
+
+
+def test_an_unknown_servo_is_not_called_out_of_reach() -> None:
+    with answering(404, b'{"code": "unknown_servo", "detail": "servo \'ax-9\' has never sent a message"}') as url:
+        assert said(url) == f"{url}: servo 'ax-9' has never sent a message"
+
+
+def test_a_page_is_not_taken_for_a_twin() -> None:
+    with answering(200, b"<html>") as url:
+        assert said(url).startswith(f"{url}: its answer is not JSON (")
+
+
+def test_a_service_that_is_away_is_named_once() -> None:
+    url = f"http://127.0.0.1:{free_port()}"
+    assert said(url).startswith(f"{url}: cannot be reached (")
+    assert said(url).count(url) == 1
