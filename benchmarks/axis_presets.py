@@ -79,14 +79,14 @@ CASCADED = "two-mass-cascade"
 _CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5, voltage_limit=60.0, sample_rate=2000.0)
 
 
-def duty_of(name: str) -> Duty:
-    """What a preset or the drive with a cascade does."""
-    return DUTIES["two-mass-drive" if name == CASCADED else name]
-
-
 def machine_of(name: str) -> Axis:
     """A preset, or the two-mass drive with a cascade in place of its filtered PID."""
-    return Axis.preset("two-mass-drive").replace(controller=_CASCADE) if name == CASCADED else Axis.preset(name)
+    axis = Axis.preset(_preset(name))
+    return axis.replace(controller=_CASCADE) if name == CASCADED else axis
+
+
+def _preset(name: str) -> str:
+    return "two-mass-drive" if name == CASCADED else name
 
 
 _ARC_SECOND = math.radians(1.0 / 3600.0)
@@ -140,7 +140,7 @@ class PresetMachine:
 
     def __post_init__(self) -> None:
         if not self.steps:
-            object.__setattr__(self, "steps", LEVELS * duty_of(self.name).hold)
+            object.__setattr__(self, "steps", LEVELS * DUTIES[_preset(self.name)].hold)
 
     @property
     def model(self) -> Axis:
@@ -150,12 +150,12 @@ class PresetMachine:
     @property
     def duration(self) -> float:
         """Length of the run, s."""
-        return self.steps * duty_of(self.name).half_period
+        return self.steps * DUTIES[_preset(self.name)].half_period
 
     @property
     def gap(self) -> PiecewiseCubic:
         """Total gap, rad at the motor, level after level."""
-        duty, healthy = duty_of(self.name), duty_of(self.name).gap / self.model.p
+        duty, healthy = DUTIES[_preset(self.name)], DUTIES[_preset(self.name)].gap / self.model.p
         count = -(-self.steps // duty.hold)
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
@@ -170,7 +170,7 @@ class PresetMachine:
     @property
     def reference(self) -> SquareWave:
         """To and fro."""
-        return SquareWave(self.amplitude, 2.0 * duty_of(self.name).half_period)
+        return SquareWave(self.amplitude, 2.0 * DUTIES[_preset(self.name)].half_period)
 
     @property
     def count(self) -> float:
@@ -193,7 +193,7 @@ class PresetMachine:
         InvalidInput
             A twin cannot be had.
         """
-        model, duty = self.model, duty_of(self.name)
+        model, duty = self.model, DUTIES[_preset(self.name)]
         most = _AMPLITUDES[1] * duty.gap
         ranges = Uncertainty(gap=(0.0, 1.5 * WORN * duty.gap / model.p), step=(_AMPLITUDES[0] * duty.gap, 2.0 * most))
         rate, probe = self.rate, duty.probe
@@ -230,20 +230,15 @@ def _whole(seconds: float, rate: float) -> float:
     return round(seconds * rate) / rate
 
 
-def _seed(name: str) -> int:
-    """Place of a preset among them; the drive with a cascade has the machines of the one without."""
-    return AXES.index("two-mass-drive" if name == CASCADED else name)
-
-
 def preset_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset whose gap grows."""
-    random, model = np.random.default_rng([seed, _seed(name)]), machine_of(name)
+    random, model = np.random.default_rng([seed, AXES.index(_preset(name))]), machine_of(name)
     return [_drawn(name, model, random) for _ in range(count)]
 
 
 def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset with any gap up to the largest, to which the twin sends verified settings."""
-    random = np.random.default_rng([seed, _seed(name), 1])
+    random = np.random.default_rng([seed, AXES.index(_preset(name)), 1])
     worn = [float(random.uniform(0.0, WORN)) for _ in range(count)]
     return [
         replace(machine, worn=(gap, gap), steps=CERTIFIED_STEPS, certified=True)
@@ -252,7 +247,7 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 
 
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
-    errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, duty_of(name)
+    errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, DUTIES[_preset(name)]
     amplitude = duty.gap * math.exp(random.uniform(*np.log(_AMPLITUDES)))
     if duty.lead:
         errors["p"] = 1.0 + duty.lead * random.uniform(-1.0, 1.0)
@@ -329,7 +324,7 @@ def steps_of(machine: PresetMachine, run: Run) -> dict[str, list[float]]:
     still = _STILL * sizes + _COUNTS * machine.model.position_resolution
     return {
         "settled": (0.5 * np.ptp(last, axis=1) <= still).astype(float).tolist(),
-        "cost": (np.abs(error).mean(axis=1) * duty_of(machine.name).half_period / sizes).tolist(),
+        "cost": (np.abs(error).mean(axis=1) * DUTIES[_preset(machine.name)].half_period / sizes).tolist(),
         "tail": (np.abs(last).max(axis=1) / sizes).tolist(),
     }
 

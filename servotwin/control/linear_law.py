@@ -48,11 +48,8 @@ class LinearLaw:
     holds : tuple of str
         States that the dead zone stops: inside they keep their values. The others go on.
     integral_only : bool
-        True: inside, nothing else stops; otherwise the law has neither inputs nor a command there, and what is not
-        stopped decays by itself.
-    B_inside, D_inside : (n, 3), (3,)
-        Instead of nothing: B and D inside, without `integral_only`; every state goes on. A cascade's are those of its
-        velocity loop, which brakes the motor there.
+        True: inside, nothing else stops; otherwise the law has neither inputs nor a command there, what is not stopped
+        decays, or B_inside, (n, 3), and D_inside, (3,), act in place of B and D (of a cascade its velocity loop).
     voltage_limit, rate_limit : float, optional
         Largest command (in its unit), and its largest change (unit per s; sampled laws only).
     windup : tuple of float
@@ -97,13 +94,11 @@ class LinearLaw:
 
     def __post_init__(self) -> None:
         n = len(self.C)
-        shapes: tuple[tuple[str, tuple[int, ...]], ...]
-        shapes = ("A", (n, n)), ("B", (n, len(INPUTS))), ("C", (n,)), ("D", (len(INPUTS),))
-        for name, shape in shapes:
-            object.__setattr__(self, name, _numbers(name, getattr(self, name), shape))
+        shapes: dict[str, tuple[int, ...]] = {"A": (n, n), "B": (n, len(INPUTS)), "C": (n,), "D": (len(INPUTS),)}
         if len(self.D_inside) or len(self.B_inside):
-            for name, shape in (("B_inside", (n, len(INPUTS))), ("D_inside", (len(INPUTS),))):
-                object.__setattr__(self, name, _numbers(name, getattr(self, name), shape))
+            shapes |= {"B_inside": shapes["B"], "D_inside": shapes["D"]}
+        for name, shape in shapes.items():
+            object.__setattr__(self, name, _numbers(name, getattr(self, name), shape))
         windup = self.windup if len(self.windup) else (0.0,) * n
         object.__setattr__(self, "windup", _numbers("windup", windup, (n,)))
         object.__setattr__(self, "names", tuple(self.names) or tuple(f"x{i + 1}" for i in range(n)))
@@ -216,8 +211,8 @@ class LinearLaw:
     def reads(self, name: str) -> bool:
         """True where the law depends on one of its `INPUTS`."""
         column = INPUTS.index(name)
-        inside = (*self.B_inside, self.D_inside) if self.D_inside else ()
-        return any(row[column] != 0.0 for row in (*self.B, self.D, *inside)) or name == f"y_{self.on}"
+        rows = (*self.B, self.D, *self.B_inside, self.D_inside or self.D)
+        return any(row[column] != 0.0 for row in rows) or name == f"y_{self.on}"
 
     @property
     def static_gain(self) -> float:
