@@ -247,7 +247,10 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 
 
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
-    errors, duty = {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()}, DUTIES[_preset(name)]
+    errors, duty = (
+        {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()},
+        DUTIES[_preset(name)],
+    )
     amplitude = duty.gap * math.exp(random.uniform(*np.log(_AMPLITUDES)))
     if duty.lead:
         errors["p"] = 1.0 + duty.lead * random.uniform(-1.0, 1.0)

@@ -23,7 +23,7 @@ _ROUNDING = 2e-3  # of a window: it is cut to whole samples, so it may be a litt
 _WINDOW, _PRE_TRIGGER, _INTERVAL, _HOLD = 2.0, 0.3, 60.0, 0.85  # s on the paper's servo
 _ABSENT = "; where absent {:g} s on the paper's servo, scaled to the time of another"
 _SILENT = (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND)
-_ALLOWANCE = 2.0  # a teaching move tells the ratio so many times better than needed, in errors that are independent
+_ALLOWANCE = 4.0  # a teaching move tells the ratio so many times better than needed: rounding repeats, and 2 did not do
 _LESSONS = 3  # moves of different lengths that were made in vain, after which an engineer is told
 _RAREST = 20  # times that the pause between these doubles
 

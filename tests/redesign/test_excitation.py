@@ -182,7 +182,7 @@ def test_bad_settings_are_named(changes: dict[str, float], words: str) -> None:
 
 
 RATIO = UnknownRatio(known=5e-3, needed=1e-3, widest=4.0 * DEG)
-UNTOLD = replace(SHORT, ratio=RATIO, noise=2e-8)
+UNTOLD = replace(SHORT, ratio=RATIO, noise=1e-8)
 
 
 def test_windows_that_do_not_tell_the_ratio_lead_to_moves_of_two_lengths_at_once() -> None:
@@ -206,7 +206,7 @@ def test_every_move_crosses_the_gap_and_the_lengths_differ_by_enough(
     places = [share * ask.size for share in (0.0, *ask.places)]
     lengths = [abs(b - a) for a, b in pairwise(places)]
     assert min(lengths) >= (slack + PITCH * (widest + 5.0 * DEG)) * (1.0 - 1e-9)
-    assert max(lengths) - min(lengths) >= 2.0 * noise / needed * (1.0 - 1e-9)
+    assert max(lengths) - min(lengths) >= 4.0 * noise / needed * (1.0 - 1e-9)
     turns = [(b - a) * (d - c) for (a, b), (c, d) in pairwise(pairwise(places))]
     assert max(turns) < 0.0
 
