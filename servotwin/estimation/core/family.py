@@ -97,7 +97,7 @@ class Sampled:
         start = np.zeros(self.C.shape[1]) if initial is None else initial
         out = np.empty((len(self.D), signal.size))
         # Read-only or strided signals would be compiled once more.
-        _respond(self.F, self.now, self.after, self.C, self.D, np.require(signal, requirements="CW"), start, out)
+        _respond(self.F, self.now, self.after, self.C, self.D, np.require(signal, requirements=("C", "W")), start, out)
         return out
 
     def plain(self, signals: Array) -> Array:

@@ -78,7 +78,7 @@ class LagFilter:
         Its half gap is `half`, its output before the first sample `start`. Later passes filter the first one's
         output: a play without gap passes its input on unchanged.
         """
-        carried, signal = np.empty(signal.size), np.require(signal, requirements="CW")  # other arrays are compiled anew
+        carried, signal = np.empty(signal.size), np.require(signal, requirements=("C", "W"))  # other arrays are compiled anew
         for taps in self._sections():
             subtract_section(signal, half, start, self.decay, taps, residual, carried)
             signal, half = carried, 0.0
