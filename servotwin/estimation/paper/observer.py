@@ -78,10 +78,8 @@ class LagFilter:
         Its half gap is `half`, its output before the first sample `start`. Later passes filter the first one's
         output: a play without gap passes its input on unchanged.
         """
-        carried, signal = (
-            np.empty(signal.size),
-            np.require(signal, requirements=("C", "W")),
-        )  # other arrays are compiled anew
+        # Read-only or strided signals would be compiled once more.
+        carried, signal = np.empty(signal.size), np.require(signal, requirements=("C", "W"))
         for taps in self._sections():
             subtract_section(signal, half, start, self.decay, taps, residual, carried)
             signal, half = carried, 0.0
