@@ -13,7 +13,7 @@ from servotwin.twin.estimating import estimator_of, motor_learning_of
 from servotwin.twin.settings import TriageSettings, TwinSettings
 from servotwin.twin.triage import Triage
 
-PAGE = Path(__file__).parents[2] / "docs" / "howto" / "own-axis.md"
+PAGE = Path(__file__).parents[2] / "docs" / "axis-presets.md"
 HEAD = "| preset | estimate of the gap | `paper`, `hysteresis` | `certified` | learns its model | triage |"
 
 
