@@ -59,6 +59,7 @@ def test_a_law_that_reads_a_floating_load_alone_is_refused_at_once() -> None:
     policy_of(DRIVE.replace(controller=CASCADE), TwinSettings(uncertainty=RANGES))
     policy_of(DRIVE, TwinSettings(uncertainty=RANGES.replace(gap=(0.0, 0.0))))
     policy_of(DRIVE, TwinSettings(uncertainty=RANGES.replace(friction=(0.5, 1.0))))
+    policy_of(DRIVE.with_position_resolution(0.03), TwinSettings(uncertainty=RANGES))
     policy_of(replace(DRIVE, load=replace(DRIVE.load, friction=1.5)), TwinSettings(uncertainty=RANGES))
 
 

@@ -38,7 +38,8 @@ def check_rests(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Non
     InvalidInput
         Its load floats there without friction and damping, or its law drives the motor to and fro there.
     """
-    if not isinstance(servo, Axis) or not _floats(servo) or not uncertainty.gap[1]:
+    # Within one count of its encoder a load is at rest as far as anybody can measure.
+    if not isinstance(servo, Axis) or not _floats(servo) or servo.p * uncertainty.gap[1] <= servo.position_resolution:
         return
     load = servo.load
     if not load.c[0]:
