@@ -55,6 +55,10 @@ def free_port() -> int:
     return port
 
 
+class NotReady(Exception):
+    """Prometheus listens, but has not started yet: it answers with 503 until then."""
+
+
 class Monitoring:
     """A Prometheus that has scraped all of it twice."""
 
@@ -63,6 +67,8 @@ class Monitoring:
 
     def get(self, path: str, **parameters: str) -> Any:
         answer = httpx.get(f"{self.url}/api/v1/{path}", params=parameters, timeout=20.0)
+        if answer.status_code == httpx.codes.SERVICE_UNAVAILABLE:
+            raise NotReady
         assert answer.status_code == 200, answer.text
         return answer.json()["data"]
 
@@ -76,7 +82,7 @@ class Monitoring:
             try:
                 if len(self.values(query)) >= number:
                     return
-            except httpx.TransportError:
+            except (httpx.TransportError, NotReady):
                 pass
             assert time.monotonic() < end, f"{query}: waited in vain"
             time.sleep(0.2)
