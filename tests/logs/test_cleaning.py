@@ -81,6 +81,15 @@ def test_excursions_of_a_few_samples_are_left_out():
     assert not outliers(values).any()
 
 
+def test_pulses_of_a_command_are_not_called_spikes():
+    """The kick of a derivative is no defect; the like of it in an encoder is."""
+    time = np.arange(400.0)
+    kicked = np.sin(time / 30.0)
+    kicked[200] = 50.0
+    found = [cleaned(time, {"motor": np.cos(time / 30.0), name: kicked}, {}).found for name in ("command", "load")]
+    assert found == [{"samples in short pulses of command": 1}, {"samples in spikes of load": 1}]
+
+
 def test_a_load_that_sticks_and_slips_did_not_stand_still():
     slips = np.floor(np.linspace(0.0, 40.0, 2000))
     assert not frozen(slips).any()

@@ -3,7 +3,6 @@
 import shutil
 import tempfile
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -21,16 +20,6 @@ QUEUES = {
     (MessageKind.VERIFICATION,),
     (*WORK_KINDS, MessageKind.VERIFICATION),
 }
-
-
-@cache
-def empty_store() -> bytes:
-    """Content of a new store's file: every example would run all migrations again."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "store.db"
-        open_store(str(path)).close()
-        return path.read_bytes()
-
 
 servos = st.sampled_from(["a", "b", "c"])
 keys = st.sampled_from([f"k{n}" for n in range(8)])
@@ -60,10 +49,7 @@ class Against(RuleBasedStateMachine):
     def __init__(self) -> None:
         super().__init__()
         self.folder = Path(tempfile.mkdtemp())
-        path = self.folder / "store.db"
-        path.write_bytes(empty_store())
-        path.chmod(0o600)
-        self.store = open_store(str(path))
+        self.store = open_store(str(self.folder / "store.db"))
         self.now = 1000.0
         self.servos: dict[str, Model] = {}
         self.kept: dict[tuple[str, str], Kept] = {}
