@@ -33,7 +33,8 @@ def _draw_loop(axes: Axes, lost: LostMotion, unit: str) -> None:
         axes.plot(lost.curves.load, lead, ".", markersize=1.2, color=style.GREY, rasterized=True)
         for side in (-0.5, 0.5):
             axes.axhline(side * lost.at_load, color=style.BLUE)
-    axes.set(xlabel=f"Load position ({unit})", ylabel=f"Motor's lead, at the load ({unit})")
+    axes.set(ylabel=f"Motor's lead, at the load ({unit})")
+    _over_position(axes, unit)
 
 
 def _draw_reversals(axes: Axes, lost: LostMotion, unit: str) -> None:
@@ -45,7 +46,14 @@ def _draw_reversals(axes: Axes, lost: LostMotion, unit: str) -> None:
     axes.plot([each.position for each in lost.local], gaps, "o", markersize=3.0, color=style.BLUE)
     _say_unless(axes, bool(lost.local))
     most = max([*gaps, high if np.isfinite(high) else 0.0])
-    axes.set(xlabel=f"Load position ({unit})", ylabel=f"Lost motion ({unit})", ylim=(0.0, 1.1 * most or None))
+    axes.set(ylabel=f"Lost motion ({unit})", ylim=(0.0, 1.1 * most or None))
+    _over_position(axes, unit)
+
+
+def _over_position(axes: Axes, unit: str) -> None:
+    """Show the load's position along x; positions in m would have long labels that overlap."""
+    axes.set(xlabel=f"Load position ({unit})")
+    axes.ticklabel_format(axis="x", scilimits=(-2, 4))
 
 
 def _draw_left(axes: Axes, lost: LostMotion, unit: str) -> None:
