@@ -19,9 +19,9 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.axis_presets import DUTIES
 from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
+from benchmarks.preset_machines import DUTIES
 from servotwin.errors import InvalidInput
 from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion

@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from benchmarks.axis_presets import DUTIES, WORN, PresetMachine, preset_machines
+from benchmarks.preset_machines import DUTIES, WORN, PresetMachine, preset_machines
 from servotwin.estimation import motor_side
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.gap import estimate_gap

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.axis_presets import DUTIES, certified_machines, judged, measured, preset_machines
+from benchmarks.axis_presets import judged, measured
+from benchmarks.preset_machines import DUTIES, certified_machines, preset_machines
 from servotwin.control.cascade import Cascade
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.axis import AXES

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from benchmarks.axis_presets import DUTIES
 from benchmarks.log_files import WRITERS, damaged
 from benchmarks.logs import inside, log_cases, measured
+from benchmarks.preset_machines import DUTIES
 from servotwin.logs.recordings import read_recording
 
 _TIME = np.arange(400) * 0.01

@@ -6,8 +6,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +15,7 @@ import pytest
 from service_system import TOKEN, twin_file
 from services import service
 from stubmachine import StubMachine
+from waiting import PATIENCE, until
 
 from servotwin.control.controller import Controller
 from servotwin.edge.guard import Limits
@@ -27,15 +27,8 @@ from servotwin.edge_process.monitoring import read_status
 from servotwin.messages import Setting
 from servotwin.runtime.retry import Retry
 
-RATE, PATIENCE = 500.0, 90.0
+RATE = 500.0
 LAW = Controller(200.0, 0.0, 0.0, 0.1, voltage_limit=10.0, sample_rate=RATE)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
 
 
 @contextmanager

@@ -3,8 +3,7 @@
 import shutil
 import socket
 import sqlite3
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from threading import Thread
@@ -13,14 +12,13 @@ import pytest
 from edge_process_parts import EDGE, cut
 from service_system import TOKEN, twin_file
 from services import service
+from waiting import PATIENCE, until
 
 from servotwin.edge_process import frames
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.link_process import LinkProcess
 from servotwin.edge_process.monitoring import read_status
 from servotwin.runtime.frames import FrameSocket
-
-PATIENCE = 60.0
 
 
 class Edge:
@@ -57,13 +55,6 @@ def edge(folder: Path, run: str) -> Iterator[Edge]:
     finally:
         one.pipe.close()
         one.thread.join(PATIENCE)
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 @pytest.mark.slow

@@ -1,9 +1,8 @@
 """Link process: another edge of its servo, a corrupt outbox, a full disk, a twin that asks for windows again."""
 
 import socket
-import time
 from array import array
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from threading import Event, Thread
@@ -11,6 +10,7 @@ from threading import Event, Thread
 import pytest
 from edge_process_parts import EDGE, SETTINGS, LinkEnd, cut, exchange_all
 from faketwin import FakeTwin
+from waiting import PATIENCE, until
 
 from servotwin.edge.agent import Agent
 from servotwin.edge.parameters import FallbackSet, Parameters
@@ -23,15 +23,6 @@ from servotwin.edge_process.outlet import PipeOutlet
 from servotwin.messages import Cause, ClaimStatus, Fallback, Resend, Setting
 from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
-
-PATIENCE = 60.0
-
-
-def until(condition: Callable[[], bool]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.02)
 
 
 def send(pipe: FrameSocket, sequence: int) -> None:

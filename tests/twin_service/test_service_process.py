@@ -8,7 +8,6 @@ import ssl
 import subprocess
 import sys
 import threading
-import time
 from contextlib import closing, nullcontext
 from pathlib import Path
 
@@ -30,6 +29,7 @@ from service_system import (
     window,
 )
 from typer.testing import CliRunner
+from waiting import PATIENCE, until
 
 from servotwin.cli.app import app
 from servotwin.errors import InvalidInput
@@ -39,18 +39,7 @@ from servotwin.twin_service import command as service
 from servotwin.twin_service.twin_file import read_twin
 from servotwin.twin_service.worker_pool import WorkerPool
 
-PATIENCE = 60.0
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="signals, process groups")
-
-
-def until(condition, seconds=PATIENCE):
-    """Wait for a condition; returns its first true value."""
-    end = time.monotonic() + seconds
-    while time.monotonic() < end:
-        if result := condition():
-            return result
-        time.sleep(0.05)
-    raise AssertionError("it did not happen in time")
 
 
 def send(client: httpx.Client, sequence: int) -> httpx.Response:
