@@ -6,7 +6,9 @@ import resource
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from faketwin import FakeTwin, Handler
@@ -16,10 +18,28 @@ from stubmachine import StubMachine
 from waiting import until
 
 from servotwin.edge.probe import ProbeLimits
+from servotwin.edge_process.config import TwinLink
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.messages import Hello, Receipt, Refusal, Setting, Update, WindowMessage
 
-pytest_plugins = ("running_edge",)
+
+@pytest.fixture
+def machine() -> Iterator[StubMachine]:
+    with StubMachine(RATE) as machine:
+        yield machine
+
+
+@pytest.fixture
+def twin() -> Iterator[FakeTwin]:
+    with FakeTwin() as twin:
+        yield twin
+
+
+@pytest.fixture
+def edge(tmp_path: Path, machine: StubMachine, twin: FakeTwin) -> Iterator[RunningEdge]:
+    made = RunningEdge(tmp_path, machine, TwinLink(twin.url, "token", timeout_s=5.0, wait_s=1.0))
+    yield made
+    made.kill()
 
 
 @pytest.mark.slow

@@ -5,12 +5,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pytest
 from faketwin import FakeTwin
 from stubmachine import StubMachine
 
@@ -87,25 +85,6 @@ class RunningEdge:
 
     def log(self) -> str:
         return (self.folder / "log").read_text()
-
-
-@pytest.fixture
-def machine() -> Iterator[StubMachine]:
-    with StubMachine(RATE) as machine:
-        yield machine
-
-
-@pytest.fixture
-def twin() -> Iterator[FakeTwin]:
-    with FakeTwin() as twin:
-        yield twin
-
-
-@pytest.fixture
-def edge(tmp_path: Path, machine: StubMachine, twin: FakeTwin) -> Iterator[RunningEdge]:
-    made = RunningEdge(tmp_path, machine, TwinLink(twin.url, "token", timeout_s=5.0, wait_s=1.0))
-    yield made
-    made.kill()
 
 
 def sequences(twin: FakeTwin) -> dict[str, list[int]]:

@@ -15,8 +15,6 @@ from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import WorkResult
 from servotwin.twin_service.auth import read_tokens, write_tokens
 
-pytest_plugins = ("service_requests",)
-
 
 def test_a_window_is_committed_then_acknowledged_and_known_the_second_time(serving):
     async def body(system, client):

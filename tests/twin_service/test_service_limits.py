@@ -15,8 +15,6 @@ from servotwin.store.engine import StoreUnavailable
 from servotwin.twin_service import http_edge
 from servotwin.twin_service.limits import RateLimiter
 
-pytest_plugins = ("service_requests",)
-
 
 def test_a_stranger_who_knocks_in_a_loop_does_not_fill_the_log(serving, caplog):
     caplog.set_level("INFO")
