@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from servotwin.estimation.output_error.shaft import drive_to, guard, through_sample
+from servotwin.estimation.output_error.shaft import drive_to, guard, slow_down, slowed, through_sample
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
@@ -28,14 +28,14 @@ class MotorStep(NamedTuple):
 
 
 class LoadStep(NamedTuple):
-    """Step of the load over a part of a sample, `fine` times `interval` (s) long.
+    """Step of the load over a part of a sample, in smaller parts of its own, `interval` (s) long.
 
     Attributes
     ----------
-    fine : int
+    parts : int
     interval, half : float
     flows, steps, push : arrays
-    friction : float
+    fading, friction : float
         Those of `run_shaft`.
     momentum : (2 n + 3,) array
         Row of the load's momentum, and what its damper to the ground takes of it per position.
@@ -43,12 +43,13 @@ class LoadStep(NamedTuple):
         Stiffness to the ground (N/m, rotary: N m/rad), and constant force (N, rotary: N m) on the load.
     """
 
-    fine: int
+    parts: int
     interval: float
     half: float
     flows: Array
     steps: Array
     push: Array
+    fading: float
     friction: float
     momentum: Array
     ground: tuple[float, float]
@@ -87,15 +88,18 @@ def step_load(by: LoadStep, side: int, begin: float, rate: float, work: Array, s
     The impulse of the shaft is what the load's momentum gained: exact, whatever happened meanwhile.
     """
     n, kept, impulse = (state.size - 3) // 2, state.size - 3, 0.0
-    for k in range(by.fine):
+    for k in range(by.parts):
         now, then = begin + k * by.interval * rate, begin + (k + 1) * by.interval * rate
         drive_to(state, side, now, rate, by.half, kept)
+        place, speed = state[n - 1], slowed(state[2 * n - 1], by.friction)
+        state[2 * n - 1] = speed
         impulse -= momentum(by.momentum, state) - 0.5 * by.interval * by.ground[0] * state[0]
-        side = through_sample(side, now, then, by.interval, by.half, by.flows, by.steps, by.push, work, state)
+        side = through_sample(
+            side, now, then, by.interval, by.half, by.flows, by.steps, by.push, by.fading, work, state
+        )
         impulse += momentum(by.momentum, state) + by.interval * (0.5 * by.ground[0] * state[0] - by.ground[1])
-        speed = state[2 * n - 1]
-        state[2 * n - 1] = speed - min(max(speed, -by.friction), by.friction)
-    return side, impulse / (by.fine * by.interval)
+        slow_down(state, place, speed, by.friction)
+    return side, impulse / (by.parts * by.interval)
 
 
 @bare
@@ -108,7 +112,7 @@ def step_both(by: MotorStep, load: LoadStep, side: int, command: float, work: Ar
     drive_to(state, side, begin, motor[-2], load.half, kept)
     force = flank_force(side, begin, state, load.push, load.half)
     step_motor(by, command, -force, motor, ahead)
-    rate = (ahead[-1] - begin) / (load.fine * load.interval)
+    rate = (ahead[-1] - begin) / (load.parts * load.interval)
     side, force = step_load(load, side, begin, rate, work[:-1], state)
     step_motor(by, command, -force, motor, ahead)
     for j in range(motor.size):

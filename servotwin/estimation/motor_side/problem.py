@@ -157,7 +157,7 @@ class MotorProblem:
             command,
             PARTS,
             by,
-            LoadStep(load.fine, load.interval, load.half, *load.matrices, load.friction, *self._momentum(values)),
+            LoadStep(load.parts, load.interval, load.half, *load.matrices, load.friction, *self._momentum(values)),
             _gains(axis, self.interval, rate),
             np.empty((len(load.scratch()) + 1, load.state.size)),
             motor,

@@ -17,9 +17,9 @@ from servotwin.plant.backlash import play_samples
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
-_FASTEST = 1.2  # of a sample: the largest rate of the flow times the interval, for the Taylor series to converge
+_FASTEST = 0.4  # largest rate of the flow times a part of a sample: a flank touched and left within a part is not seen
+_PARTS = 3  # of a sample with friction, whose sign changes between parts only
 _EXPONENTIAL = 20  # terms of the series, for a norm below one
-_RELAXED = 12.0  # a shaft that relaxes faster than that in a sample is taken as relaxed
 
 
 Flags: TypeAlias = NDArray[np.bool_]
@@ -105,14 +105,16 @@ class PreparedShaft(NamedTuple):
 
     Attributes
     ----------
-    drive : (M,) array
-        Motor at the load, `fine` times as dense as the samples; `interval` (s) lies between two of it.
+    drive : (N,) array
+        Motor at the load.
+    parts : int
+        Of a sample.
     interval : float
-    fine : int
+        s, of a part.
     half : float
         Half gap.
     matrices : tuple
-        Flows, steps and the force's row.
+        Flows, steps, the force's row, and the rate at which the shaft's stretch fades in the gap.
     friction : float
     state : array
         At the first sample; a simulation changes it.
@@ -121,10 +123,10 @@ class PreparedShaft(NamedTuple):
     """
 
     drive: Array
+    parts: int
     interval: float
-    fine: int
     half: float
-    matrices: tuple[Array, Array, Array]
+    matrices: tuple[Array, Array, Array, float]
     friction: float
     state: Array
     zero: float
@@ -197,19 +199,15 @@ class ShaftModel:
                 "load force",
             )
         )
-        flows, steps, push, fine = _matrices(self.axis, factors, interval)
-        driven = math.exp(named["ratio"]) * drive + named["offset"]
-        if fine > 1:
-            at = np.arange((driven.size - 1) * fine + 1) / fine
-            driven = np.interp(at, np.arange(driven.size), driven)
+        flows, steps, push, fading, parts = _matrices(self.axis, factors, interval)
         friction = math.exp(named.get("load friction", 0.0)) * self.axis.load.friction / self.axis.load.m[-1]
         return PreparedShaft(
-            driven,
-            interval / fine,
-            fine,
+            math.exp(named["ratio"]) * drive + named["offset"],
+            parts,
+            interval / parts,
             math.exp(named["ratio"]) * abs(named["half gap"]),
-            (flows, steps, push),
-            friction * interval / fine,
+            (flows, steps, push, fading),
+            0.5 * friction * interval / parts,
             np.concatenate([values[-2 * n :], [values[-2 * n], 0.0, 1.0]]),
             named.get("position offset", 0.0),
         )
@@ -224,6 +222,7 @@ class ShaftModel:
         gains = 2.0 * rate * interval, rate * rate * interval
         run_shaft(
             made.drive,
+            made.parts,
             made.interval,
             made.half,
             *made.matrices,
@@ -235,8 +234,8 @@ class ShaftModel:
             out,
             sides,
         )
-        position, velocity, end = out[:, :: made.fine]
-        return Motion(position + made.zero, velocity, end, sides[:: made.fine])
+        position, velocity, end = out
+        return Motion(position + made.zero, velocity, end, sides)
 
     def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
         """Position (N,) of the last mass in `simulate`."""
@@ -244,28 +243,31 @@ class ShaftModel:
 
 
 @lru_cache(maxsize=64)
-def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, Array, Array, int]:
-    """Flows and steps (2, size, size) in the gap and in contact, the force's row, parts of a sample that are needed."""
+def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, Array, Array, float, int]:
+    """Flows and steps (2, size, size) in the gap and in contact, the force's row, the rate at which the stretch fades,
+    parts of a sample that are needed."""
     k_d, c_d, c, k, ratio, force = factors
     load, shaft, n = axis.load, axis.transmission, axis.n
     masses = load.masses.copy()
     masses[-1] *= ratio
     k_d, c_d = k_d * shaft.k_d, c_d * shaft.c_d
     links = chain(masses, k * load.stiffnesses, c * load.dampings, k_d, c_d)
-    size, rate = 2 * n + 3, k_d / c_d if c_d > 0.0 else math.inf
+    size, kept = 2 * n + 3, 2 * n
     flows, push = np.zeros((2, size, size)), np.zeros(size)
-    flows[0, : 2 * n, : 2 * n], flows[1, : 2 * n, : 2 * n] = links.A_open, links.A
-    flows[1, : 2 * n, 2 * n], flows[1, : 2 * n, 2 * n + 1] = links.B_position, links.B_velocity
-    flows[1, 2 * n, 2 * n + 1] = 1.0
-    flows[0, 2 * n, n] = 1.0
-    if rate * interval < _RELAXED:
-        flows[0, 2 * n, [0, 2 * n]] = rate, -rate
-    push[: 2 * n], push[2 * n : 2 * n + 2] = links.reaction, (k_d, c_d)
-    flows[:, 2 * n - 1, 2 * n + 2] = force * load.force / masses[-1]
+    flows[0, :kept, :kept], flows[1, :kept, :kept] = links.A_open, links.A
+    flows[1, :kept, kept], flows[1, :kept, kept + 1] = links.B_position, links.B_velocity
+    flows[1, kept, kept + 1] = 1.0
+    flows[0, kept, n] = 1.0
+    push[:kept], push[kept : kept + 2] = links.reaction, (k_d, c_d)
+    flows[:, kept - 1, kept + 2] = force * load.force / masses[-1]
     fastest = max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
-    fine = max(1, math.ceil(fastest * interval / _FASTEST))
-    steps = np.array([exponential(flow * interval / fine) for flow in flows])
-    return flows, steps, push, fine
+    parts = max(_PARTS if load.friction > 0.0 else 1, math.ceil(fastest * interval / _FASTEST))
+    steps = np.array([exponential(flow * interval / parts) for flow in flows])
+    fading = k_d / c_d if c_d > 0.0 else 0.0
+    left = math.exp(-fading * interval / parts)
+    steps[0, kept] = steps[0, 0]
+    steps[0, kept, [0, kept]] += -left, left
+    return flows, steps, push, fading, parts
 
 
 def exponential(matrix: Array) -> Array:

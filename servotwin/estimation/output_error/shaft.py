@@ -2,37 +2,42 @@
 
 Between two samples the motor's angle is linear. In contact the load is a linear system driven by the motor, in the gap
 a free one: both advance by matrix exponentials. Where a flank is touched or left within a sample, the instant is the
-root of a polynomial, the Taylor series of the flow.
+root of a polynomial, the Taylor series of the flow. In the gap the stretch that is left in the shaft fades on its own,
+often far faster than anything else moves: it has its own exponential beside the series.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.compiled import bare, inlined, subroutine
 from servotwin.plant.signals import Array
 
 _TERMS = 14
 _CHANGES = 8  # within a sample; a load at rest on a flank could touch and leave it for ever
 _ROUNDS = 60
+_EXACT = 1e-13  # of an interval: a shorter step to an instant is the last
 
 
-@bare
+@subroutine
 def series(flow: Array, state: Array, terms: Array) -> None:
-    """Taylor coefficients (terms, size) of the flow from a state (size,)."""
-    size = state.size
+    """Taylor coefficients (terms, size) of the flow from a state (size,); its last two states are constant."""
+    size, moving = state.size, state.size - 2
     for j in range(size):
         terms[0, j] = state[j]
     for k in range(1, _TERMS):
-        for i in range(size):
+        terms[k, moving] = terms[k, moving + 1] = 0.0
+        for i in range(moving):
             total = 0.0
             for j in range(size):
                 total += flow[i, j] * terms[k - 1, j]
             terms[k, i] = total / k
 
 
-@bare
+@subroutine
 def value(polynomial: Array, time: float) -> float:
     """A polynomial (terms,), ascending, at a time."""
     total = 0.0
@@ -41,32 +46,57 @@ def value(polynomial: Array, time: float) -> float:
     return total
 
 
-@bare
-def first_fall(polynomial: Array, end: float) -> float:
-    """Time in [0, end] at which a polynomial that is negative at the end falls below zero."""
-    low, high = 0.0, end
+@subroutine
+def slope(polynomial: Array, time: float) -> float:
+    """Derivative of a polynomial (terms,), ascending, at a time."""
+    total = 0.0
+    for k in range(_TERMS - 1, 0, -1):
+        total = total * time + k * polynomial[k]
+    return total
+
+
+@subroutine
+def faded(stretch: float, fading: float, time: float) -> float:
+    """Change of a stretch that fades at a rate (1/s), after a time."""
+    return stretch * math.expm1(-fading * time)
+
+
+@subroutine
+def first_fall(polynomial: Array, stretch: float, fading: float, end: float) -> float:
+    """Time in [0, end] at which a polynomial and what a stretch has faded, negative at the end, fall below zero.
+
+    Newton's method; a step that leaves the bracket, or shortens it too little, is replaced by its middle.
+    """
+    low, high, time, before = 0.0, end, end, 2.0 * end
     for _ in range(_ROUNDS):
-        middle = 0.5 * (low + high)
-        if value(polynomial, middle) >= 0.0:
-            low = middle
+        here = value(polynomial, time) + faded(stretch, fading, time)
+        if here >= 0.0:
+            low = time
         else:
-            high = middle
-        if high - low <= 1e-13 * end:
+            high = time
+        falling = slope(polynomial, time) - fading * stretch * math.exp(-fading * time)
+        step = -here / falling if falling != 0.0 else math.inf
+        if not low < time + step < high or abs(step) > 0.5 * before:
+            step = 0.5 * (low + high) - time
+        time, before = time + step, abs(step)
+        if before <= _EXACT * end:
             break
-    return high
+    return time
 
 
-@bare
+@inlined
 def advance(step: Array, state: Array, out: Array) -> None:
-    """State (size,) one matrix (size, size) later."""
-    for i in range(state.size):
+    """State (size,) one matrix (size, size) later; its last two states are constant."""
+    size, moving = state.size, state.size - 2
+    out[moving], out[moving + 1] = state[moving], state[moving + 1]
+    for i in range(moving):
         total = 0.0
-        for j in range(state.size):
+        for j in range(size):
             total += step[i, j] * state[j]
         out[i] = total
 
 
-@bare
+@inlined
 def drive_to(state: Array, side: int, drive: float, rate: float, half: float, kept: int) -> None:
     """Set the driven end in contact: its position and rate, states `kept` and the next."""
     if side != 0:
@@ -74,7 +104,7 @@ def drive_to(state: Array, side: int, drive: float, rate: float, half: float, ke
         state[kept + 1] = rate
 
 
-@bare
+@inlined
 def guard(side: int, drive: float, state: Array, push: Array, half: float) -> float:
     """Positive while the mode lasts: force on the flank, or the shorter way to one."""
     kept = state.size - 3
@@ -86,7 +116,7 @@ def guard(side: int, drive: float, state: Array, push: Array, half: float) -> fl
     return half - abs(drive - state[kept])
 
 
-@bare
+@subroutine
 def guard_series(
     side: int, ahead: int, drive: float, rate: float, terms: Array, push: Array, half: float, out: Array
 ) -> None:
@@ -105,7 +135,7 @@ def guard_series(
         out[1] -= ahead * rate
 
 
-@bare
+@subroutine
 def later(terms: Array, time: float, out: Array) -> None:
     """State (size,) at a time, from its Taylor coefficients."""
     for j in range(out.size):
@@ -115,7 +145,23 @@ def later(terms: Array, time: float, out: Array) -> None:
         out[j] = total
 
 
-@bare
+@inlined
+def slowed(speed: float, friction: float) -> float:
+    """A speed less what Coulomb friction takes of it at most."""
+    return speed - min(max(speed, -friction), friction)
+
+
+@inlined
+def slow_down(state: Array, place: float, speed: float, friction: float) -> None:
+    """Apply friction after a step that the last mass began at a place with a speed: it rests on where it is held."""
+    n = (state.size - 3) // 2
+    if speed == 0.0 and abs(state[2 * n - 1]) <= 2.0 * friction:
+        state[n - 1], state[2 * n - 1] = place, 0.0
+    else:
+        state[2 * n - 1] = slowed(state[2 * n - 1], friction)
+
+
+@inlined
 def through_sample(
     side: int,
     begin: float,
@@ -125,6 +171,7 @@ def through_sample(
     flows: Array,
     steps: Array,
     push: Array,
+    fading: float,
     work: Array,
     state: Array,
 ) -> int:
@@ -132,40 +179,62 @@ def through_sample(
 
     The other arguments are those of `run_shaft`.
     """
+    after = work[_TERMS]
+    advance(steps[1 if side != 0 else 0], state, after)
+    if guard(side, end, after, push, half) < 0.0:
+        side = through_changes(side, begin, end, interval, half, flows, push, fading, work, state)
+    for j in range(state.size):
+        state[j] = after[j]
+    return side
+
+
+@subroutine
+def through_changes(
+    side: int,
+    begin: float,
+    end: float,
+    interval: float,
+    half: float,
+    flows: Array,
+    push: Array,
+    fading: float,
+    work: Array,
+    state: Array,
+) -> int:
+    """Advance as `through_sample` where flanks are touched or left, from the first instant on; state at the end in
+    `work[_TERMS]`."""
     kept, rate = state.size - 3, (end - begin) / interval
     terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
     now, left = begin, interval
     for change in range(_CHANGES):
-        if change == 0:
-            advance(steps[1] if side != 0 else steps[0], state, after)
-            if guard(side, end, after, push, half) >= 0.0:
-                break
-        series(flows[1] if side != 0 else flows[0], state, terms)
+        series(flows[1 if side != 0 else 0], state, terms)
+        stretch = state[kept] - state[0] if side == 0 else 0.0
         if change > 0:
             later(terms, left, after)
+            after[kept] += faded(stretch, fading, left)
             if guard(side, end, after, push, half) >= 0.0 or change == _CHANGES - 1:
                 break
         ahead = 1 if end > after[kept] else -1
         guard_series(side, ahead, now, rate, terms, push, half, polynomial)
-        time = first_fall(polynomial, left)
+        time = first_fall(polynomial, ahead * stretch, fading, left)
         later(terms, time, state)
         now += rate * time
         left -= time
         side = ahead if side == 0 else 0
         drive_to(state, side, now, rate, half, kept)
-    for j in range(state.size):
-        state[j] = after[j]
     return side
 
 
 @bare
 def run_shaft(
     drive: Array,
+    parts: int,
     interval: float,
     half: float,
     flows: Array,
     steps: Array,
     push: Array,
+    fading: float,
     measured: Array,
     gains: tuple[float, float],
     friction: float,
@@ -179,21 +248,26 @@ def run_shaft(
     Parameters
     ----------
     drive : (N,) array
-        Motor's position seen at the load, m or rad.
+        Motor's position seen at the load, m or rad; straight from one sample to the next.
+    parts : int
+        Of a sample, one after the other.
     interval, half : float
-        s, and half of the gap at the load.
+        s, of a part; and half of the gap at the load.
     flows, steps : (2, size, size) arrays
-        Flow and its exponential over one interval, in the gap and in contact, of (q (n), v (n), driven end, its rate,
-        1); size = 2 n + 3.
+        Flow and its exponential over a part, in the gap and in contact, of (q (n), v (n), driven end, its rate, 1);
+        size = 2 n + 3. In the gap only the exponential has the fading of the stretch.
     push : (size,) array
         Row of the shaft's force on the load in contact.
-    measured : (M,) array
-        Measured position at every ((N - 1) / (M - 1))-th sample.
+    fading : float
+        Rate at which the stretch of the shaft fades in the gap, 1/s; 0: of a shaft without damping nothing is left.
+    measured : (N,) array
+        Measured position.
     gains : (float, float)
         Shares of the measured position less the simulated one that are added to the last mass's position, and to its
         speed (1/s); 0: none.
     friction : float
-        Speed that Coulomb friction takes off the last mass in one interval; after each it takes that much at most.
+        Speed that Coulomb friction takes off the last mass in half a part at most: before each, and after it. A mass
+        that it would stop at once stays where it rests.
     work : (18, size) array
         Scratch.
     state : (size,) array
@@ -204,18 +278,22 @@ def run_shaft(
         Out: flank in contact, -1, 0 or 1.
     """
     n, kept = (state.size - 3) // 2, state.size - 3
-    part, lead = (drive.size - 1) // (measured.size - 1), drive[0] - state[kept]
+    lead = drive[0] - state[kept]
     side = 0 if abs(lead) <= half else (1 if lead > 0.0 else -1)
     for i in range(drive.size):
-        rate = (drive[i + 1] - drive[i]) / interval if i + 1 < drive.size else 0.0
+        rate = (drive[i + 1] - drive[i]) / (parts * interval) if i + 1 < drive.size else 0.0
         drive_to(state, side, drive[i], rate, half, kept)
-        error = measured[i // part] - state[n - 1] if i % part == 0 else 0.0
+        error = measured[i] - state[n - 1]
         motion[0, i], motion[1, i], motion[2, i] = state[n - 1], state[2 * n - 1], state[kept]
         sides[i] = side
         state[n - 1] += gains[0] * error
         state[2 * n - 1] += gains[1] * error
         if i + 1 == drive.size:
             break
-        side = through_sample(side, drive[i], drive[i + 1], interval, half, flows, steps, push, work, state)
-        speed = state[2 * n - 1]
-        state[2 * n - 1] = speed - min(max(speed, -friction), friction)
+        for k in range(parts):
+            begin, end = drive[i] + k * interval * rate, drive[i] + (k + 1) * interval * rate
+            drive_to(state, side, begin, rate, half, kept)
+            place, speed = state[n - 1], slowed(state[2 * n - 1], friction)
+            state[2 * n - 1] = speed
+            side = through_sample(side, begin, end, interval, half, flows, steps, push, fading, work, state)
+            slow_down(state, place, speed, friction)
