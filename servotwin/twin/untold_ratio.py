@@ -26,17 +26,18 @@ class UntoldRatio(Struct, frozen=True):
     windows: int = 0
     advised: bool = False
 
-    def after(self, estimate: GapEstimate, prevented: str) -> tuple[UntoldRatio, str]:
+    def after(self, estimate: GapEstimate, prevented: str, settings: ExcitationSettings) -> tuple[UntoldRatio, str]:
         """Return the state after an estimate, and the sentence of the alarm; empty: none.
 
-        `prevented`: why no moves of different lengths will be requested; empty: they are, or will be.
+        `prevented`: why no moves of different lengths will be requested; empty: they are, or will be. The alarm comes
+        after as many windows as a request would.
         """
         if estimate.ok and estimate.machine is not None:
             return UntoldRatio(), ""
         if estimate.ratio is None:
             return self, ""
         windows = self.windows + 1
-        if self.advised or not prevented or windows < ExcitationSettings().after:
+        if self.advised or not prevented or windows < settings.after:
             return replace(self, windows=windows), ""
         return UntoldRatio(windows, advised=True), advice(estimate.ratio, prevented)
 

@@ -10,6 +10,7 @@ from servotwin.cosim import cosimulate
 from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading, UnknownRatio, interval_95, no_estimate
 from servotwin.estimation.learning.wear import Expectation, Wear
 from servotwin.messages import encode
+from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.twin.context import context_of
 from servotwin.twin.estimating import DecodedWindow, estimator_of
 from servotwin.twin.evidence import GapEstimateRecord
@@ -24,16 +25,16 @@ TOLD = GapEstimate(0.1, 1e-4, 1e-3, interval_95(0.1, 1e-3), GapStatus.OK, 1.0)
 TAUGHT = replace(TOLD, machine=MachineReading((0.0,) * 4, (0.0,) * 16))
 
 
-def alarms(*seen: tuple[GapEstimate, str]) -> list[bool]:
+def alarms(*seen: tuple[GapEstimate, str], after: int = 2) -> list[bool]:
     state, found = UntoldRatio(), []
     for estimate, prevented in seen:
-        state, sentence = state.after(estimate, prevented)
+        state, sentence = state.after(estimate, prevented, ExcitationSettings(after=after))
         found.append(bool(sentence))
     return found
 
 
 def test_the_alarm_says_what_to_do_and_why_the_twin_does_not() -> None:
-    _, sentence = UntoldRatio(1).after(UNTOLD, "a probing move is not allowed")
+    _, sentence = UntoldRatio(1).after(UNTOLD, "a probing move is not allowed", ExcitationSettings())
     assert sentence == (
         "the windows do not tell the gap from the transmission's ratio: move by different lengths once, or state the "
         "ratio to 0.12 % (pitch_percent of [twin.learning]); a probing move is not allowed"
@@ -43,6 +44,10 @@ def test_the_alarm_says_what_to_do_and_why_the_twin_does_not() -> None:
 def test_it_comes_once_until_a_window_has_told_the_ratio() -> None:
     no = (UNTOLD, "not allowed")
     assert alarms(no, no, no, (TOLD, ""), no, (TAUGHT, ""), no, no) == [False, True, *[False] * 5, True]
+
+
+def test_it_comes_after_as_many_windows_as_a_request_would() -> None:
+    assert alarms(*[(UNTOLD, "not allowed")] * 6, after=5) == [False] * 4 + [True, False]
 
 
 def test_it_does_not_come_for_other_windows_or_while_moves_may_be_requested() -> None:
