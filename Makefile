@@ -14,9 +14,10 @@ PYTEST := $(BIN)/python -m pytest -q -n 3 --dist loadfile --no-loadscope-reorder
 # The fast tests hardly ever wait, and every process imports all of them once more.
 PYTEST_FAST := $(PYTEST) -n 2
 
-# On the core that lint leaves idle: nearly all tests wait for these.
+# On the core that lint leaves idle, for about as long as it takes: nearly all tests wait for these, for a twin's estimator many.
 KERNELS := import servotwin as st; servo = st.Servo.preset("paper"); \
-	[st.simulate(each, 1.0, reference=st.Step(1e-3), gap=0.1, tolerance=1e-5) for each in (servo, servo.replace(sample_rate=1e3))]
+	[st.simulate(each, 1.0, reference=st.Step(1e-3), gap=0.1, tolerance=1e-5) for each in (servo, servo.replace(sample_rate=1e3))]; \
+	run = st.simulate(servo, 1.0, reference=st.Step(1e-3), gap=0.1); st.estimate_gap(st.Window.from_run(run, 0.0, 1.0), servo)
 
 .PHONY: help demo reproduce reference check test fuzz bench lint format lock clean packages kernels
 

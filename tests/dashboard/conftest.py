@@ -22,7 +22,7 @@ def browser():
     sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is in the extra dev")
     with sync_api.sync_playwright() as engine:
         # Root, as in containers, has no sandbox.
-        opened = engine.chromium.launch(executable_path=needed("chromium"), args=["--no-sandbox"])
+        opened = engine.chromium.launch(executable_path=needed("chromium"), args=["--no-sandbox", "--disable-gpu"])
         yield opened
         opened.close()
 
@@ -32,8 +32,8 @@ def open_page(browser, twin):
     """Opens pages; in the end no script failed, nothing moved, and nothing was executed that came as a name."""
     contexts, faults, shifts = [], [], []
 
-    def opened(login=OPERATOR, width=1280, height=900, theme="light", expected=()):
-        context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=theme)
+    def opened(login=OPERATOR, width=1280, height=900, expected=()):
+        context = browser.new_context(viewport={"width": width, "height": height})
         context.set_default_timeout(WAIT_MS)
         contexts.append(context)
         moved = []

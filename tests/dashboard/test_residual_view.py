@@ -67,13 +67,14 @@ def drive(tmp_path_factory):
             text = re.sub(r"\[models.axis.controller\]\nsample_rate_hz = .*\n|controller = .*\n", "", text)
             text = text.replace("amplitude_mm = 1.0, period_s = 20.0", "amplitude_deg = 10.0, period_s = 4.0")
             text = text.replace('"hysteresis"', '"paper"').replace("sample_rate_hz = 1000.0", "sample_rate_hz = 500.0")
+            text = text.replace("duration_s = 40.0", "duration_s = 8.0")
             patched.setattr(dashboard_fleet, name, text)
         return stored_fits(wearing_fleet(tmp_path_factory.mktemp("drive"), time.time()))
 
 
 @pytest.mark.slow
 def test_an_output_error_fit_has_a_residual_too(drive):
-    assert drive
+    assert len(drive) > 1
     for fit in drive[:2]:
         view = residual_view(fit)
         assert view["of"] == "position"
