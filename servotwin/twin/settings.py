@@ -28,6 +28,10 @@ from servotwin.redesign.registry import POLICIES
 _LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
 
 
+_BIAS = 0.01
+"""Of the limit of a command: larger offsets of a drive, which no file states, are not assumed."""
+
+
 @settings("triage")
 @dataclass(frozen=True)
 class TriageSettings:
@@ -273,7 +277,7 @@ def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None 
         That paths are relative to.
     plant : Servo or Axis, optional
         Steps and input bias of the uncertainty that the file does not state are those of the preset `paper` in the
-        axis's own metre and volt; a servo's are as they are.
+        axis's own metre and volt, the bias at most a hundredth of the command's limits; a servo's are as they are.
     """
     estimator = part(table, "estimator", METHODS[attribute(table, TwinSettings, "method")].settings)
     given = table.values.get("uncertainty", {})
@@ -285,5 +289,7 @@ def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None 
     if not {"step_mm", "step_deg"} & given.keys():
         changed["step"] = (own.length * known.step[0], own.length * known.step[1])
     if not set(INPUT_BIAS_KEYS) & given.keys():
-        changed["input_bias"] = (own.voltage * known.input_bias[0], own.voltage * known.input_bias[1])
+        limits = [_BIAS * each for each in (plant.command_limit, plant.controller.voltage_limit) if each is not None]
+        most = min([own.voltage * known.input_bias[1], *limits])
+        changed["input_bias"] = (-most, most)
     return replace(settings, uncertainty=known.replace(**changed)) if changed else settings

@@ -66,14 +66,14 @@ def open_machine(page, name):
 
 
 def looks(page):
-    """Show a page at three widths, the usual ones in both themes, which do not move anything; say which, and its width.
+    """Show a page at three widths in both themes, which do not move anything; say which, and its width.
     In the end it is what it was."""
     before = page.viewport_size
     for name, width, height in (("desk", 1280, 900), ("phone", 360, 740), ("wall", 3840, 2160)):
         page.set_viewport_size({"width": width, "height": height})
         page.evaluate("scrollTo(0, 0)")
         page.wait_for_timeout(250)  # plots follow the width
-        for theme in ("dark", "light") if name != "wall" else ("light",):
+        for theme in ("dark", "light"):
             page.emulate_media(color_scheme=theme)
             yield f"{theme}-{name}", width
     page.set_viewport_size(before)

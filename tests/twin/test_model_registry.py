@@ -11,9 +11,10 @@ from servotwin.control.gains import gains_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
+from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
-from servotwin.twin.model_registry import ModelRegistry, ServoModel
+from servotwin.twin.model_registry import ModelRegistry, ServoModel, models_of
 from servotwin.twin.settings import TwinSettings
 
 TEXT = """
@@ -79,6 +80,27 @@ def test_where_nothing_is_verified_nothing_is_known_of_the_start():
     few = Demands(machines=40, screened=2, conditions=4, scales=(0.5,), beyond=Beyond(machines=4), settled=0.9)
     settings = TwinSettings(uncertainty=wide, demands=few)
     assert ServoModel("axis", Servo.preset("paper"), settings).first_setting is None
+
+
+def of_axis(name: str, ranges: str = "") -> ServoModel:
+    text = f'[models.axis]\nservo = "{name}"\n[models.axis.twin]\n[models.axis.twin.uncertainty]\n{ranges}'
+    (model,) = models_of(parse_toml(text, "twin.toml"), Path(), checked=False)
+    return model
+
+
+@pytest.mark.parametrize("name", [name for name in AXES if Axis.preset(name).controller.voltage_limit is not None])
+def test_a_bias_that_no_file_states_is_small_beside_the_command(name):
+    model = of_axis(name)
+    low, high = model.settings.uncertainty.input_bias
+    assert low == -high
+    assert 0.0 < high <= 0.01 * model.servo.controller.voltage_limit
+
+
+@pytest.mark.slow
+def test_an_axis_has_a_fallback_set_where_its_file_states_gaps_and_steps_only():
+    model = of_axis("ball-screw", "gap_deg = [0.0, 5.4]\nstep_mm = [0.15, 1.0]")
+    few = Demands(machines=300, screened=2, beyond=Beyond(machines=4))
+    assert ServoModel("axis", model.servo, model.settings.replace(demands=few)).first_setting is not None
 
 
 def test_a_servos_file_lies_beside_the_fleets(tmp_path):

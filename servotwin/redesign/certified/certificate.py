@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
-from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant
-from servotwin.redesign.certified.uncertainty import LARGEST_DELAY
+from servotwin.redesign.certified.uncertainty import LARGEST_DELAY, in_words
 from servotwin.redesign.design import Design
 
 
@@ -348,14 +347,9 @@ class Certificate:
 
     def tried(self, servo: Plant) -> str:
         """Sentence on what was tried, with ranges in the units of the servo or axis that was verified."""
-        unit, command = position_unit(servo), command_unit(servo)
         law = "in continuous time" if self.rate is None else f"at {self.rate:g} Hz, up to {self.delay} samples late"
-        low, high = (math.degrees(end) for end in self.gap)
         text = (
-            f"verified on {self.members} simulated machines {law}: steps of {unit.factor * self.step[0]:.3g} to "
-            f"{unit.factor * self.step[1]:.3g} {unit.name} from rest, gaps of {low:.4g} to {high:.4g} deg, "
-            f"input bias of {self.input_bias[0]:.3g} to {self.input_bias[1]:.3g} {command}, "
-            f"friction of {self.friction[0]:.3g} to {self.friction[1]:.3g} N m; "
+            f"verified on {self.members} simulated machines {law}: {in_words(self, servo)}; "
             f"{100.0 * self.settled_least:.4g} % settle at least, with {100.0 * self.confidence:g} % confidence"
         )
         if self.loop is not None:

@@ -27,7 +27,7 @@ from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import Uncertainty, in_words
 from servotwin.redesign.design import decoded_part
 from servotwin.runtime.files import atomic_output
 from servotwin.runtime.user_cache import cache_folder, source_digest
@@ -71,7 +71,8 @@ def fallback_certificate(servo: Plant, uncertainty: Uncertainty, demands: Demand
     def verify() -> Certificate:
         result = certify(servo, uncertainty, demands, trial)
         if isinstance(result, NotVerified):
-            raise InvalidInput(f"no fallback set for the servo's stated range: {result.reason}")
+            known = f"stated in [twin.uncertainty] or by default are {in_words(uncertainty, servo)}"
+            raise InvalidInput(f"no fallback set for the servo's stated range: {result.reason}; {known}")
         return result
 
     values = {"servo": servo, "uncertainty": uncertainty, "demands": demands, "trial": replace(trial, threads=None)}

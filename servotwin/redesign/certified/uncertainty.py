@@ -6,7 +6,7 @@ import itertools
 import math
 from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from servotwin.config.keys import check, key, settings
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.basis import BacklashKind
+from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import check_gap
@@ -71,6 +72,30 @@ class LearntFactors:
         values, vectors = np.linalg.eigh(np.array(self.covariance))
         normal = np.clip(ndtri(np.clip(places, 1e-12, 1.0 - 1e-12)), -_TAILS, _TAILS)
         return np.asarray(np.exp(np.array(self.mean) + normal * np.sqrt(np.maximum(values, 0.0)) @ vectors.T))
+
+
+class StatedRanges(Protocol):
+    """Ranges of a machine's conditions: gap (rad), input bias (command), step (m or rad) and friction (N m)."""
+
+    @property
+    def gap(self) -> Range: ...
+    @property
+    def input_bias(self) -> Range: ...
+    @property
+    def step(self) -> Range: ...
+    @property
+    def friction(self) -> Range: ...
+
+
+def in_words(ranges: StatedRanges, plant: Plant) -> str:
+    """Say the ranges in the units of a plant."""
+    unit, command = position_unit(plant), command_unit(plant)
+    low, high = (math.degrees(end) for end in ranges.gap)
+    return (
+        f"steps of {unit.factor * ranges.step[0]:.3g} to {unit.factor * ranges.step[1]:.3g} {unit.name} from rest, "
+        f"gaps of {low:.4g} to {high:.4g} deg, input bias of {ranges.input_bias[0]:.3g} to "
+        f"{ranges.input_bias[1]:.3g} {command}, friction of {ranges.friction[0]:.3g} to {ranges.friction[1]:.3g} N m"
+    )
 
 
 @settings("uncertainty")
