@@ -75,8 +75,13 @@ class Grid:
         biases: tuple[float, ...] | None = None,
         noises: tuple[float, ...] | None = None,
     ) -> Grid:
-        """Make a grid; biases that are left out are in the servo's own volts, noises a part of the smallest step."""
-        usual, volt = cls(), scales(policy.servo).voltage
+        """Make a grid; noises that are left out are a part of the smallest step.
+
+        Biases that are left out are in the servo's own volts, the largest at most half of the stated one.
+        """
+        usual, volt, known = cls(), scales(policy.servo).voltage, max(map(abs, policy.uncertainty.input_bias))
+        if known > 0.0:
+            volt = min(volt, 0.5 * known / usual.biases[-1])
         return cls(
             usual.finest if finest is None else finest,
             tuple(volt * bias for bias in usual.biases) if biases is None else biases,
