@@ -144,7 +144,8 @@ class Uncertainty:
         Range,
         key(
             *INPUT_BIAS_KEYS,
-            help="Range of the command that is added behind the controller.",
+            help="Range of the command that is added behind the controller; where a twin's file leaves it out, up to "
+            "0.1 V either way, and of an axis as much in its own units, at most 1 % of its command's limit.",
         ),
     ] = (0.0, 0.0)
     friction: Annotated[
