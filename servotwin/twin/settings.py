@@ -28,7 +28,7 @@ from servotwin.redesign.registry import POLICIES
 _LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
 
 
-_BIAS = 0.01
+_LARGEST_BIAS = 0.01
 """Of the limit of a command: larger offsets of a drive, which no file states, are not assumed."""
 
 
@@ -289,7 +289,9 @@ def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None 
     if not {"step_mm", "step_deg"} & given.keys():
         changed["step"] = (own.length * known.step[0], own.length * known.step[1])
     if not set(INPUT_BIAS_KEYS) & given.keys():
-        limits = [_BIAS * each for each in (plant.command_limit, plant.controller.voltage_limit) if each is not None]
+        limits = [
+            _LARGEST_BIAS * each for each in (plant.command_limit, plant.controller.voltage_limit) if each is not None
+        ]
         most = min([own.voltage * known.input_bias[1], *limits])
         changed["input_bias"] = (-most, most)
     return replace(settings, uncertainty=known.replace(**changed)) if changed else settings

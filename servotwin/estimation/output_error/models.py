@@ -17,8 +17,11 @@ from servotwin.plant.backlash import play_samples
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
-_FASTEST = 0.4  # largest rate of the flow times a part of a sample: a flank touched and left within a part is not seen
+# Largest rate of the flow times a part of a sample: a flank touched and left within a part is not seen; and for the
+# Taylor series to converge.
+_FINE, _CONVERGES = 0.4, 1.2
 _PARTS = 3  # of a sample with friction, whose sign changes between parts only
+_OWN = (1.0,) * 6  # factors of the model's own numbers
 _EXPONENTIAL = 20  # terms of the series, for a norm below one
 
 
@@ -246,6 +249,29 @@ class ShaftModel:
 def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, Array, Array, float, int]:
     """Flows and steps (2, size, size) in the gap and in contact, the force's row, the rate at which the stretch fades,
     parts of a sample that are needed."""
+    flows, push, fading = _flows(axis, factors)
+    kept = len(push) - 3
+    parts = max(_least_parts(axis, interval), math.ceil(_fastest(flows) * interval / _CONVERGES))
+    steps = np.array([exponential(flow * interval / parts) for flow in flows])
+    left = math.exp(-fading * interval / parts)
+    steps[0, kept] = steps[0, 0]
+    steps[0, kept, [0, kept]] += -left, left
+    return flows, steps, push, fading, parts
+
+
+@lru_cache(maxsize=64)
+def _least_parts(axis: Axis, interval: float) -> int:
+    """Parts of a sample at the model's own numbers: with more of them elsewhere a fit would not be smooth."""
+    flows, _, _ = _flows(axis, _OWN)
+    return max(_PARTS if axis.load.friction > 0.0 else 1, math.ceil(_fastest(flows) * interval / _FINE))
+
+
+def _fastest(flows: Array) -> float:
+    return max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
+
+
+def _flows(axis: Axis, factors: tuple[float, ...]) -> tuple[Array, Array, float]:
+    """Flows (2, size, size) in the gap and in contact, the force's row, the rate at which the stretch fades."""
     k_d, c_d, c, k, ratio, force = factors
     load, shaft, n = axis.load, axis.transmission, axis.n
     masses = load.masses.copy()
@@ -260,14 +286,7 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
     flows[0, kept, n] = 1.0
     push[:kept], push[kept : kept + 2] = links.reaction, (k_d, c_d)
     flows[:, kept - 1, kept + 2] = force * load.force / masses[-1]
-    fastest = max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
-    parts = max(_PARTS if load.friction > 0.0 else 1, math.ceil(fastest * interval / _FASTEST))
-    steps = np.array([exponential(flow * interval / parts) for flow in flows])
-    fading = k_d / c_d if c_d > 0.0 else 0.0
-    left = math.exp(-fading * interval / parts)
-    steps[0, kept] = steps[0, 0]
-    steps[0, kept, [0, kept]] += -left, left
-    return flows, steps, push, fading, parts
+    return flows, push, k_d / c_d if c_d > 0.0 else 0.0
 
 
 def exponential(matrix: Array) -> Array:

@@ -151,14 +151,44 @@ def slowed(speed: float, friction: float) -> float:
     return speed - min(max(speed, -friction), friction)
 
 
-@inlined
-def slow_down(state: Array, place: float, speed: float, friction: float) -> None:
-    """Apply friction after a step that the last mass began at a place with a speed: it rests on where it is held."""
-    n = (state.size - 3) // 2
-    if speed == 0.0 and abs(state[2 * n - 1]) <= 2.0 * friction:
-        state[n - 1], state[2 * n - 1] = place, 0.0
-    else:
-        state[2 * n - 1] = slowed(state[2 * n - 1], friction)
+@subroutine
+def through_changes(
+    side: int,
+    begin: float,
+    end: float,
+    interval: float,
+    half: float,
+    flows: Array,
+    push: Array,
+    fading: float,
+    work: Array,
+    state: Array,
+) -> int:
+    """Advance the state by one interval in which flanks are touched or left; return the flank at its end.
+
+    The state at the end is in `work[_TERMS]`, where that of a step without changes was. The other arguments are those
+    of `through_sample`.
+    """
+    kept, rate = state.size - 3, (end - begin) / interval
+    terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
+    now, left = begin, interval
+    for change in range(_CHANGES):
+        series(flows[1 if side != 0 else 0], state, terms)
+        stretch = state[kept] - state[0] if side == 0 else 0.0
+        if change > 0:
+            later(terms, left, after)
+            after[kept] += faded(stretch, fading, left)
+            if guard(side, end, after, push, half) >= 0.0 or change == _CHANGES - 1:
+                break
+        ahead = 1 if end > after[kept] else -1
+        guard_series(side, ahead, now, rate, terms, push, half, polynomial)
+        time = first_fall(polynomial, ahead * stretch, fading, left)
+        later(terms, time, state)
+        now += rate * time
+        left -= time
+        side = ahead if side == 0 else 0
+        drive_to(state, side, now, rate, half, kept)
+    return side
 
 
 @inlined
@@ -188,41 +218,14 @@ def through_sample(
     return side
 
 
-@subroutine
-def through_changes(
-    side: int,
-    begin: float,
-    end: float,
-    interval: float,
-    half: float,
-    flows: Array,
-    push: Array,
-    fading: float,
-    work: Array,
-    state: Array,
-) -> int:
-    """Advance as `through_sample` where flanks are touched or left, from the first instant on; state at the end in
-    `work[_TERMS]`."""
-    kept, rate = state.size - 3, (end - begin) / interval
-    terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
-    now, left = begin, interval
-    for change in range(_CHANGES):
-        series(flows[1 if side != 0 else 0], state, terms)
-        stretch = state[kept] - state[0] if side == 0 else 0.0
-        if change > 0:
-            later(terms, left, after)
-            after[kept] += faded(stretch, fading, left)
-            if guard(side, end, after, push, half) >= 0.0 or change == _CHANGES - 1:
-                break
-        ahead = 1 if end > after[kept] else -1
-        guard_series(side, ahead, now, rate, terms, push, half, polynomial)
-        time = first_fall(polynomial, ahead * stretch, fading, left)
-        later(terms, time, state)
-        now += rate * time
-        left -= time
-        side = ahead if side == 0 else 0
-        drive_to(state, side, now, rate, half, kept)
-    return side
+@inlined
+def slow_down(state: Array, place: float, speed: float, friction: float) -> None:
+    """Apply friction after a step that the last mass began at a place with a speed: it rests on where it is held."""
+    n = (state.size - 3) // 2
+    if speed == 0.0 and abs(state[2 * n - 1]) <= 2.0 * friction:
+        state[n - 1], state[2 * n - 1] = place, 0.0
+    else:
+        state[2 * n - 1] = slowed(state[2 * n - 1], friction)
 
 
 @bare

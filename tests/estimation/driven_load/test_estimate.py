@@ -102,7 +102,8 @@ def test_the_longest_part_without_a_pause_counts(made, found):
         *(np.concatenate([getattr(each, name)[part] for each, part in parts]) for name in ("time", "motor", "load"))
     )
     answer = gap_of_driven_load(joined, UNKNOWN)
-    assert answer.gap.gap_motor == pytest.approx(found.gap.gap_motor, rel=1e-3)
+    # Times that are rounded otherwise lead the search on another way: by a hundredth of its standard deviation.
+    assert answer.gap.gap_motor == pytest.approx(found.gap.gap_motor, abs=0.02 * found.gap.std_motor)
 
 
 def test_the_table_of_models_says_why_the_dynamics_were_taken_or_not(found, made):
