@@ -159,7 +159,7 @@ def certify(
         str | None,
         typer.Option(
             help="Largest input bias that the feedforward leaves: VALUE,VALUE,...; by default 1,10,50 in the servo's "
-            "own volts.",
+            "own volts, or less: the largest is at most half of the stated bias.",
             show_default=False,
         ),
     ] = None,

@@ -12,6 +12,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.messages import Setting
 from servotwin.plant.axis import AXES, Axis
+from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.twin.model_registry import ModelRegistry, ServoModel, models_of
@@ -93,7 +94,7 @@ def test_a_bias_that_no_file_states_is_small_beside_the_command(name):
     model = of_axis(name)
     low, high = model.settings.uncertainty.input_bias
     assert low == -high
-    assert 0.0 < high <= 0.01 * model.servo.controller.voltage_limit
+    assert high == min(0.1 * scales(model.servo).voltage, 0.01 * model.servo.controller.voltage_limit)
 
 
 @pytest.mark.slow
