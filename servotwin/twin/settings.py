@@ -26,10 +26,7 @@ from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.registry import POLICIES
 
 _LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
-
-
-_LARGEST_BIAS = 0.01
-"""Of the limit of a command: larger offsets of a drive, which no file states, are not assumed."""
+_LARGEST_BIAS = 0.01  # of a command's limit: no larger offset of a drive is assumed where its file states none
 
 
 @settings("triage")
