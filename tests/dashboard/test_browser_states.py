@@ -101,14 +101,23 @@ def test_a_malformed_event_keeps_the_last_good_data(open_page):
 def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):
     page = open_page(expected=("ERR_", "Failed to load"))
     page.evaluate("window.kept = 1")
-    twin.kill()
-    has_text(page, "#state", "cannot be reached")
-    has_text(page, "#state", "What is shown is of")
-    assert page.locator(".rows .row").count() > 10
-    twin.restart()
+    with twin.away():
+        has_text(page, "#state", "cannot be reached")
+        has_text(page, "#state", "What is shown is of")
+        assert page.locator(".rows .row").count() > 10
     page.wait_for_selector("[data-live=live]", state="attached")
     assert page.evaluate("window.kept") == 1
     page.locator(".table:not(.stale)").wait_for()
+
+
+def test_a_twin_that_goes_before_the_shared_stream_is_loaded_is_said_at_once(open_page):
+    page = open_page(expected=("status of 404",))
+    page.add_init_script(
+        "const W = SharedWorker; globalThis.SharedWorker = function () { return new W('/nothing.js'); };"
+    )
+    page.reload()
+    has_text(page, "#state", "The twin cannot be reached. What is shown is of")
+    assert page.locator(".rows .row").count() > 10
 
 
 def test_an_answer_of_the_live_view_that_cannot_be_read_is_said_and_forgotten(open_page):
@@ -160,9 +169,8 @@ def test_nothing_moves_while_alarms_and_updates_come_and_the_twin_goes(open_page
             has_text(page, "[aria-label=Events] td", f"the alarm at {place}")
     finally:
         store.close()
-    twin.kill()
-    has_text(page, "#state", "What is shown is of")
-    twin.restart()
+    with twin.away():
+        has_text(page, "#state", "What is shown is of")
     page.wait_for_selector("[data-live=live]", state="attached")
 
 
@@ -181,10 +189,9 @@ def test_states_are_photographed_and_accessible(open_page, twin):
     photographed(page, "unknown")
     open_machine(page, WEARING)
     page.wait_for_selector(".hysteresis svg")
-    twin.kill()
-    has_text(page, "#state", "What is shown is of")
-    photographed(page, "twin-away")
-    twin.restart()
+    with twin.away():
+        has_text(page, "#state", "What is shown is of")
+        photographed(page, "twin-away")
     page.wait_for_selector("[data-live=live]", state="attached")
     page.context.clear_cookies()
     page.select_option("[aria-label=Window] select", index=1)

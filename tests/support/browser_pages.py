@@ -1,8 +1,10 @@
 """A twin's service for the browser's tests, and what they look for on its pages."""
 
+import contextlib
 import os
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import httpx
@@ -32,8 +34,14 @@ class Twin:
         os.killpg(self._process.pid, signal.SIGKILL)
         self._entered.__exit__(None, None, None)
 
-    def restart(self) -> None:
-        self.start(self.url.rpartition(":")[2])
+    @contextlib.contextmanager
+    def away(self) -> Iterator[None]:
+        """Killed within the block, and there again after it, also where the block fails."""
+        self.kill()
+        try:
+            yield
+        finally:
+            self.start(self.url.rpartition(":")[2])
 
 
 WATCH_SHIFTS = """new PerformanceObserver((list) => {

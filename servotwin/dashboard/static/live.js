@@ -76,6 +76,7 @@ export class Live {
     source.addEventListener("trouble", (event) => this.set("trouble", read(event) || "The twin reports trouble."));
     source.addEventListener("ended", () => this.end("The session has ended, or its token was revoked."));
     source.addEventListener("error", () => this.lost());
+    source.addEventListener("unloaded", () => this.retry("The twin cannot be reached."));
   }
 
   // A twin that hangs, and a network that is gone, end no connection.
@@ -155,7 +156,10 @@ class SharedSource extends EventTarget {
   constructor(position) {
     super();
     this.readyState = EventSource.CONNECTING;
-    this.port = new SharedWorker("/static/stream_worker.js").port;
+    const worker = new SharedWorker("/static/stream_worker.js");
+    // Of a worker that could not be loaded nothing else is heard.
+    worker.onerror = () => this.port.onmessage && this.dispatchEvent(new Event("unloaded"));
+    this.port = worker.port;
     this.port.onmessage = ({ data: { type, data, lastEventId, readyState } }) => {
       this.readyState = readyState;
       this.dispatchEvent(Object.assign(new Event(type), { data, lastEventId }));
