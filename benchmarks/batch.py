@@ -113,10 +113,11 @@ def _end_last_line(path: Path) -> None:
 
 
 def _batches() -> dict[str, Batch]:
-    from benchmarks import axis_presets, logs
+    from benchmarks import axis_certificates, axis_presets, logs
     from benchmarks.policies import loops
 
-    return {loops.NAME: loops.BATCH, logs.NAME: logs.BATCH, **axis_presets.BATCHES}
+    single = {each.NAME: each.BATCH for each in (loops, logs, axis_certificates)}
+    return single | axis_presets.BATCHES
 
 
 def main(arguments: Sequence[str]) -> None:
