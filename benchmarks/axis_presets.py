@@ -3,8 +3,8 @@
 The gap grows in levels, between windows where they leave room: a machine that wears in years has one gap in a window.
 
 ``python -m benchmarks.batch axes --seed 5 --count 45 FILE`` measures the twin's estimates while the preset's own
-controller runs; ``axes-certified`` instead of ``axes`` lets the twin send verified settings to machines worn
-by any amount. The blocks are the presets, and `two-mass-cascade`, the two-mass drive with a cascade.
+controller runs; ``axes-growing`` instead of ``axes`` lets the twin send verified settings while the gap grows, and
+``axes-certified`` to machines worn by any amount. The blocks are the presets.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.batch import Batch
-from benchmarks.preset_machines import MACHINES, PresetMachine, certified_machines, duty_of, preset_machines
+from benchmarks.preset_machines import DUTIES, PresetMachine, certified_machines, growing_machines, preset_machines
 from servotwin.cosim import Cosimulation, Loop, SimulatedMachine
 from servotwin.cosim.machine import simulation_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.simulation import Run
 
-NAME, CERTIFIED = "axes", "axes-certified"
+NAME, GROWING, CERTIFIED = "axes", "axes-growing", "axes-certified"
 # A step has settled where the error's half peak-to-peak over the last third of its time is below this share of it, and
 # two counts of the sensor.
 _STILL, _COUNTS = 0.01, 2.0
@@ -104,7 +104,7 @@ def steps_of(machine: PresetMachine, run: Run) -> dict[str, list[float]]:
     still = _STILL * sizes + _COUNTS * machine.model.position_resolution
     return {
         "settled": (0.5 * np.ptp(last, axis=1) <= still).astype(float).tolist(),
-        "cost": (np.abs(error).mean(axis=1) * duty_of(machine.name).half_period / sizes).tolist(),
+        "cost": (np.abs(error).mean(axis=1) * DUTIES[machine.name].half_period / sizes).tolist(),
         "tail": (np.abs(last).max(axis=1) / sizes).tolist(),
     }
 
@@ -128,7 +128,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     ):
         result.add_column(heading, justify="right")
     notes = []
-    for name in MACHINES:
+    for name in DUTIES:
         machines = [numbers for key, numbers in found.items() if key.split("/")[1] == name]
         refused = sorted({each["refused"] for each in machines if "refused" in each})
         ran = [each for each in machines if "twin" in each]
@@ -188,7 +188,8 @@ def _doubts(ran: Sequence[Mapping[str, Any]]) -> Counter[str]:
 
 
 BATCHES = {
-    NAME: Batch(partial(_units, preset_machines), measured, _show, MACHINES),
-    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, MACHINES),
+    NAME: Batch(partial(_units, preset_machines), measured, _show, tuple(DUTIES)),
+    GROWING: Batch(partial(_units, growing_machines), measured, _show, tuple(DUTIES)),
+    CERTIFIED: Batch(partial(_units, certified_machines), measured, _show, tuple(DUTIES)),
 }
 """For `benchmarks.batch`."""

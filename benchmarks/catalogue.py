@@ -99,7 +99,7 @@ def two_masses(options: Options) -> Workload:
     duration = options.wear.duration
     return Workload(
         "two-mass",
-        f"preset two-mass-drive, {duration:g} s, gap 0 to 0.02 rad, 5 kHz",
+        f"two-mass drive that knocks, {duration:g} s, gap 0 to 0.02 rad, 5 kHz",
         (ours.two_masses(duration),),
         (Check("error", "/ 1 mrad", lambda q: _largest(q - ours.refined_two_masses(duration))),),
         lambda seconds: f"{duration / seconds:,.0f} x real time",

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.contest import Contestant
-from benchmarks.workloads import NoisyWorkload, SweepWorkload, WearWorkload
+from benchmarks.workloads import NoisyWorkload, SweepWorkload, WearWorkload, knocking_drive
 from servotwin.control.controller import Controller
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.axis import Axis
@@ -101,8 +101,8 @@ def sweeping(workload: SweepWorkload, threads: int) -> Contestant:
 
 @cache
 def _two_mass_drive() -> Axis:
-    """The preset two-mass-drive under its own law in continuous time, read once as the other presets."""
-    return Axis.preset("two-mass-drive").replace(sample_rate=None)
+    """The knocking drive in continuous time, read once as the presets."""
+    return knocking_drive().replace(sample_rate=None)
 
 
 def _two_masses(duration: float) -> Simulation:

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.commissioning.edge_settings import Recording
-from servotwin.control.cascade import Cascade
 from servotwin.cosim.scenario import Scenario
 from servotwin.edge.probe import ProbeLimits
 from servotwin.plant.axis import AXES, Axis
@@ -58,20 +57,6 @@ class Duty(NamedTuple):
     moves: tuple[float, float] = (0.6, 0.9)
 
 
-CASCADED = "two-mass-cascade"
-_CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, integral_time=0.5, voltage_limit=60.0, sample_rate=2000.0)
-
-
-def machine_of(name: str) -> Axis:
-    """A preset, or the two-mass drive with a cascade in place of its filtered PID."""
-    axis = Axis.preset(_preset(name))
-    return axis.replace(controller=_CASCADE) if name == CASCADED else axis
-
-
-def _preset(name: str) -> str:
-    return "two-mass-drive" if name == CASCADED else name
-
-
 _ARC_SECOND = math.radians(1.0 / 3600.0)
 DUTIES: Mapping[str, Duty] = {
     "two-mass-drive": Duty(2e-3, 10.0),
@@ -79,16 +64,16 @@ DUTIES: Mapping[str, Duty] = {
     "robot-joint": Duty(math.radians(0.05), 4.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
     "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3, lead=6e-3, probe=2e-4, moves=(0.86, 0.98)),
-    "micro-positioner": Duty(200e-9, 3.0, 0.95, 1.5, 3),
+    "micro-positioner": Duty(200e-9, 3.0, 1.05, 1.6, 3),
     "gantry": Duty(5e-5, 5.0),
     "emps": Duty(1e-5, 1.0),
 }
-MACHINES = (*DUTIES, CASCADED)
 
 
-def duty_of(name: str) -> Duty:
-    """Duty of a machine; with the cascade that of its preset."""
-    return DUTIES[_preset(name)]
+def stated_ranges(name: str) -> Uncertainty:
+    """What a machine's file states: gaps up to one and a half times the largest, and steps as they come."""
+    gap, (least, most) = DUTIES[name].gap, _AMPLITUDES
+    return Uncertainty(gap=(0.0, 1.5 * WORN * gap / Axis.preset(name).p), step=(least * gap, 2.0 * most * gap))
 
 
 # Model's errors, relative; amplitudes of the reference in healthy gaps.
@@ -125,22 +110,22 @@ class PresetMachine:
 
     def __post_init__(self) -> None:
         if not self.steps:
-            object.__setattr__(self, "steps", LEVELS * duty_of(self.name).hold)
+            object.__setattr__(self, "steps", LEVELS * DUTIES[self.name].hold)
 
     @property
     def model(self) -> Axis:
         """The preset."""
-        return machine_of(self.name)
+        return Axis.preset(self.name)
 
     @property
     def duration(self) -> float:
         """Length of the run, s."""
-        return self.steps * duty_of(self.name).half_period
+        return self.steps * DUTIES[self.name].half_period
 
     @property
     def gap(self) -> PiecewiseCubic:
         """Total gap, rad at the motor, level after level."""
-        duty, healthy = duty_of(self.name), duty_of(self.name).gap / self.model.p
+        duty, healthy = DUTIES[self.name], DUTIES[self.name].gap / self.model.p
         count = -(-self.steps // duty.hold)
         levels = healthy * np.linspace(*self.worn, count)
         times, pieces = [0.0], [[levels[0], 0.0, 0.0, 0.0]]
@@ -155,7 +140,7 @@ class PresetMachine:
     @property
     def reference(self) -> SquareWave:
         """To and fro."""
-        return SquareWave(self.amplitude, 2.0 * duty_of(self.name).half_period)
+        return SquareWave(self.amplitude, 2.0 * DUTIES[self.name].half_period)
 
     @property
     def count(self) -> float:
@@ -178,9 +163,7 @@ class PresetMachine:
         InvalidInput
             A twin cannot be had.
         """
-        model, duty = self.model, duty_of(self.name)
-        most = _AMPLITUDES[1] * duty.gap
-        ranges = Uncertainty(gap=(0.0, 1.5 * WORN * duty.gap / model.p), step=(_AMPLITUDES[0] * duty.gap, 2.0 * most))
+        model, duty, ranges = self.model, DUTIES[self.name], stated_ranges(self.name)
         rate, probe = self.rate, duty.probe
         excitation = ExcitationSettings(probe=probe) if probe else None
         own = TwinSettings(policy="paper", k_dz=0.0, excitation=excitation)
@@ -217,13 +200,18 @@ def _whole(seconds: float, rate: float) -> float:
 
 def preset_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset whose gap grows."""
-    random, model = np.random.default_rng([seed, AXES.index(_preset(name))]), machine_of(name)
+    random, model = np.random.default_rng([seed, AXES.index(name)]), Axis.preset(name)
     return [_drawn(name, model, random) for _ in range(count)]
+
+
+def growing_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
+    """Draw machines of a preset whose gap grows, to which the twin sends verified settings."""
+    return [replace(machine, certified=True) for machine in preset_machines(name, count, seed)]
 
 
 def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
     """Draw machines of a preset with any gap up to the largest, to which the twin sends verified settings."""
-    random = np.random.default_rng([seed, AXES.index(_preset(name)), 1])
+    random = np.random.default_rng([seed, AXES.index(name), 1])
     worn = [float(random.uniform(0.0, WORN)) for _ in range(count)]
     return [
         replace(machine, worn=(gap, gap), steps=CERTIFIED_STEPS, certified=True)
@@ -234,7 +222,7 @@ def certified_machines(name: str, count: int, seed: int) -> list[PresetMachine]:
 def _drawn(name: str, model: Axis, random: np.random.Generator) -> PresetMachine:
     errors, duty = (
         {each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()},
-        duty_of(name),
+        DUTIES[name],
     )
     amplitude = duty.gap * math.exp(random.uniform(*np.log(_AMPLITUDES)))
     if duty.lead:

@@ -10,6 +10,7 @@ import numpy as np
 
 from servotwin.control import Controller
 from servotwin.hybrid.automaton import Array
+from servotwin.plant.axis import Axis
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
@@ -23,6 +24,14 @@ def the_servo(preset: str = PRESET, calm: bool = False) -> Servo:
     """A preset, read once; `calm` without integral action, so that it comes to rest in its gap."""
     servo = Servo.preset(preset)
     return servo.replace(controller=servo.controller.replace(Ki=0.0)) if calm else servo
+
+
+@cache
+def knocking_drive() -> Axis:
+    """The preset two-mass-drive under a filtered PID on its load in place of its cascade: its motor knocks in the gap
+    at all times, which makes many events."""
+    law = Controller(Kp=60.0, Ki=40.0, Kd=20.0, Tf=0.02, voltage_limit=60.0, sample_rate=2000.0)
+    return Axis.preset("two-mass-drive").replace(controller=law)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import servotwin as st
+from benchmarks.workloads import knocking_drive
 from servotwin.analysis.limit_cycles.cycle import CycleStatus
 from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predictions
 from servotwin.errors import InvalidInput
@@ -17,7 +18,7 @@ VELOCITY = st.Axis(
     st.Load((5.2,) * 3, (1e4,) * 3, (36.9,) * 3),
     st.Controller(Kp=1000.0, Ki=4000.0, Kd=0.0, Tf=0.1),
 )
-TWO_MASS = st.Axis.preset("two-mass-drive").replace(sample_rate=None, voltage_limit=None)
+TWO_MASS = knocking_drive().replace(sample_rate=None, voltage_limit=None)
 
 
 @pytest.mark.parametrize(("axis", "gap"), [(VELOCITY, 0.2), (TWO_MASS, 0.02)], ids=["velocity", "two masses"])

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from benchmarks.axis_presets import judged, measured
-from benchmarks.preset_machines import DUTIES, certified_machines, preset_machines
-from servotwin.control.cascade import Cascade
+from benchmarks.preset_machines import DUTIES, certified_machines, growing_machines, preset_machines
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.axis import AXES
 
@@ -25,20 +24,13 @@ def test_every_preset_has_a_duty_and_machines_near_it() -> None:
         assert machines[0].gap.value(machines[0].duration) == pytest.approx(
             10.0 * DUTIES[name].gap / machines[0].model.p
         )
+        assert growing_machines(name, 3, 5) == [replace(each, certified=True) for each in machines]
         worn = certified_machines(name, 3, 5)
         assert [each.plant for each in worn] == [each.plant for each in machines]
         # A stepper goes where it is told, and its load follows: of the numbers that are off only its lead shows.
         assert (machines[0].plant.p == machines[0].model.p) == (name != "stepper-stage")
         assert machines[0].plant != machines[0].model
         assert all(each.certified and 0.0 < each.worn[0] == each.worn[1] < 10.0 for each in worn)
-
-
-def test_the_drive_with_a_cascade_is_the_same_machine() -> None:
-    cascaded, (plain,) = certified_machines("two-mass-cascade", 1, 5)[0], certified_machines("two-mass-drive", 1, 5)
-    assert (cascaded.amplitude, cascaded.worn, cascaded.duration) == (plain.amplitude, plain.worn, plain.duration)
-    assert cascaded.plant.load == plain.plant.load
-    assert isinstance(cascaded.model.controller, Cascade)
-    cascaded.scenario().model.check_loop()
 
 
 @pytest.mark.parametrize("name", DUTIES)

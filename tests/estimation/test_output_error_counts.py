@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ from scipy.signal import lfilter
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
-from servotwin.estimation.output_error.estimator import _problem
+from servotwin.estimation.output_error.estimator import _problem, fit
 from servotwin.estimation.output_error.fit import search
 from servotwin.estimation.output_error.models import lagged
 from servotwin.estimation.output_error.motor_angle import without_noise
@@ -20,7 +21,8 @@ from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
-from servotwin.plant.signals import Array
+from servotwin.plant.signals import Array, SquareWave
+from servotwin.simulation import simulate
 
 
 @pytest.mark.parametrize("far", [55.2e-6, 70e-6])
@@ -226,3 +228,25 @@ def test_a_gap_that_jumps_within_a_window_of_large_moves_is_a_mismatch() -> None
     estimate = estimate_gap(Window(*seen, sample_rate=1000.0), axis)
     assert estimate.status is GapStatus.MODEL_MISMATCH
     assert "of half the gap unexplained" in " ".join(estimate.reasons)
+
+
+@pytest.mark.parametrize(("stiffer", "fraction", "refused"), [(0.99, 1.0, False), (0.6, 0.001, True)])
+def test_a_shaft_that_looks_soft_within_few_counts_is_no_mismatch(
+    stiffer: float, fraction: float, refused: bool
+) -> None:
+    """A gap of a few counts of the motor's encoder; the same machine is refused where fine counts show a soft shaft."""
+    axis, gap = Axis.preset("two-mass-drive"), 0.0182
+    sensors = replace(axis.sensors, encoder_resolution=fraction * axis.encoder_resolution)
+    axis = axis.replace(sensors=sensors)
+    run = simulate(axis.scaled({"k": stiffer}), 15.0, reference=SquareWave(0.069, 20.0), gap=gap, sample_rate=2000.0)
+    window = Window.from_run(run, 9.5, 5.0)
+    found = fit(window, axis, None, OutputErrorSettings())
+    stiffness = next(place for place, each in enumerate(found.problem.model.unknowns) if each.name == "shaft stiffness")
+    assert found.best.values[stiffness] < -0.2
+    estimate = estimate_gap(window, axis)
+    if refused:
+        assert estimate.status is GapStatus.MODEL_MISMATCH
+        assert estimate.reasons == ("the shaft stiffness would be off by -27 %",)
+    else:
+        assert estimate.ok
+        assert estimate.interval[0] <= gap <= estimate.interval[1]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import servotwin as st
+from benchmarks.workloads import knocking_drive
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import disturbance
 from servotwin.plant.axis import Axis
@@ -89,7 +90,7 @@ def test_a_version_does_not_depend_on_how_a_number_is_typed() -> None:
 def test_any_ratio_reads_back_as_it_was_written() -> None:
     rng = np.random.default_rng(3)
     for p in rng.uniform(0.8, 1.2, 40).tolist():
-        axis = TWO_MASS.replace(transmission=st.Transmission(p, 3300.0, 2.0, "free"))
+        axis = knocking_drive().replace(transmission=st.Transmission(p, 3300.0, 2.0, "free"))
         assert Axis.loads(axis.dumps(), "again.toml").version == axis.version
 
 

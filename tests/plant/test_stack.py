@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 
+from benchmarks.workloads import knocking_drive
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import AutomatonStack
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_loop, sampled_plant
@@ -63,7 +64,8 @@ def test_a_stack_is_its_automata(k_d, friction, dead_zone, limit, filtered) -> N
 @pytest.mark.parametrize(("name", "friction"), [("two-mass-drive", False), ("robot-joint", True), ("ball-screw", True)])
 def test_a_stack_of_axes_is_their_automata(name: str, friction: bool) -> None:
     """Shafts that are free in the gap, with friction of motor and load; to rounding, as sums are taken otherwise."""
-    axis = Axis.preset(name).replace(sample_rate=None)
+    preset = knocking_drive() if name == "two-mass-drive" else Axis.preset(name)
+    axis = preset.replace(sample_rate=None)
     axes = [axis.scaled(factors) for factors in ({"k": 1.1}, {"c": 0.5, "p": 1.02}, {"m": 1.2, "k_T": 0.9, "k_B": 1.3})]
     laws = [axis.pidf.replace(Kp=axis.pidf.Kp * (1.0 + 0.1 * i)) for i in range(len(axes))]
     shape = Shape(friction=friction, gap=2)

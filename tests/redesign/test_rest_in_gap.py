@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.workloads import knocking_drive
 from servotwin.control.cascade import Cascade
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
@@ -17,7 +18,7 @@ from servotwin.redesign.registry import policy_of
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled
 from servotwin.twin.settings import TwinSettings
 
-DRIVE = Axis.preset("two-mass-drive")
+DRIVE = knocking_drive()
 CASCADE = Cascade(2.0, 1.0, velocity_gain=30.0, voltage_limit=60.0, sample_rate=2e3, integral_only=False)
 GAPS = np.array([4e-3, 1e-2, 2e-2])
 RANGES = Uncertainty(gap=(0.0, 0.03), step=(0.06, 0.4))

@@ -179,17 +179,27 @@ def _mismatches(found: Search, likely: Array, rate: float, least: float) -> tupl
 
 
 def unusual_numbers(found: Search, likely: Array) -> tuple[str, ...]:
-    """List the unknowns (u,), as they are `likely`, that would have to be far off what is known of them."""
+    """List the unknowns (u,), as they are `likely`, that would have to be far off what is known of them.
+
+    Rounding may have moved them: a motor that touches softly, within few counts of its encoder, looks soft and late.
+    """
     problem, sentences = found.problem, list[str]()
     limits = problem.limits()
     for i, unknown in enumerate(problem.model.unknowns):
         size = abs(float(likely[i]))
         known = math.isfinite(unknown.std) and unknown.unit != "damping"
-        if known and (size > _UNUSUAL * unknown.std or size >= limits[i]):
+        far = known and (size > _UNUSUAL * unknown.std or size >= limits[i])
+        if far and not _rounding_explains(found, i, size, bool(size >= limits[i])):
             late = unknown.unit == "time"
             change = f"{1e3 * likely[i]:+.3g} ms" if late else f"{100.0 * math.expm1(likely[i]):+.2g} %"
             sentences.append(f"the {unknown.name} would be off by {change}")
     return tuple(sentences)
+
+
+def _rounding_explains(found: Search, which: int, size: float, at_limit: bool) -> bool:
+    """Tell whether an unknown may be off by a size because of rounding: alone where the search ended at its limit."""
+    rounding, known = rounded(found, which), found.problem.model.unknowns[which].std
+    return size <= _UNUSUAL * (rounding if at_limit else math.hypot(rounding, known))
 
 
 def differing_halves(found: Search, rate: float) -> tuple[str, ...]:
@@ -218,15 +228,15 @@ def _slow(raw: Array) -> float:
     return math.sqrt(max(0.0, left - _CHANCE * 0.5 * float(np.mean(np.diff(raw) ** 2)) / size))
 
 
-def influence(found: Search, keep: NDArray[np.intp]) -> tuple[float, float, float]:
-    """Change of the half gap that some of the residuals ask for, linearised, its std, and that of rounding.
+def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple[float, float, float]:
+    """Change of an unknown that some of the residuals ask for, linearised, its std, and that of rounding.
 
     Samples that show the same count have the same error: noise averages out over them, rounding does not. The second
-    and third are inf where these residuals do not show the gap.
+    and third are inf where these residuals do not show it.
     """
     fit, problem = found.best, found.problem
     places = np.flatnonzero(found.free)
-    at, data = int(np.flatnonzero(places == HALF)[0]), fit.raw.size
+    at, data = int(np.flatnonzero(places == which)[0]), fit.raw.size
     rows = fit.rows[np.ix_(places, keep)]
     size = np.linalg.norm(rows, axis=1)
     size[size == 0.0] = 1.0
@@ -248,9 +258,9 @@ def influence(found: Search, keep: NDArray[np.intp]) -> tuple[float, float, floa
     return float(weights @ fit.residual[keep]), std, rounding
 
 
-def rounded(found: Search) -> float:
-    """Standard deviation of the half gap that the rounding of the encoders makes."""
-    rounding = influence(found, np.arange(found.best.residual.size))[2]
+def rounded(found: Search, which: int = HALF) -> float:
+    """Standard deviation of an unknown that the rounding of the encoders makes."""
+    rounding = influence(found, np.arange(found.best.residual.size), which)[2]
     return rounding if math.isfinite(rounding) else 0.0
 
 
