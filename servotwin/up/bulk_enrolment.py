@@ -143,6 +143,8 @@ def _columns(folder: Path) -> dict[str, tuple[str, _Column]]:
 def _check_head(path: Path, head: list[str], columns: list[str]) -> None:
     allowed = f"the first line names the columns: {', '.join(columns)}"
     for name in head:
+        if any(separator in name for separator in (";", "\t")):
+            raise InvalidInput(f"{path}: line 1: separates its columns by semicolons or tabs; separate them by commas")
         if name not in columns:
             raise InvalidInput(f"{path}: line 1: column {name!r} is not known{did_you_mean(name, columns)}; {allowed}")
     if len(set(head)) < len(head) or "name" not in head:

@@ -102,6 +102,7 @@ def test_a_folder_that_cannot_be_written_leaves_all_as_it_was(folder: Path) -> N
     [
         ("", "'name' is missing"),
         ("ax-1\n", "column 'ax-1' is not known"),
+        ("name;role\nax-1;control\n", "line 1: separates its columns by semicolons or tabs; separate them by commas"),
         ("name,name\nax-1,ax-1\n", "named twice"),
         ("name,rolle\nax-1,\n", "did you mean 'role'"),
         ("name\n\n", "has no rows"),
