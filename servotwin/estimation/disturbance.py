@@ -93,7 +93,11 @@ def disturbance(window: Window, servo: Plant) -> Disturbance:
         return nothing_known(effort, f"the window has no {' and no '.join(missing)}")
     units = scales(servo)
     size, shortest = _sizes(window, units)
-    stretches = _constant(window, size, shortest)
+    stretches = [
+        (last - count * size, last)
+        for first, last in _constant(window)
+        for count in range(shortest, (last - first) // size + 1)
+    ]
     rests = list(_rests(window, servo, size, stretches))
     if not rests:
         return nothing_known(effort, _no_rest(bool(stretches), SHORTEST * units.time))
@@ -116,8 +120,7 @@ def quick_bias(window: Window, servo: Plant) -> tuple[float, float]:
         return math.nan, math.inf
     window = window.driven(servo.command_limit)
     size, least = _sizes(window, scales(servo))
-    ends = {last: first for first, last in reversed(_constant(window, size, least))}
-    shortest = [(first, last) for last, first in reversed(ends.items())]
+    shortest = [(last - least * size, last) for first, last in _constant(window) if last - first >= least * size]
     bias, std, _, _ = next(_rests(window, servo, size, shortest), (math.nan, math.inf, 0, 0))
     return bias, std
 
@@ -135,12 +138,11 @@ def _longest_good(rests: list[tuple[float, float, int, int]], fine: float) -> tu
     return max((rest for rest in rests if rest[1] <= allowed), key=lambda rest: rest[3] - rest[2])
 
 
-def _constant(window: Window, size: int, shortest: int) -> list[tuple[int, int]]:
-    """(first, last) of every stretch of whole batches that ends with a constant reference, and is long enough."""
+def _constant(window: Window) -> list[tuple[int, int]]:
+    """(first, last) of every stretch with a constant reference."""
     assert window.reference is not None
-    edges = [0, *(np.flatnonzero(np.diff(window.reference)) + 1), window.reference.size]
-    pairs = pairwise(edges)
-    return [(int(b) - k * size, int(b)) for a, b in pairs for k in range(shortest, (b - a) // size + 1)]
+    changes = (np.flatnonzero(np.diff(window.reference)) + 1).tolist()
+    return list(pairwise([0, *changes, window.reference.size]))
 
 
 def _rests(
@@ -155,61 +157,70 @@ def _rests(
     batches: dict[int, _Batches] = {}
     for first, last in stretches:
         if last not in batches:
-            batches[last] = _batches(window, size, begins[last], last)
-        rest = _rest(per_sample, steep, size, (last - first) // size, batches[last])
+            batches[last] = _batches(window, size, begins[last], last, per_sample)
+        rest = _rest(steep, size, (last - first) // size, batches[last])
         if rest is not None:
             yield *rest, first, last
 
 
+class _Means(NamedTuple):
+    """Means of batches (n,), the squares of their differences, and the largest difference of the last 2, 3 .. n."""
+
+    values: Array
+    squares: Array
+    largest: Array
+
+    @classmethod
+    def of(cls, samples: Array, size: int) -> _Means:
+        values = _means(samples, size)
+        steps = np.diff(values)
+        return cls(values, steps**2, np.maximum.accumulate(np.abs(steps)[::-1]))
+
+
 class _Batches(NamedTuple):
-    """Means of batches that end with a constant reference, and the motor's angle at the ends of each (rad)."""
+    """Batches that end with a constant reference: means, and of each the motor's back EMF and the rest of its voltage
+    (V)."""
 
-    angle: Array
-    position: Array
-    voltage: Array
-    ends: Array
+    angle: _Means
+    position: _Means
+    back_emf: Array
+    drive: Array
 
 
-def _batches(window: Window, size: int, first: int, last: int) -> _Batches:
+def _batches(window: Window, size: int, first: int, last: int, per_sample: float) -> _Batches:
+    """`per_sample`: V of one radian per sample."""
     assert window.voltage is not None
     assert window.theta_m is not None
     angle = window.theta_m[first:last]
-    position, voltage = _means(window.position[first:last], size), _means(window.voltage[first:last], size)
     ends = np.append(angle[::size], angle[-1] + (angle[-1] - angle[-2]))
-    return _Batches(_means(angle, size), position, voltage, ends)
+    back_emf = per_sample * np.diff(ends) / size
+    drive = _means(window.voltage[first:last], size) - back_emf
+    return _Batches(_Means.of(angle, size), _Means.of(window.position[first:last], size), back_emf, drive)
 
 
-def _rest(
-    per_sample: float, steep: tuple[float, float], size: int, count: int, batches: _Batches
-) -> tuple[float, float] | None:
-    """(bias, std) of the last `count` batches; None where something moves in them.
-
-    Parameters
-    ----------
-    per_sample : float
-        V of one radian per sample.
-    steep : (float, float)
-        For motor and load, as of `_still`.
-    """
-    if not (_still(batches.angle[-count:], size, steep[0]) and _still(batches.position[-count:], size, steep[1])):
+def _rest(steep: tuple[float, float], size: int, count: int, batches: _Batches) -> tuple[float, float] | None:
+    """(bias, std) of the last `count` batches; None where something moves in them. `steep`: as of `_still`, for motor
+    and load."""
+    if not (_still(batches.angle, count, size, steep[0]) and _still(batches.position, count, size, steep[1])):
         return None
-    speed = per_sample * np.diff(batches.ends[-count - 1 :]) / size
-    drive = batches.voltage[-count:] - speed
-    wrong = _BACK_EMF_SHARE * abs(float(np.mean(speed)))
+    drive = batches.drive[-count:]
+    wrong = _BACK_EMF_SHARE * abs(float(np.mean(batches.back_emf[-count:])))
     return -float(np.mean(drive)), math.hypot(_spread(drive), wrong)
 
 
-def _still(means: Array, size: int, steep: float) -> bool:
-    """Tell whether a signal rests but for noise; one unit per sample is `steep` times what counts as rest."""
-    if steep * float(np.max(np.abs(np.diff(means)))) / size <= 1.0:
+def _still(means: _Means, count: int, size: int, steep: float) -> bool:
+    """Tell whether a signal rests in its last `count` batches but for noise; one unit per sample is `steep` times what
+    counts as rest."""
+    if steep * float(means.largest[count - 2]) / size <= 1.0:
         return True
-    return means.size >= _FEWEST and _roughness(means) >= _SMOOTH
+    return count >= _FEWEST and _roughness(means.values[-count:], means.squares[1 - count :]) >= _SMOOTH
 
 
-def _roughness(means: Array) -> float:
-    """Mean square of successive differences over the variance (von Neumann's ratio)."""
-    variance = float(np.var(means))
-    return float(np.mean(np.diff(means) ** 2)) / variance if variance > 0.0 else math.inf
+def _roughness(means: Array, squares: Array) -> float:
+    """Mean square of successive differences, given their squares, over the variance (von Neumann's ratio)."""
+    left = means - float(np.add.reduce(means)) / means.size
+    variance = float(np.add.reduce(left * left)) / means.size
+    return float(np.add.reduce(squares)) / squares.size / variance if variance > 0.0 else math.inf
 
 
 def _spread(drive: Array) -> float:
@@ -239,9 +250,10 @@ def _noise(position: Array, size: int) -> float:
     count = position.size
     line = np.arange(count) - 0.5 * (count - 1)
     left = position - position.mean() - line * float(line @ position) / float(line @ line)
-    means = _means(left, size)
-    if _roughness(means) < _SMOOTH:
-        left = left - np.interp(np.arange(count), (np.arange(means.size) + 0.5) * size - 0.5, means)
+    means = _Means.of(left, size)
+    if _roughness(means.values, means.squares) < _SMOOTH:
+        middles = (np.arange(means.values.size) + 0.5) * size - 0.5
+        left = left - np.interp(np.arange(count), middles, means.values)
     return float(np.sqrt(left @ left / (count - 2)))
 
 

@@ -6,7 +6,7 @@ from typing import ClassVar, TypeAlias
 import msgspec
 from msgspec import Struct
 
-from servotwin.messages.checks import require
+from servotwin.messages.checks import InvalidMessage, require
 
 
 class Gains(Struct, frozen=True):
@@ -151,11 +151,14 @@ AnyGains: TypeAlias = Gains | CascadeGains | LinearGains
 def _check_numbers(gains: AnyGains, positive: tuple[str, ...]) -> None:
     """Refuse numbers that are not finite, of the named ones those that are not positive, and thresholds out of
     order."""
+    # Not `require`: the sentences would be made for every number of every state of a twin.
     for name in gains.__struct_fields__:
-        require(isfinite(getattr(gains, name)), f"gains {name} {getattr(gains, name)} is not finite")
+        if not isfinite(getattr(gains, name)):
+            raise InvalidMessage(f"gains {name} {getattr(gains, name)} is not finite")
     for name in positive:
-        unit = " s" if name != "gain" else ""
-        require(getattr(gains, name) > 0.0, f"gains {name} {getattr(gains, name)}{unit} is not positive")
+        if not getattr(gains, name) > 0.0:
+            unit = " s" if name != "gain" else ""
+            raise InvalidMessage(f"gains {name} {getattr(gains, name)}{unit} is not positive")
     require(0.0 <= gains.enter <= gains.leave, f"gains enter {gains.enter}, leave {gains.leave}: not in order")
 
 

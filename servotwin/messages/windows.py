@@ -37,9 +37,13 @@ class Channel(Struct, frozen=True):
     data: bytes
 
     def __post_init__(self) -> None:
-        require(isfinite(self.scale) and self.scale >= 0.0, f"channel {self.name}: scale {self.scale} is not allowed")
-        require(isfinite(self.offset), f"channel {self.name}: offset {self.offset} is not finite")
-        require(len(self.data) > 0 and len(self.data) % 2 == 0, f"channel {self.name}: not a number of int16 samples")
+        # Not `require`: the sentences would be made for every channel of every window.
+        if not (isfinite(self.scale) and self.scale >= 0.0):
+            raise InvalidMessage(f"channel {self.name}: scale {self.scale} is not allowed")
+        if not isfinite(self.offset):
+            raise InvalidMessage(f"channel {self.name}: offset {self.offset} is not finite")
+        if not self.data or len(self.data) % 2:
+            raise InvalidMessage(f"channel {self.name}: not a number of int16 samples")
 
     @property
     def samples(self) -> int:

@@ -14,8 +14,7 @@ _NAMES_PER_QUERY = 5000
 
 def after_serial(connection: sa.Connection, servo: str, after: int, limit: int) -> list[OutgoingMessage]:
     """Messages to the edge with serials above `after`."""
-    query = sa.select(outgoing.c.serial, outgoing.c.body).where(outgoing.c.servo == servo, outgoing.c.serial > after)
-    rows = connection.execute(query.order_by(outgoing.c.serial).limit(limit))
+    rows = connection.execute(_AFTER_SERIAL, {"_servo": servo, "_after": after, "_limit": limit})
     return [OutgoingMessage(row.serial, row.body) for row in rows]
 
 
@@ -24,8 +23,7 @@ def newest_serials(connection: sa.Connection, servos: Collection[str]) -> dict[s
     names, newest = list(servos), dict[str, int]()
     for begin in range(0, len(names), _NAMES_PER_QUERY):  # a database takes only so many parameters at once
         part = names[begin : begin + _NAMES_PER_QUERY]
-        query = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(part))
-        newest.update((servo, serial) for servo, serial in connection.execute(query))
+        newest.update((servo, serial) for servo, serial in connection.execute(_NEWEST, {"_servos": part}))
     return newest
 
 
@@ -43,3 +41,13 @@ def skip_to_serial(connection: sa.Connection, servo: str, serial: int) -> None:
     """Make the serial of the next message to the edge exceed `serial`."""
     behind = sa.update(twins).where(twins.c.servo == servo, twins.c.posted < serial)
     connection.execute(behind.values(posted=serial))
+
+
+# Made once: each poll of an edge runs one or both.
+_AFTER_SERIAL = (
+    sa.select(outgoing.c.serial, outgoing.c.body)
+    .where(outgoing.c.servo == sa.bindparam("_servo"), outgoing.c.serial > sa.bindparam("_after", type_=sa.BigInteger))
+    .order_by(outgoing.c.serial)
+    .limit(sa.bindparam("_limit", type_=sa.Integer))
+)
+_NEWEST = sa.select(twins.c.servo, twins.c.posted).where(twins.c.servo.in_(sa.bindparam("_servos", expanding=True)))

@@ -145,8 +145,9 @@ class Store:
             return []
         with transaction(self.engines.reader) as connection:
             loaded = leases.load(connection, leased, kinds, per_servo, newest_first)
-            due = leases.due(connection, {turn.servo for turn in leased}, now)
-        idle = {lease.servo for lease in loaded if not lease.messages and lease.servo not in due}
+            idle = {lease.servo for lease in loaded if not lease.messages}
+            if idle:
+                idle -= leases.due(connection, idle, now)
         if idle:
             self.release(owner, idle)
         return [lease for lease in loaded if lease.servo not in idle]
@@ -169,10 +170,12 @@ class Store:
         An edge that reports a higher serial than any that was posted received it before the store was restored from a
         backup: the next message gets a serial that the edge does not take for a duplicate.
         """
-        messages = self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
-        if messages or self.damaged:
-            return messages
-        if self.posted([servo]).get(servo, after) < after <= _MAX_SERIAL:
+        with transaction(self.engines.reader) as connection:
+            messages = posting.after_serial(connection, servo, after, limit)
+            # Of an edge that received nothing no store is too old.
+            known = not after or bool(messages) or self.damaged
+            newest = after if known else posting.newest_serials(connection, [servo]).get(servo, after)
+        if newest < after <= _MAX_SERIAL:
             self._write(lambda connection: posting.skip_to_serial(connection, servo, after))
         return messages
 

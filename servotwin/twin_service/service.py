@@ -88,7 +88,9 @@ class TwinService:
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
         self.polls = LongPolls(self._read_outgoing, config.long_polls, self._shared, config.polls_per_servo)
-        self.commits = GroupCommit(store, CommitLimits(waiting=config.queue), self.clocks.wall)
+        # In lock-step somebody waits for each result.
+        limits = CommitLimits(waiting=config.queue, gather=0.0 if config.lockstep else CommitLimits().gather)
+        self.commits = GroupCommit(store, limits, self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
         self.watch = StoreWatch(
             store, self.executor, self._writes.put, self._writes.commit, self.clocks.wall, self.clocks.monotonic

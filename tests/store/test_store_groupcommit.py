@@ -96,6 +96,59 @@ def test_waiting_writes_are_committed_together(gate: Gate) -> None:
     group.close()
 
 
+class Pause:
+    """A wait that lasts until it is ended, and is counted."""
+
+    def __init__(self) -> None:
+        self.begun, self.ended = threading.Semaphore(0), threading.Semaphore(0)
+        self.lengths: list[float] = []
+
+    def __call__(self, seconds: float) -> None:
+        self.lengths.append(seconds)
+        self.begun.release()
+        assert self.ended.acquire(timeout=PATIENCE_S)
+
+
+def test_a_message_that_comes_alone_waits_for_no_other(gate: Gate) -> None:
+    pause = Pause()
+    gate.opened.set()
+    group = GroupCommit(gate, sleep=pause)
+    for n in range(3):
+        assert group.put(window(sequence=n)).result(PATIENCE_S) is PutResult.NEW
+    group.close()
+    assert (gate.sizes, pause.lengths) == ([1, 1, 1], [])
+
+
+def test_where_several_were_written_together_the_next_gather_first(gate: Gate) -> None:
+    pause = Pause()
+    group = GroupCommit(gate, CommitLimits(gather=0.25), sleep=pause)
+    first = group.put(window(sequence=0))
+    assert gate.entered.wait(PATIENCE_S)
+    others = [group.put(window(sequence=n)) for n in (1, 2)]
+    gate.opened.set()
+    assert results([first, *others]) == [PutResult.NEW] * 3
+    late = [group.put(window(sequence=3))]
+    assert pause.begun.acquire(timeout=PATIENCE_S)
+    late += [group.put(window(sequence=n)) for n in (4, 5)]
+    assert not late[0].done()
+    pause.ended.release()
+    assert results(late) == [PutResult.NEW] * 3
+    group.close()
+    assert (gate.sizes, pause.lengths) == ([1, 2, 3], [0.25])
+
+
+@pytest.mark.parametrize("gather", [0.25, 0.0])
+def test_results_gather_unless_somebody_waits_for_them(store: Store, gather: float) -> None:
+    pause = Pause()
+    pause.ended.release()
+    group = GroupCommit(store, CommitLimits(gather=gather), lambda: 300.0, pause)
+    store.put([window("s")])
+    (claim,) = store.lease("me", 1, 30.0, 200.0)
+    assert group.commit(outcome(claim)).result(PATIENCE_S)
+    group.close()
+    assert pause.lengths == ([gather] if gather else [])
+
+
 def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:
     group = GroupCommit(gate, CommitLimits(together_bytes=2000))
     futures = [group.put(window(sequence=0))]

@@ -54,10 +54,10 @@ class LeastSquares:
 def least_squares(columns: Array, target: Array) -> LeastSquares:
     """Fit the rows of `columns` (k, m) to `target` (m,)."""
     products = columns @ columns.T
-    size = np.sqrt(np.diagonal(products))
-    size = np.where(size == 0.0, 1.0, size)
+    size = np.sqrt(products.diagonal())
+    size[size == 0.0] = 1.0
     # Columns of length one: the test for dependence must not depend on their units.
-    values, vectors = np.linalg.eigh(products / np.outer(size, size))
+    values, vectors = np.linalg.eigh(products / (size[:, None] * size))
     good = values > _DEPENDENT_EIGENVALUE * values[-1]
     root = (vectors[:, good] / np.sqrt(values[good])).T / size
     return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(size.size, dtype=bool))

@@ -131,13 +131,15 @@ class Nearby:
 def nearby(servo: Servo, factors: tuple[float, ...], rate: float, reduce: Decimation, soft: bool) -> Nearby:
     """Responses around a servo with other logarithms of its factors, at a sample rate (Hz), decimated."""
     here = np.array(factors)
+    if soft:
+        stiff = nearby(servo, factors, rate, reduce, False)  # by place, as others call it: a name makes another key
+        stiffness = math.exp(here[0]) * float(servo.stiffnesses.max())
+        compliance = SOFT + (0.0 if servo.rigid else stiffness / servo.k_d)
+        softened = variants(servo, [here], rate, [stiffness / compliance])[0]
+        softer = Neighbour.of(stiff.model, softened, SOFT, here.size)
+        return Nearby(stiff.model, (*stiff.others, softer), here.size + 1)
     moved = [row for row in range(here.size) if row != PITCH and (row != RATIO or servo.n > 2)]
     first, *others = variants(servo, [here, *(here + STEP * np.eye(here.size)[row] for row in moved)], rate)
     model = reduced_response(first, reduce)
     neighbours = [Neighbour.of(model, other, STEP, row) for other, row in zip(others, moved, strict=True)]
-    if soft:
-        stiffness = math.exp(here[0]) * float(servo.stiffnesses.max())
-        compliance = SOFT + (0.0 if servo.rigid else stiffness / servo.k_d)
-        softened = variants(servo, [here], rate, [stiffness / compliance])[0]
-        neighbours.append(Neighbour.of(model, softened, SOFT, here.size))
-    return Nearby(model, tuple(neighbours), here.size + soft)
+    return Nearby(model, tuple(neighbours), here.size)
