@@ -130,6 +130,8 @@ class WindowFit:
         evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings)
+        if self.settings.gap_rate > 0.0 and evidence.scale > 0.0:
+            evidence = _spread_to(evidence, math.hypot(evidence.std, self._moved_by_growth()))
         status, reasons = judge(evidence, self.settings)
         usable = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
         if self.learnt is not None and self.learnt.beyond and usable:
@@ -156,6 +158,18 @@ class WindowFit:
         if self.learnt is None or not teaches:
             return stated
         return replace(stated, machine=self.learnt.reading(self.settings.calibration))
+
+    def _moved_by_growth(self) -> float:
+        """How far (rad) the gap lies from that of the same window if it did not grow.
+
+        Two pushes tell gap, offset and growth apart by less than a count of the position, where the machine's own
+        error is as large.
+        """
+        assert self.aligned is not None
+        gap, still = self.aligned.whitened.point.gap, replace(self.settings, gap_rate=0.0)
+        position, rate = self.window.position, self.window.sample_rate
+        _, points = coarse_search(self.angle, position, rate, self.servo, gap, still)
+        return abs(align_and_fit(self.angle, position, rate, self.servo, points, still).whitened.point.gap - gap)
 
     def _one_contact(self, evidence: FitEvidence, contacts: ContactEvidence, reasons: tuple[str, ...]) -> GapEstimate:
         """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
@@ -288,7 +302,11 @@ def _count(angle: Array, servo: Servo) -> float:
 
 def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:
     """Widen a spread and an interval by what the model's factors leave open."""
-    std = learnt.gap_std(settings.calibration)
+    return _spread_to(evidence, learnt.gap_std(settings.calibration))
+
+
+def _spread_to(evidence: FitEvidence, std: float) -> FitEvidence:
+    """Widen the spread (rad), and the interval with it; as it is where it is no narrower."""
     if not evidence.std < std < math.inf:
         return evidence
     gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
