@@ -1,6 +1,7 @@
 """The default estimator: right, and honest about how right; reduced from its bench."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,10 +12,12 @@ from benchmarks import estimator as bench
 from benchmarks import estimator_conditions as conditions
 from benchmarks.cramer_rao import bound, noise_root
 from benchmarks.estimator_windows import RATE, cut, random_cases
-from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.gap import estimate_gap, options_for
 from servotwin.estimation.whitened.estimator import WhitenedSettings
 from servotwin.estimation.whitened.fit import plain_fit
 from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.simulation import simulate
@@ -168,3 +171,19 @@ def test_a_gap_taken_for_constant_that_grows_is_covered_or_refused():
     accepted = [(e, case.gap) for e, case in zip(estimates, cases, strict=True) if e.ok]
     assert len(accepted) >= 5
     assert all(e.interval[0] < gap < e.interval[1] for e, gap in accepted)
+
+
+def test_growth_that_only_fractions_of_a_count_tell_counts_as_unknown():
+    """Two pushes tell gap, offset and growth apart by nothing else; from such residuals a gap was 1.9 deg off."""
+    axis, middle = Axis.preset("micro-positioner"), math.radians(40.5)
+    law = axis.controller.replace(Kp=2e5, Ki=6e3, integral_only=True)
+    gap, reference = SCurve(math.radians(30.0), math.radians(48.0), 9.0), SquareWave(1.2e-5, 6.0)
+    run = simulate(axis, 9.0, controller=law, reference=reference, gap=gap, tolerance=6e-7, sample_rate=5000.0)
+    window, rate = Window.from_run(run, start=2.85, duration=4.8), math.radians(3.0)
+    refused = estimate_gap(window, axis, settings=replace(options_for(axis, "whitened", None), gap_rate=rate))
+    assert refused.status is GapStatus.UNIDENTIFIABLE
+    assert "the gap is known to" in refused.reasons[0]
+    said = estimate_gap(window, axis, settings=WhitenedSettings(gap_rate=rate, largest_std=1.0))
+    assert said.ok
+    assert said.std > math.radians(1.0)
+    assert said.interval[0] < middle < said.interval[1]

@@ -130,7 +130,7 @@ class WindowFit:
         evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings)
-        if self.settings.gap_rate > 0.0 and evidence.scale > 0.0:
+        if self.settings.gap_rate > 0.0 and max(evidence.scale, self.servo.position_resolution) > 0.0:
             evidence = _spread_to(evidence, math.hypot(evidence.std, self._moved_by_growth()))
         status, reasons = judge(evidence, self.settings)
         usable = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
