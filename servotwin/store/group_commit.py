@@ -33,8 +33,8 @@ class CommitLimits(NamedTuple):
     together, together_bytes : int
         Messages and results in one transaction, and bytes of bodies.
     gather : float
-        s for which a transaction waits for more writes where that delays nobody much, or many come: by itself it takes
-        as much processor time as ten writes in it.
+        s for which results wait for more writes: no edge waits for them, and a transaction takes as much processor time
+        as ten writes in it.
     """
 
     waiting: int = 4096
@@ -135,17 +135,15 @@ class GroupCommit:
         return future
 
     def _run(self) -> None:
-        before = 0
-        while jobs := self._take(before):
+        while jobs := self._take():
             self._write(jobs)
-            before = len(jobs)
 
-    def _take(self, before: int) -> list[_Write]:
-        """Wait for the writes of the next transaction; none: closed, and all is written. `before`: of the last one."""
+    def _take(self) -> list[_Write]:
+        """Wait for the writes of the next transaction; none: closed, and all is written."""
         with self._changed:
             self._changed.wait_for(lambda: self._jobs or self._closing)
-            # No edge waits for results; and a message that comes alone is not delayed.
-            gather = before > 1 or not self._messages
+            # Messages are not delayed: while one transaction is being written, the next ones gather by themselves.
+            gather = not self._messages
         if gather and not self._closing and self._limits.gather:
             self._sleep(self._limits.gather)
         batch: list[_Write] = []
