@@ -96,23 +96,10 @@ def test_waiting_writes_are_committed_together(gate: Gate) -> None:
     group.close()
 
 
-class Pause:
-    """A wait that lasts until it is ended, and is counted."""
-
-    def __init__(self) -> None:
-        self.begun, self.ended = threading.Semaphore(0), threading.Semaphore(0)
-        self.lengths: list[float] = []
-
-    def __call__(self, seconds: float) -> None:
-        self.lengths.append(seconds)
-        self.begun.release()
-        assert self.ended.acquire(timeout=PATIENCE_S)
-
-
 def test_messages_wait_for_no_others(gate: Gate) -> None:
     """Neither one alone nor the next after several: it took a quarter of the rate of commits."""
-    pause = Pause()
-    group = GroupCommit(gate, sleep=pause)
+    pauses: list[float] = []
+    group = GroupCommit(gate, sleep=pauses.append)
     first = group.put(window(sequence=0))
     assert gate.entered.wait(PATIENCE_S)
     others = [group.put(window(sequence=n)) for n in (1, 2)]
@@ -120,19 +107,18 @@ def test_messages_wait_for_no_others(gate: Gate) -> None:
     assert results([first, *others]) == [PutResult.NEW] * 3
     assert group.put(window(sequence=3)).result(PATIENCE_S) is PutResult.NEW
     group.close()
-    assert (gate.sizes, pause.lengths) == ([1, 2, 1], [])
+    assert (gate.sizes, pauses) == ([1, 2, 1], [])
 
 
 @pytest.mark.parametrize("gather", [0.25, 0.0])
 def test_results_gather_unless_somebody_waits_for_them(store: Store, gather: float) -> None:
-    pause = Pause()
-    pause.ended.release()
-    group = GroupCommit(store, CommitLimits(gather=gather), lambda: 300.0, pause)
+    pauses: list[float] = []
+    group = GroupCommit(store, CommitLimits(gather=gather), lambda: 300.0, pauses.append)
     store.put([window("s")])
     (claim,) = store.lease("me", 1, 30.0, 200.0)
     assert group.commit(outcome(claim)).result(PATIENCE_S)
     group.close()
-    assert pause.lengths == ([gather] if gather else [])
+    assert pauses == ([gather] if gather else [])
 
 
 def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:
