@@ -160,7 +160,7 @@ class WindowFit:
         return replace(stated, machine=self.learnt.reading(self.settings.calibration))
 
     def _moved_by_growth(self) -> float:
-        """How far (rad) the gap lies from that of the same window if it did not grow.
+        """Distance (rad) of the gap from that of the same window taken for constant.
 
         Two pushes tell gap, offset and growth apart by less than a count of the position, where the machine's own
         error is as large.
