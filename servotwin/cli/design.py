@@ -153,7 +153,10 @@ def certify(
     ] = None,
     finest_deg: Annotated[
         float | None,
-        typer.Option(help="Width of the narrowest cells in the gap, deg; by default 4.", show_default=False),
+        typer.Option(
+            help="Width of the narrowest cells in the gap, deg; by default a sixteenth of the stated range.",
+            show_default=False,
+        ),
     ] = None,
     bias_mv: Annotated[
         str | None,

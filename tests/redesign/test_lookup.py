@@ -17,6 +17,7 @@ from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.lookup import (
@@ -105,16 +106,25 @@ def test_a_grid_that_is_none_is_refused(changes: dict, named: str) -> None:
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_default_grid_of_a_preset(name: str) -> None:
     policy = CertifiedPolicy(Servo.preset(name), Uncertainty(input_bias=(-0.1, 0.1)))
-    assert Grid.of(policy) == Grid()
-    assert Grid.of(policy, noises=(0.0,)) == Grid(noises=(0.0,))
+    finest = 60.0 * DEG / 16.0
+    assert Grid.of(policy) == Grid(finest)
+    assert Grid.of(policy, noises=(0.0,)) == Grid(finest, noises=(0.0,))
 
 
 def test_a_machine_in_other_units_has_the_grid_in_them() -> None:
     servo, steps = scaled(Servo.preset("paper"), 8.0, 2.0**-20, 2.0**7), (2.0**-20 * 1e-4, 2.0**-20 * 1e-3)
     found = Grid.of(CertifiedPolicy(servo, Uncertainty(step=steps)))
-    assert found.finest == Grid().finest
+    assert found.finest == 60.0 * DEG / 16.0
     assert found.biases == pytest.approx([2.0**7 * bias for bias in Grid().biases])
     assert found.noises == pytest.approx([2.0**-20 * noise for noise in Grid().noises])
+
+
+def test_the_narrowest_cells_are_a_sixteenth_of_the_stated_gaps_however_small_these_are() -> None:
+    policy = CertifiedPolicy(Axis.preset("ball-screw"), Uncertainty(gap=(0.0, 1.5 * DEG), step=(1e-4, 1e-3)))
+    grid = Grid.of(policy)
+    assert len(grid.levels((0.0, 1.5 * DEG))) == 5
+    exact = CertifiedPolicy(Axis.preset("ball-screw"), Uncertainty(gap=(DEG, DEG), step=(1e-4, 1e-3)))
+    assert len(Grid.of(exact).levels((DEG, DEG))) == 1
 
 
 # --- what is looked up
@@ -220,14 +230,28 @@ def test_a_small_bias_is_not_looked_up_where_overshoot_was_not_judged() -> None:
 
 
 @pytest.mark.slow
-def test_a_cell_whose_voltage_reaches_its_limit_is_not_verified() -> None:
-    """There a feedforward would leave less on one side."""
+def test_a_cell_whose_voltage_meets_its_limit_is_verified_with_the_largest_feedforwards_too() -> None:
     tight = replace(POLICY, servo=SERVO.replace(voltage_limit=1.0))
-    loose = replace(POLICY, servo=SERVO.replace(voltage_limit=40.0))
-    key = CellIndex(0, 0, 0, 0)
-    assert certify_cell(tight, GRID, key) is None
-    found = certify_cell(loose, GRID, key)
+    found = certify_cell(tight, GRID, CellIndex(0, 0, 0, 0))
     assert found is not None
+    assert found.saturated
+    assert found.settled == 1.0
+    assert found.setting.controller.voltage_limit == 1.0
+    assert found.setting.controller.feedforward == 0.0
+
+
+@pytest.mark.slow
+def test_a_cell_is_not_verified_where_the_largest_feedforward_leaves_too_little() -> None:
+    servo, key = SERVO.replace(voltage_limit=0.3), CellIndex(0, 0, 0, 0)
+    assert certify_cell(replace(POLICY, servo=servo, feedforward_limit=0.25), GRID, key) is not None
+    assert certify_cell(replace(POLICY, servo=servo, feedforward_limit=0.28), GRID, key) is None
+
+
+@pytest.mark.slow
+def test_a_cell_whose_voltage_stays_below_its_limit_carries_the_limit() -> None:
+    found = certify_cell(replace(POLICY, servo=SERVO.replace(voltage_limit=40.0)), GRID, CellIndex(0, 0, 0, 0))
+    assert found is not None
+    assert not found.saturated
     assert found.setting.controller.voltage_limit == 40.0
 
 

@@ -21,10 +21,12 @@ from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting
 from servotwin.plant.scales import scales
+from servotwin.redesign.certified.attempt import with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
-from servotwin.redesign.certified.certify import certify, known_bias
+from servotwin.redesign.certified.certify import certify, confirm, known_bias
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
+from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
@@ -33,6 +35,8 @@ _PREFERRED_LEVELS = 2
 _QUIET = 10.0
 # To the smallest step.
 _NOISES = 10.0
+# Of the stated range of gaps: width of the narrowest cells where none is given.
+_FINEST = 1.0 / 16.0
 
 
 @dataclass(frozen=True)
@@ -75,15 +79,17 @@ class Grid:
         biases: tuple[float, ...] | None = None,
         noises: tuple[float, ...] | None = None,
     ) -> Grid:
-        """Make a grid; noises that are left out are a part of the smallest step.
+        """Make a grid; a finest width that is left out is a sixteenth of the stated range of gaps.
 
-        Biases that are left out are in the servo's own volts, the largest at most half of the stated one.
+        Noises that are left out are a part of the smallest step, biases in the servo's own volts, the largest at most
+        half of the stated one.
         """
         usual, volt, known = cls(), scales(policy.servo).voltage, max(map(abs, policy.uncertainty.input_bias))
+        least, most = policy.uncertainty.gap
         if known > 0.0:
             volt = min(volt, 0.5 * known / usual.biases[-1])
         return cls(
-            usual.finest if finest is None else finest,
+            (_FINEST * (most - least) or usual.finest) if finest is None else finest,
             tuple(volt * bias for bias in usual.biases) if biases is None else biases,
             (0.0, policy.uncertainty.step[0] / _NOISES) if noises is None else noises,
         )
@@ -202,19 +208,37 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
     """Certify the setting of a cell; None where none is verified.
 
     As long as no voltage meets its limit, the feedforward matters only through the bias that it leaves. So the cell is
-    verified without feedforward, and with a limit that is lower by the largest one; where that limit is met, there is
-    no certificate. Every machine has to settle: the few that need not might all lie in the region that is looked up.
+    verified without feedforward, and with a limit that is lower by the largest one. Where that limit is met, it is
+    verified with the limit itself, without feedforward and with the largest one either way. Every machine has to
+    settle: the few that need not might all lie in the region that is looked up.
     """
-    stated, bias = policy.uncertainty.gap, grid.biases[key.bias]
-    known = policy.uncertainty.replace(gap=cell_range(grid, stated, key), input_bias=(-bias, bias))
-    limit = policy.servo.controller.voltage_limit
-    servo = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
-    demands = policy.demands_within_band()
-    certificate = certify(servo, known, demands, policy.simulations, 0.0, grid.noises[key.noise], policy.clock)
-    if isinstance(certificate, NotVerified) or certificate.saturated or certificate.settled < 1.0:
+    bias, limit = grid.biases[key.bias], policy.servo.controller.voltage_limit
+    known = policy.uncertainty.replace(gap=cell_range(grid, policy.uncertainty.gap, key), input_bias=(-bias, bias))
+    lower = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
+    noise, demands = grid.noises[key.noise], policy.demands_within_band()
+    found = certify(lower, known, demands, policy.simulations, 0.0, noise, policy.clock)
+    if isinstance(found, Certificate) and found.saturated:
+        found = certify(policy.servo, known, demands, policy.simulations, 0.0, noise, policy.clock)
+        if isinstance(found, Certificate) and not _holds_with_feedforward(policy, known, found.setting, noise):
+            return None
+    if isinstance(found, NotVerified) or found.settled < 1.0:
         return None
-    law = certificate.setting.controller.replace(voltage_limit=limit)
-    return replace(certificate, setting=replace(certificate.setting, controller=law))
+    law = found.setting.controller.replace(voltage_limit=limit)
+    return replace(found, setting=replace(found.setting, controller=law))
+
+
+def _holds_with_feedforward(policy: CertifiedPolicy, known: Uncertainty, setting: Design, noise: float) -> bool:
+    """True where a setting settles every machine also with the largest feedforward of either sign, limits included."""
+    (low, high), most, demands = known.input_bias, policy.feedforward_limit, policy.demands_within_band()
+    for feedforward in (-most, most) if most else ():
+        biased, fed = (
+            known.replace(input_bias=(low - feedforward, high - feedforward)),
+            with_feedforward(setting, feedforward),
+        )
+        tried = confirm(policy.servo, biased, fed, demands, policy.simulations, noise, policy.clock)
+        if isinstance(tried, NotVerified) or tried.settled < 1.0:
+            return False
+    return True
 
 
 def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[CellIndex, Certificate | None]) -> CertifiedTable:
