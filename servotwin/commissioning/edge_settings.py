@@ -47,7 +47,14 @@ class Recording:
         Rules that select the windows to send; None: the edge sends every one. In a file, [novelty].
     """
 
-    sample_rate: Annotated[float, key("sample_rate_hz", above=0.0, help="Rate of the samples.")] = 5000.0
+    sample_rate: Annotated[
+        float,
+        key(
+            "sample_rate_hz",
+            above=0.0,
+            help="Rate of the samples; where absent, in a scenario, that of a sampled controller.",
+        ),
+    ] = 5000.0
     window: Annotated[
         float | None,
         key("window_s", above=0.0, help="Length of a window; where absent it follows from the controller."),

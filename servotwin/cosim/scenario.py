@@ -238,8 +238,8 @@ class Scenario:
         ratio = max(rate, law) / min(rate, law)
         if abs(ratio - round(ratio)) > 1e-9 * ratio:
             raise InvalidInput(
-                f"controller sample_rate = {law!r} Hz does not divide: it and the recording's {rate!r} Hz must be "
-                "whole multiples of one another"
+                f"recording sample_rate = {rate!r} Hz: it and the controller's {law!r} Hz must be whole multiples of "
+                "one another"
             )
 
 

@@ -143,11 +143,20 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     return {
         "controller": controller,
         "supervision": supervision,
-        "recording": replace(part(table, RECORDING, Recording), probe=probe, novelty=novelty),
+        "recording": replace(_recording(table, controller or servo.controller), probe=probe, novelty=novelty),
         "uplink": uplink,
         "downlink": downlink,
         "twin": read_inner(table, TWIN, lambda inner: read_twin_settings(inner, folder, servo)),
     }
+
+
+def _recording(table: Table, controller: AnyController) -> Recording:
+    """Read [recording]; its rate is that of a sampled controller where it gives none."""
+    given = table.table(RECORDING)
+    recording: Recording = read(given, Recording)
+    given.done()
+    rate = controller.sample_rate
+    return replace(recording, sample_rate=rate) if rate and "sample_rate_hz" not in given.values else recording
 
 
 def _changed(table: Table, controller: AnyController) -> AnyController | None:

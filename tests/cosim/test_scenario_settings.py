@@ -64,6 +64,13 @@ def test_every_key_of_the_default_estimator_is_read(tmp_path):
     )
 
 
+def test_windows_have_the_rate_of_a_sampled_controller_unless_the_file_says_otherwise(tmp_path):
+    sampled = SHORT + "[controller]\nsample_rate_hz = 2000\n"
+    assert load(tmp_path, SHORT).recording.sample_rate == 5000.0
+    assert load(tmp_path, sampled).recording.sample_rate == 2000.0
+    assert load(tmp_path, sampled + "[recording]\nsample_rate_hz = 4000\n").recording.sample_rate == 4000.0
+
+
 def test_the_default_twin_is_the_default_estimators(tmp_path):
     assert load(tmp_path, SHORT).twin.method == Scenario(Servo.preset("paper"), 1.0).twin.method == "whitened"
     assert {Scenario.preset(name).twin.method for name in ("fig15", "fig15-sampled", "fig16")} == {"paper"}
@@ -90,7 +97,7 @@ def test_a_calm_loop_is_recorded_for_longer_and_from_before_the_change(tmp_path,
     [
         ("kp_v_per_m = 13777", "unstable"),
         ("ki_v_per_m_s = -100", "unstable"),
-        ("sample_rate_hz = 10", "at 10 Hz is unstable"),
+        ("sample_rate_hz = 10\n[recording]\nsample_rate_hz = 5000", "at 10 Hz is unstable"),
         ("sample_rate_hz = 5000\nloop_filter_hz = 0.5", "unstable"),
         ("rate_limit_v_per_s = 100", "sample rate in Hz"),
     ],
