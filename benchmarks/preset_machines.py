@@ -32,7 +32,7 @@ class Duty(NamedTuple):
     gap : float
         Healthy gap at the load, m or rad, as the preset's file states it.
     half_period : float
-        s, between two steps.
+        s, between two steps. A load that coasts comes to rest within it.
     before, window : float
         Of the half period: part of a window before a step, and length of a window. A motor that comes to rest without
         overshoot touches one flank in each step, so that a window must hold two of them.
@@ -59,9 +59,9 @@ class Duty(NamedTuple):
 
 _ARC_SECOND = math.radians(1.0 / 3600.0)
 DUTIES: Mapping[str, Duty] = {
-    "two-mass-drive": Duty(2e-3, 10.0),
+    "two-mass-drive": Duty(2e-3, 30.0, 1.0 / 60.0, 1.0 / 6.0),
     "ball-screw": Duty(5e-6, 0.4),
-    "robot-joint": Duty(math.radians(0.05), 4.0),
+    "robot-joint": Duty(math.radians(0.05), 16.0, 1.0 / 80.0, 1.0 / 8.0),
     "telescope": Duty(10.0 * _ARC_SECOND, 40.0),
     "stepper-stage": Duty(2e-6, 5.0, 0.95, 1.5, 3, lead=6e-3, probe=2e-4, moves=(0.86, 0.98)),
     "micro-positioner": Duty(200e-9, 3.0, 1.05, 1.6, 3),

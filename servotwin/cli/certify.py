@@ -18,7 +18,6 @@ from servotwin.config.table import Table, did_you_mean, read_toml
 from servotwin.config.toml import attribute
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
-from servotwin.plant.display_units import command_unit
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
@@ -163,14 +162,8 @@ def _summary(job: _TableJob, table: CertifiedTable) -> str:
     shares = Counter(cell is not None for cell in table.cells.values())
     settings = {cell.setting for cell in table.cells.values() if cell is not None}
     low, high = (math.degrees(gap) for gap in table.stated)
-    servo, limited = job.policy.servo, ""
-    if shares[False] and servo.controller.voltage_limit is not None:
-        limit = f"{servo.controller.voltage_limit:g} {command_unit(servo)}"
-        limited = (
-            f" (a cell in which the command meets its limit, {limit}, is never verified: without a table the twin "
-            "verifies by itself)"
-        )
+    others = "; in the others the twin sends the fallback set" if shares[False] else ""
     return (
         f"written: {job.path}: {shares[True]} of {len(table.cells)} cells of gaps from {low:g} to {high:g} deg are"
-        f" verified, with {len(settings)} different settings; in the others the twin sends the fallback set{limited}"
+        f" verified, with {len(settings)} different settings{others}"
     )
