@@ -117,7 +117,9 @@ def _unmodelled(axis: Axis) -> Array:
     return spreads
 
 
-def _own_information(found: Search, places: NDArray[np.intp], calibration: float, unmodelled: Array) -> tuple[Array, Array]:
+def _own_information(
+    found: Search, places: NDArray[np.intp], calibration: float, unmodelled: Array
+) -> tuple[Array, Array]:
     """Information (f, f) of a window alone on unknowns at places (f,), and the same times their values (f,) in it.
 
     The fit's information on them, the freedom of the others taken out, is that of white noise. Rounding and what the
