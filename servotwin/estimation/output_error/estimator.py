@@ -181,7 +181,7 @@ def _count_of_motor(axis: Axis, theta_m: Array) -> float:
 
 
 def _problem(
-    window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings, learnt: Array | None
+    window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings, learnt: Array | None = None
 ) -> Problem:
     """The window with its model; `learnt` (4, 4) is the covariance of what is known of a free shaft."""
     interval = 1.0 / window.sample_rate
