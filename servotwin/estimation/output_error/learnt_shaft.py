@@ -35,6 +35,7 @@ _DAMPED = 2e-3
 _DOUBT = 2.0
 _TELLS = 0.5  # of the standard deviation that was known: what a window tells better counts
 _TOGETHER = 5.0  # standard deviations between a window's numbers and those that were known
+_LEAST_INFORMATION = 1e-2  # of what was known: where a window tells less, it shows nothing
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _SINGULAR = 1e-12
 _DAMPING = LEARNT["shaft damping"]
@@ -97,7 +98,7 @@ def shaft_reading(found: Search, machine: FactorPrior, calibration: float) -> Sh
     gains, axes = np.linalg.eigh(lower.T @ told @ lower)
     shown = axes.T @ (lower.T @ score)
     # A direction of information g has the window's own number, shown / g, with the variance 1 / g + 1 about 0.
-    informed = gains > _SINGULAR
+    informed = gains > _LEAST_INFORMATION
     away = math.sqrt(float(np.sum(shown[informed] ** 2 / (gains[informed] * (1.0 + gains[informed])))))
     counts = gains > 1.0 / _TELLS**2 - 1.0
     gains, shown = gains * counts, shown * counts
