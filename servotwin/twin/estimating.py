@@ -28,6 +28,7 @@ from servotwin.estimation.window import CHANNELS, Window
 from servotwin.messages import Setting
 from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
@@ -58,14 +59,17 @@ def stated_machine(settings: TwinSettings) -> FactorPrior:
 def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
     """Knowledge of a machine before its first window; None: it is not learnt, and keeps the numbers of its model.
 
-    Of one mass behind a rigid transmission only the ratio shows; it is known better where nothing is stated of it.
+    Of one mass behind a rigid transmission only the ratio shows; it is known better where nothing is stated of it. A
+    shaft that is free in the gap begins with what its own estimate assumes where nothing is learnt.
     """
-    known = stated_machine(settings)
-    if not settings.learning.learn or servo.at_motor or not servo.rigid:
+    known, own = stated_machine(settings), output_error.OutputErrorSettings()
+    pitch = min(known.pitch[1], own.ratio)
+    free = servo.backlash_kind is BacklashKind.FREE
+    if not settings.learning.learn or servo.at_motor or not (servo.rigid or free):
         return None
-    if servo_for(servo) is not None:
-        return known
-    return known.with_pitch(0.0, min(known.pitch[1], output_error.OutputErrorSettings().ratio))
+    if free:
+        return FactorPrior.of_spreads(own.stiffness, own.damping, pitch, own.mass_ratio)
+    return known if servo_for(servo) is not None else known.with_pitch(0.0, pitch)
 
 
 def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:

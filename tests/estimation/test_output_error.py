@@ -16,6 +16,7 @@ from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.estimator import _problem
 from servotwin.estimation.output_error.fit import search
+from servotwin.estimation.output_error.learnt_shaft import adapted_shaft
 from servotwin.estimation.output_error.models import Priors, ShaftModel
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.verdict import _slow, grown
@@ -83,6 +84,28 @@ def test_the_load_under_the_motor_s_motion_is_that_of_the_exact_simulation(axis:
         errors.append(float(np.abs(moved.position - run.position).max()) / (axis.p * gap))
     assert errors[1] < 1e-4
     assert 10.0 < errors[0] / errors[1] < 25.0
+
+
+def test_a_learnt_covariance_is_the_prior_of_a_fit_and_leaves_the_others_as_they_are() -> None:
+    covariance = np.diag(np.square([0.01, 0.1, 0.002, 0.03]))
+    covariance[0, 1] = covariance[1, 0] = -0.6 * 0.01 * 0.1
+    plain, model = ShaftModel(TWO_LOADS, PRIORS), ShaftModel(TWO_LOADS, PRIORS, covariance)
+    factors, places = (list(each) for each in zip(*model.places, strict=True))
+    assert [plain.unknowns[place].name for place in places] == ["shaft stiffness", "shaft damping", "mass ratio"]
+    known = model.root.T @ model.root
+    assert np.linalg.inv(known[np.ix_(places, places)]) == pytest.approx(covariance[np.ix_(factors, factors)])
+    stds = {unknown.name: unknown.std for unknown in model.unknowns}
+    assert (stds["ratio"], stds["shaft stiffness"]) == pytest.approx((0.002, 0.01))
+    others = [i for i, unknown in enumerate(plain.unknowns) if i not in places and unknown.name != "ratio"]
+    assert np.array_equal(model.root[others], plain.root[others])
+
+
+def test_a_shaft_is_adapted_by_its_own_numbers_alone() -> None:
+    made = adapted_shaft(TWO_LOADS, np.log([1.1, 0.7, 1.01, 1.2]))
+    shaft, own = made.transmission, TWO_LOADS.transmission
+    assert (shaft.k_d, shaft.c_d, shaft.p) == pytest.approx((1.1 * own.k_d, 0.7 * own.c_d, 1.01 * own.p))
+    assert made.load.m == pytest.approx((3.0, 1.2 * 2.6))
+    assert (made.load.k, made.load.c) == (TWO_LOADS.load.k, TWO_LOADS.load.c)
 
 
 def test_a_load_that_friction_holds_does_not_creep() -> None:

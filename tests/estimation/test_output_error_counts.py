@@ -15,8 +15,8 @@ from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.estimator import _problem, fit
 from servotwin.estimation.output_error.fit import search
-from servotwin.estimation.output_error.models import lagged
 from servotwin.estimation.output_error.motor_angle import without_noise
+from servotwin.estimation.output_error.play_model import lagged
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis

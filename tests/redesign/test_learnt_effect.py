@@ -15,6 +15,7 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Setting, Update
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
@@ -88,6 +89,11 @@ def test_the_pitch_counts_with_its_covariance() -> None:
     assert factors.names == ("k", "c", "p")
     assert factors.covariance[2][2] == covariance[2, 2]
     assert factors.covariance[0][2] == covariance[0, 2]
+
+
+def test_a_free_shaft_keeps_its_stated_ranges_in_the_verification() -> None:
+    """Its load's mass and damping are not learnt, and both act on the loop."""
+    assert learnt_servo(Axis.preset("gantry"), POLICY.uncertainty, learnt(OFF_BY[0]), None) is None
 
 
 @cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from servotwin.estimation.output_error.models import (
     ShaftModel,
     Unknown,
     exponential,
+    independent,
 )
 from servotwin.estimation.output_error.problem import LARGEST, delayed
 from servotwin.plant.actuator import Actuator
@@ -73,6 +74,11 @@ class MotorModel:
         stds = (self.load, self.torque, self.damping, self.damping, math.inf, self.delay, math.inf)
         units = ("factor", "factor", "damping", "damping", "command", "time", "speed")
         return (*self.shaft.unknowns, *map(Unknown, _MOTOR, stds, units))
+
+    @cached_property
+    def root(self) -> Array:
+        """(u, u), diagonal."""
+        return independent(self.unknowns)
 
 
 @dataclass(frozen=True, eq=False)

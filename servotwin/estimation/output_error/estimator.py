@@ -16,8 +16,10 @@ from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, MachineReading, no_estimate
 from servotwin.estimation.output_error.fit import Search, search
-from servotwin.estimation.output_error.models import MotionModel, PlayModel, Priors, ShaftModel
+from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, shaft_reading
+from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
+from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
@@ -63,7 +65,8 @@ def estimate(
         Total gap, rad: one of the starts.
     settings : OutputErrorSettings, optional
     machine : FactorPrior, optional
-        What is known of the machine. Of a rigid transmission its pitch is the ratio, and the estimate has a reading.
+        What is known of the machine, in place of the settings' spreads; the estimate then has a reading. Of a rigid
+        transmission its pitch counts alone, which is the ratio.
 
     Raises
     ------
@@ -78,13 +81,16 @@ def estimate(
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
-    found, noise = _fit(window, theta_m, axis, prior, settings)
+    found, noise = _fit(window, theta_m, axis, prior, settings, machine)
     unit, possible = 2.0 / axis.p, possible_half(found)
     stated = _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
-    # A spread that is small beside the motor's travel only is too large to tell a ratio.
-    if machine is None or possible is None or not (stated.ok and stated.std <= settings.largest_share * stated.gap):
+    if machine is None or not stated.ok:
         return stated
-    return replace(stated, machine=_taught(machine, possible, settings.calibration))
+    if possible is None:
+        return _with_shaft(stated, shaft_reading(found, machine, settings.calibration))
+    # A spread that is small beside the motor's travel only is too large to tell a ratio.
+    taught = stated.std <= settings.largest_share * stated.gap
+    return replace(stated, machine=_taught(machine, possible, settings.calibration) if taught else None)
 
 
 def fit(
@@ -97,15 +103,25 @@ def fit(
     """Fit a window as `estimate` does; raises InvalidInput as it does."""
     theta_m = _checked(window, axis)
     axis, settings = _known(axis, settings, machine)
-    return _fit(window, theta_m, axis, prior, settings)[0]
+    return _fit(window, theta_m, axis, prior, settings, machine)[0]
 
 
 def _known(axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None) -> tuple[Axis, OutputErrorSettings]:
-    """The axis with the ratio that is known of it, and the settings with that ratio's spread."""
-    if machine is None or axis.backlash_kind is BacklashKind.FREE:
+    """The axis with the numbers that are known of it, and the settings with the spread of a rigid one's ratio."""
+    if machine is None:
         return axis, settings
+    if axis.backlash_kind is BacklashKind.FREE:
+        return adapted_shaft(axis, machine.mean), settings
     mean, std = machine.pitch
     return axis.scaled({"p": math.exp(mean)}), replace(settings, ratio=std)
+
+
+def _with_shaft(stated: GapEstimate, reading: ShaftReading) -> GapEstimate:
+    """The estimate with the machine's numbers; refused where they contradict what was known of them."""
+    if reading.contradicts:
+        refused = no_estimate(stated.time, (reading.sentence,), stated.model_version, stated.method)
+        return replace(refused, status=GapStatus.MODEL_MISMATCH, rms=stated.rms, evaluations=stated.evaluations)
+    return replace(stated, machine=reading.machine)
 
 
 def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) -> MachineReading | None:
@@ -119,13 +135,18 @@ def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) ->
 
 
 def _fit(
-    window: Window, theta_m: Array, axis: Axis, prior: float | GapEstimate | None, settings: OutputErrorSettings
+    window: Window,
+    theta_m: Array,
+    axis: Axis,
+    prior: float | GapEstimate | None,
+    settings: OutputErrorSettings,
+    machine: FactorPrior | None,
 ) -> tuple[Search, float]:
     """The fit of a window, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
     free = axis.backlash_kind is BacklashKind.FREE
     motor = MotorAngle(theta_m, 0.0) if free else without_noise(theta_m, _count_of_motor(axis, theta_m))
     expected = prior.gap if isinstance(prior, GapEstimate) else prior
-    problem = _problem(window, motor.angle, axis, settings)
+    problem = _problem(window, motor.angle, axis, settings, None if machine is None else machine.covariance)
     return search(problem, 0.5 * axis.p * (expected or 0.0)), motor.noise
 
 
@@ -159,8 +180,10 @@ def _count_of_motor(axis: Axis, theta_m: Array) -> float:
     return max(axis.encoder_resolution, counted(theta_m))
 
 
-def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings) -> Problem:
-    """The window with its model."""
+def _problem(
+    window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings, learnt: Array | None = None
+) -> Problem:
+    """The window with its model; `learnt` (4, 4) is the covariance of what is known of a free shaft."""
     interval = 1.0 / window.sample_rate
     measured = theta_m if window.theta_m is None else window.theta_m
     at_motor = _count_of_motor(axis, measured)
@@ -171,7 +194,7 @@ def _problem(window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSe
         late = max(late, _LATE / own)
         theta_m = _smooth(theta_m, _CUT * own / (2.0 * math.pi), window.sample_rate) if at_motor > 0.0 else theta_m
     priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
-    model: MotionModel = ShaftModel(axis, priors) if free else PlayModel(axis, priors)
+    model: MotionModel = ShaftModel(axis, priors, learnt) if free else PlayModel(axis, priors)
     count = math.hypot(axis.p * at_motor, at_load)
     return Problem(model, axis.p * theta_m, window.position, interval, count)
 

@@ -113,10 +113,9 @@ def whitened_rows(
         moved[i] += steps[i]
         table[i + 1] = (problem.misfit(moved, rate) - raw) / steps[i]
     white = noise.whiten(table)
-    spreads = np.array([unknown.std for unknown in problem.model.unknowns])
-    known = np.diag(1.0 / spreads)
-    rows = np.hstack([white[1:], known * free])
-    return np.concatenate([white[0], values / spreads]), rows, raw
+    root = problem.model.root
+    rows = np.hstack([white[1:], root.T * free[:, None]])
+    return np.concatenate([white[0], root @ values]), rows, raw
 
 
 def descend(
@@ -145,7 +144,7 @@ def descend(
             if -float(move @ (2.0 * residual + move)) <= _GAIN * cost / residual.size:
                 return Fit(values, residual, rows, cost, raw, count)
             white = noise.whiten(problem.misfit(ahead, rate)[None])[0]
-            prior = ahead / np.array([unknown.std for unknown in problem.model.unknowns])
+            prior = problem.model.root @ ahead
             after, count = float(white @ white + prior @ prior), count + 1
             better = after < cost
             damping = max(1e-9, 0.1 * damping) if better else 10.0 * damping

@@ -1,8 +1,9 @@
-"""The two models: a load behind an elastic shaft that is free in the gap, and one mass on a rigid screw."""
+"""Models of a window, and that of a load behind an elastic shaft that is free in the gap."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import NamedTuple, Protocol, TypeAlias
@@ -11,9 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.estimation.output_error.shaft import run_shaft
-from servotwin.hybrid.compiled import bare
 from servotwin.plant.axis import Axis
-from servotwin.plant.backlash import play_samples
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
@@ -22,6 +21,7 @@ from servotwin.plant.structure import chain
 _FINE, _CONVERGES = 0.4, 1.2
 _PARTS = 3  # of a sample with friction, whose sign changes between parts only
 _OWN = (1.0,) * 6  # factors of the model's own numbers
+_KNOWN = 0.5  # of a damping's usual spread: below it windows told of it
 _EXPONENTIAL = 20  # terms of the series, for a norm below one
 
 
@@ -61,11 +61,14 @@ class Unknown(NamedTuple):
 class FittedModel(Protocol):
     """Model of a window: its unknowns, of which the first is the half gap at the load, and its observer's rate, 1/s.
 
+    `root` (u, u) times the unknowns has unit covariance by what is known of them beforehand, and 0 where nothing is.
     `slowing`: rates of the observer in the second fits and in the last ones, over the first.
     """
 
     @property
     def unknowns(self) -> tuple[Unknown, ...]: ...
+    @property
+    def root(self) -> Array: ...
     @property
     def speed(self) -> float: ...
     @property
@@ -90,11 +93,18 @@ class Priors(NamedTuple):
     delay: float
 
 
+def independent(unknowns: Sequence[Unknown]) -> Array:
+    """(u, u) `root` of unknowns that are known independently of each other."""
+    return np.diag([1.0 / unknown.std for unknown in unknowns])
+
+
 HALF, OFFSET, DELAY, RATIO = range(4)
-LAG = 5  # of `PlayModel`
+LEARNT = {"shaft stiffness": 0, "shaft damping": 1, "mass ratio": 3}
+"""Unknowns of `ShaftModel` that are learnt, with their places in `servotwin.estimation.whitened.free_model.FACTORS`."""
 
 
-def _common(priors: Priors) -> tuple[Unknown, ...]:
+def common(priors: Priors) -> tuple[Unknown, ...]:
+    """Unknowns of every model of the load's motion, the first ones."""
     return (
         Unknown("half gap", math.inf, "load"),
         Unknown("offset", math.inf, "load"),
@@ -141,10 +151,20 @@ class PreparedShaft(NamedTuple):
 
 @dataclass(frozen=True)
 class ShaftModel:
-    """Chain of masses behind an elastic shaft that is free in the gap."""
+    """Chain of masses behind an elastic shaft that is free in the gap.
+
+    Attributes
+    ----------
+    axis : Axis
+        With the numbers that are known best.
+    priors : Priors
+    learnt : (4, 4) array, optional
+        Covariance of the logarithms of stiffness, damping, ratio and ratio of the masses, in place of their `priors`.
+    """
 
     axis: Axis
     priors: Priors
+    learnt: Array | None = None
 
     @property
     def speed(self) -> float:
@@ -160,9 +180,12 @@ class ShaftModel:
     def unknowns(self) -> tuple[Unknown, ...]:
         """Half gap, offset of the motor's encoder, delay, ratio; factors; first positions and speeds of the masses."""
         load, known = self.axis.load, self.priors
-        factors = [Unknown("shaft stiffness", known.stiffness, "factor")]
+        own = (known.stiffness, known.damping, known.ratio, known.mass_ratio)
+        stiffness, damping, ratio, mass_ratio = own if self.learnt is None else np.sqrt(np.diag(self.learnt)).tolist()
+        factors = [Unknown("shaft stiffness", stiffness, "factor")]
         if self.axis.transmission.c_d > 0.0:
-            factors.append(Unknown("shaft damping", known.damping, "damping"))
+            unit = "factor" if damping < _KNOWN * known.damping else "damping"
+            factors.append(Unknown("shaft damping", damping, unit))
         if any(load.c):
             factors.append(Unknown("load damping", known.damping, "damping"))
         if load.friction > 0.0:
@@ -172,12 +195,27 @@ class ShaftModel:
         if any(load.k):
             factors.append(Unknown("load stiffness", known.stiffness, "factor"))
         if load.n > 1:
-            factors.append(Unknown("mass ratio", known.mass_ratio, "factor"))
+            factors.append(Unknown("mass ratio", mass_ratio, "factor"))
         if not load.free:
             factors.append(Unknown("position offset", math.inf, "load"))
         places = [Unknown(f"q{i + 1}", math.inf, "load") for i in range(load.n)]
         speeds = [Unknown(f"v{i + 1}", math.inf, "speed") for i in range(load.n)]
-        return (*_common(known), *factors, *places, *speeds)
+        return (*common(known._replace(ratio=ratio)), *factors, *places, *speeds)
+
+    @cached_property
+    def places(self) -> tuple[tuple[int, int], ...]:
+        """Of the unknowns in `LEARNT`, place there and among the unknowns."""
+        names = [unknown.name for unknown in self.unknowns]
+        return tuple((at, names.index(name)) for name, at in LEARNT.items() if name in names)
+
+    @cached_property
+    def root(self) -> Array:
+        """(u, u), with the learnt covariance."""
+        root = independent(self.unknowns)
+        if self.learnt is not None:
+            which, places = (np.array(each) for each in zip(*self.places, strict=True))
+            root[np.ix_(places, places)] = np.linalg.inv(np.linalg.cholesky(self.learnt[np.ix_(which, which)]))
+        return root
 
     def start(self, half: float, offset: float, first: tuple[float, float]) -> Array:
         """Unknowns (u,) at the model's numbers, for the last mass's first position and speed."""
@@ -300,73 +338,3 @@ def exponential(matrix: Array) -> Array:
     for _ in range(halvings):
         result = result @ result
     return result
-
-
-@dataclass(frozen=True)
-class PlayModel:
-    """One mass on a rigid screw: the play operator, and the lag of its encoder."""
-
-    axis: Axis
-    priors: Priors
-
-    @property
-    def speed(self) -> float:
-        """No observer."""
-        return 0.0
-
-    @property
-    def slowing(self) -> tuple[float, float]:
-        """Any."""
-        return 1.0, 1.0
-
-    @cached_property
-    def unknowns(self) -> tuple[Unknown, ...]:
-        """Half gap, offset of the position, delay, ratio, first place of the screw, lag of the position.
-
-        Both encoders' electronics delay, and filter: a lag that is not fitted is taken for gap and delay.
-        """
-        return (
-            *_common(self.priors),
-            Unknown("first place", math.inf, "load"),
-            Unknown("lag", self.priors.delay, "time", positive=True),
-        )
-
-    def start(self, half: float, offset: float, first: tuple[float, float]) -> Array:
-        """Unknowns (u,) for a first position of the mass."""
-        return np.array([half, offset, 0.0, 0.0, first[0], 0.0])
-
-    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
-        """Motion under the motor's motion (N,) at the load, for unknowns (u,); there is nothing to observe."""
-        del measured, rate
-        driven, half, place = self._driven(drive, values)
-        lead, lag = driven - place, float(values[LAG])
-        sides = np.where(np.abs(lead) >= half * (1.0 - 1e-9), np.sign(lead), 0.0).astype(np.int8)
-        return Motion(lagged(place, lag / interval), np.gradient(place, interval), place, sides)
-
-    def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
-        """Position (N,) of the mass in `simulate`."""
-        del measured, rate
-        return lagged(self._driven(drive, values)[2], float(values[LAG]) / interval)
-
-    def _driven(self, drive: Array, values: Array) -> tuple[Array, float, Array]:
-        """Motor (N,) at the load, half gap there, and place (N,) of the screw behind the gap."""
-        half, offset, _, ratio, first, _ = values.tolist()
-        driven, half = math.exp(ratio) * drive + offset, math.exp(ratio) * abs(half)
-        return driven, half, play_samples(driven, np.array([half]), first)
-
-
-def lagged(values: Array, samples: float) -> Array:
-    """A signal (N,) behind a first-order lag of a number of samples, straight between them."""
-    out = np.empty(values.size)
-    decay = math.exp(-1.0 / samples) if samples > 0.0 else 0.0
-    slope = samples * (1.0 - decay)
-    out[0] = values[0]
-    lag(values, decay, 1.0 - slope, slope - decay, out)
-    return out
-
-
-@bare
-def lag(values: Array, decay: float, now: float, before: float, out: Array) -> None:
-    """`lagged` into `out` (N,), of which the first is there."""
-    for i in range(1, values.size):
-        out[i] = decay * out[i - 1] + now * values[i] + before * values[i - 1]

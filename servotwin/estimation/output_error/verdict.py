@@ -13,6 +13,7 @@ from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
 from servotwin.estimation.output_error.models import HALF, RATIO
 from servotwin.estimation.output_error.possible import PossibleHalf
+from servotwin.estimation.output_error.rounding import per_count
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.plant.signals import Array
 
@@ -248,12 +249,7 @@ def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple
     white = np.zeros(data)
     seen = keep < data
     white[keep[seen]] = weights[seen]
-    # Back from the whitened residual to the samples: the whitening filter, transposed.
-    filtered = np.convolve(white[::-1], found.noise.predictors[-1])[:data][::-1] / found.noise.spread[-1]
-    margin = (problem.position.size - data) // 2
-    begins = np.flatnonzero(np.diff(problem.position[margin : margin + data])) + 1
-    sums = np.add.reduceat(filtered, np.concatenate([[0], begins]))
-    rounding = problem.count * _EVENLY * float(np.linalg.norm(sums))
+    rounding = problem.count * _EVENLY * float(np.linalg.norm(per_count(found, white[None])))
     std = math.sqrt(inverse[at, at] * fit.variance()) / size[at]
     return float(weights @ fit.residual[keep]), std, rounding
 

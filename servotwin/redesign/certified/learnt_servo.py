@@ -9,6 +9,7 @@ import numpy as np
 from servotwin.estimation.learning.motor import BACK_EMF, LAG, LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.plant.axis import Axis
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -19,6 +20,15 @@ from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 _LEAST_K, _LEAST_C = 0.002, 0.01
 # Of a stated half-width: a number of the motor that is not known better than that stays as stated.
 _WELL_KNOWN = 0.5
+
+
+def counts_learnt(servo: Plant) -> bool:
+    """True where a learnt machine counts in place of the stated half-widths.
+
+    Of a free shaft it does not: the verification draws one factor for all stiffnesses and one for all dampings, and the
+    load's own damping is not learnt. Its mass, which acts back on the motor there, is not either.
+    """
+    return servo.backlash_kind is not BacklashKind.FREE
 
 
 def narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
@@ -35,7 +45,7 @@ def learnt_servo(
     The motor's numbers count where the windows told more of them than was stated.
     """
     names, variances = list[str](), list[Array]()
-    if machine is not None:
+    if machine is not None and counts_learnt(servo):
         servo = adapted(servo, machine.mean) if isinstance(servo, Servo) else _scaled(servo, machine.mean)
         names += ["k", "c", "p"]
         variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))

@@ -24,6 +24,7 @@ from servotwin.plant.scales import scales
 from servotwin.redesign.certified.attempt import with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm, known_bias
+from servotwin.redesign.certified.learnt_servo import counts_learnt
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.design import Design
@@ -268,7 +269,8 @@ class TablePolicy:
 
         A machine that was learnt to lie outside of the stated half-widths is in no cell: its settings are verified.
         """
-        if evidence.machine is not None and not _is_stated(evidence.machine, self.policy.uncertainty):
+        learnt = evidence.machine if counts_learnt(self.policy.servo) else None
+        if learnt is not None and not _is_stated(learnt, self.policy.uncertainty):
             return self.policy.redesign(evidence)
         return self.policy.decide(evidence, self)
 
