@@ -258,7 +258,7 @@ def _noise(position: Array, size: int) -> float:
 
 
 def _means(samples: Array, size: int) -> Array:
-    return np.asarray(samples.reshape(-1, size).mean(axis=1))
+    return np.asarray(np.add.reduce(samples.reshape(-1, size), axis=1) / size)
 
 
 def _no_rest(constant: bool, shortest: float) -> str:
