@@ -92,4 +92,4 @@ def variants(
 
 def _times(factors: Array, part: Array) -> Array:
     """(s, ...) a part times each factor (s,)."""
-    return np.multiply.outer(factors, part)
+    return factors.reshape(-1, *part.ndim * [1]) * part
