@@ -100,10 +100,12 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
     parameters = controller.replace(sample_rate=window.sample_rate).law(tolerance)
     if _largest(parameters, window.voltage, window.reference, window.position) > _VAST:
         return None
-    made = None
+    steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
+    fading, made = (1.0 - steps) ** np.arange(window.voltage.size + 1), None
     for delay in range(_DELAYS):
         voltage, rest = window.voltage[delay:], window.voltage.size - delay
-        later = _compared(parameters, voltage, window.reference[:rest], window.position[:rest])
+        asked = made is None or not made.factors
+        later = _compared(parameters, fading, voltage, window.reference[:rest], window.position[:rest], asked)
         if later is None or later.agrees:
             return later
         made = later if made is None or (later.factors and not made.factors) else made
@@ -111,13 +113,24 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
 
 
 def _compared(
-    parameters: LawParameters, voltage: Array, reference: Array, position: Array
+    parameters: LawParameters, fading: Array, voltage: Array, reference: Array, position: Array, asked: bool
 ) -> ControllerComparison | None:
-    """Compare a voltage with that of a law, sample by sample."""
+    """Compare a voltage with that of a law, sample by sample.
+
+    Parameters
+    ----------
+    parameters : LawParameters
+    fading : (3, n + 1 or more) array
+        What is left sample by sample of the offset, of the filtered error and of the filtered reference's speed.
+    voltage, reference, position : (n,) arrays
+        V, m, m.
+    asked : bool
+        False: the factors are not computed.
+    """
     first = _forgotten(parameters)
     if position.size - first < 2 * _BLOCKS:
         return None
-    given = _voltage_from_best_start(parameters, voltage, reference, position)
+    given = _voltage_from_best_start(parameters, fading, voltage, reference, position)
     means = _means(voltage, first)
     swing, unexplained = _rms(means - means.mean()), _rms(_means(voltage - given, first))
     stiff = _stiffness(parameters)
@@ -125,11 +138,15 @@ def _compared(
     tolerated = _TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
     if tolerated >= _LARGEST * swing:
         return None
-    factors = {} if unexplained <= tolerated else _factors(parameters, voltage, reference, position, first, tolerated)
+    factors: dict[str, float] = {}
+    if asked and not unexplained <= tolerated:
+        factors = _factors(parameters, fading, voltage, reference, position, first, tolerated)
     return ControllerComparison(unexplained, swing, tolerated, factors)
 
 
-def _voltage_from_best_start(parameters: LawParameters, voltage: Array, reference: Array, position: Array) -> Array:
+def _voltage_from_best_start(
+    parameters: LawParameters, fading: Array, voltage: Array, reference: Array, position: Array
+) -> Array:
     """Voltage (n,) of the law from the initial state that fits the recorded one best."""
     start = law.start(float(position[0]))._replace(reference=float(reference[0]), voltage=float(voltage[0]))
     best, least = np.zeros(0), math.inf
@@ -141,7 +158,7 @@ def _voltage_from_best_start(parameters: LawParameters, voltage: Array, referenc
             # A voltage at its limit corrects the integral: what is left of its first value shows before that.
             first = int(np.argmax(limited)) if limited.any() else limited.size
             free = np.arange(limited.size) < first if first >= _FEWEST else ~limited
-            state = _corrected(parameters, state, voltage - given, acting, free, reference)
+            state = _corrected(parameters, fading, state, voltage - given, acting, free, reference)
         given, _ = run_law(parameters, state, reference, position)
         if (error := _rms(voltage - given)) < least:
             best, least = given, error
@@ -150,6 +167,7 @@ def _voltage_from_best_start(parameters: LawParameters, voltage: Array, referenc
 
 def _corrected(
     parameters: LawParameters,
+    fading: Array,
     state: LawState,
     left: Array,
     acting: Array,
@@ -157,21 +175,21 @@ def _corrected(
     reference: Array,
 ) -> LawState:
     """Correct the initial state by what it would have to be for the voltage left (n,) to vanish where it is free."""
-    count = np.arange(left.size)
-    columns = {"offset": (1.0 - parameters.release_step) ** count}
+    size = left.size
+    columns = {"offset": fading[0, :size]}
     if parameters.integral_step != 0.0:
         columns["integral"] = acting
     if parameters.derivative_gain != 0.0:
-        columns["derivative"] = -parameters.derivative_gain * acting * (1.0 - parameters.filter_step) ** count
+        columns["derivative"] = -parameters.derivative_gain * acting * fading[1, :size]
     if parameters.velocity_gain != 0.0:
-        columns["ahead"] = parameters.velocity_gain * (1.0 - parameters.velocity_step) ** (count + 1)
+        columns["ahead"] = parameters.velocity_gain * fading[2, 1 : size + 1]
     if parameters.friction != 0.0:
         # Which way the reference moved before the window holds until it moves in it.
         columns["direction"] = parameters.friction * (np.cumsum(reference != reference[0]) == 0)
     if parameters.notch_gain != 0.0:
         for name in columns.keys() & {"integral", "derivative"}:
             columns[name] = behind_notch(parameters, np.asarray(columns[name], dtype=float), 0.0, 0.0)
-        columns |= _notch_columns(parameters, left.size)
+        columns |= _notch_columns(parameters, size)
     matrix = np.stack([column[free] for column in columns.values()], axis=1)
     values = _least_squares(matrix, left[free])
     return state._replace(
@@ -180,14 +198,19 @@ def _corrected(
 
 
 def _factors(
-    parameters: LawParameters, voltage: Array, reference: Array, position: Array, first: int, tolerated: float
+    parameters: LawParameters,
+    fading: Array,
+    voltage: Array,
+    reference: Array,
+    position: Array,
+    first: int,
+    tolerated: float,
 ) -> dict[str, float]:
     """Gains in stated ones with which the law without limits explains the voltage; empty: none do."""
     terms = _law_terms(parameters, reference, position)
     stated = {name: term for name, term in terms.gains.items() if np.any(term != 0.0)}
-    steps = np.array([[parameters.release_step], [parameters.filter_step], [parameters.velocity_step]])
     # What the law's state before the window leaves in it.
-    fading = (1.0 - steps) ** np.arange(voltage.size)
+    fading = fading[:, : voltage.size]
     initial = [terms.acting, *fading]
     if parameters.notch_gain != 0.0:
         initial = [behind_notch(parameters, terms.acting, 0.0, 0.0), fading[0], fading[2]]
@@ -260,7 +283,11 @@ def _law_terms(parameters: LawParameters, reference: Array, position: Array) -> 
         Kp=0.0, integral_step=0.0, derivative_gain=0.0, velocity_gain=0.0, friction=0.0,
     )  # fmt: skip
     _, acting = run_law(nothing, start, reference, position)
-    runs = {name: run_law(nothing._replace(**gain), start, reference, position)[0] for name, gain in stated.items()}
+    runs = {
+        name: run_law(nothing._replace(**gain), start, reference, position)[0]
+        for name, gain in stated.items()
+        if any(gain.values())
+    }
     return _Terms(acting, runs)
 
 

@@ -116,7 +116,7 @@ def quick_bias(window: Window, servo: Plant) -> tuple[float, float]:
 
     The first such interval at rest counts; without one, or without the channels, the result is (NaN, inf).
     """
-    if holds_position(servo) or any(name not in window.channels for name in ("reference", "voltage", "theta_m")):
+    if holds_position(servo) or not {"reference", "voltage", "theta_m"} <= window.channels.keys():
         return math.nan, math.inf
     window = window.driven(servo.command_limit)
     size, least = _sizes(window, scales(servo))
@@ -173,7 +173,7 @@ class _Means(NamedTuple):
     @classmethod
     def of(cls, samples: Array, size: int) -> _Means:
         values = _means(samples, size)
-        steps = np.diff(values)
+        steps = values[1:] - values[:-1]
         return cls(values, steps**2, np.maximum.accumulate(np.abs(steps)[::-1]))
 
 
@@ -193,7 +193,7 @@ def _batches(window: Window, size: int, first: int, last: int, per_sample: float
     assert window.theta_m is not None
     angle = window.theta_m[first:last]
     ends = np.append(angle[::size], angle[-1] + (angle[-1] - angle[-2]))
-    back_emf = per_sample * np.diff(ends) / size
+    back_emf = per_sample * (ends[1:] - ends[:-1]) / size
     drive = _means(window.voltage[first:last], size) - back_emf
     return _Batches(_Means.of(angle, size), _Means.of(window.position[first:last], size), back_emf, drive)
 
@@ -258,7 +258,7 @@ def _noise(position: Array, size: int) -> float:
 
 
 def _means(samples: Array, size: int) -> Array:
-    return np.asarray(samples.reshape(-1, size).mean(axis=1))
+    return np.asarray(np.add.reduce(samples.reshape(-1, size), axis=1) / size)
 
 
 def _no_rest(constant: bool, shortest: float) -> str:

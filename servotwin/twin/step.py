@@ -333,7 +333,7 @@ def _teach(
     """Decide if the edge is sent the learnt structure; `estimate`: of this window, where it counts."""
     if model.responses is None or state.responses is None or state.oversight.held:
         return state, ()
-    machine = state.wear.known_machine(model.settings.learning, arrived)
+    machine = None if estimate is None else state.wear.known_machine(model.settings.learning, arrived)
     responses, sent = model.responses.after(state.responses, decoded, arrived, estimate, machine)
     return replace(state, responses=responses), () if sent is None else (sent,)
 

@@ -7,6 +7,7 @@ import pytest
 
 from servotwin.control.controller import Controller
 from servotwin.control.law import start, tick
+from servotwin.estimation import controller as comparison
 from servotwin.estimation.controller import compare_controller
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
@@ -73,6 +74,17 @@ def test_gains_that_were_changed_are_said_in_stated_ones(factors):
     assert not made.agrees
     assert [made.factors[name] for name in ("Kp", "Ki", "Kd")] == pytest.approx(factors, abs=0.02)
     assert f"it fits Kp {factors[0]:.2g}, Ki {factors[1]:.2g}" in made.sentence
+
+
+def test_gains_that_explain_a_voltage_are_not_looked_for_again_at_every_delay(monkeypatch):
+    searched, fit = [], comparison._factors
+    monkeypatch.setattr(comparison, "_factors", lambda *given: searched.append(fit(*given)) or searched[-1])
+    made = compare_controller(by_hand(LAW.replace(Kp=0.5 * LAW.Kp), 0.0), LAW, 0.0)
+    assert searched == [made.factors]
+    assert made.factors["Kp"] == pytest.approx(0.5, abs=0.02)
+    searched.clear()
+    assert compare_controller(loop(LAW), LAW, 0.0).factors == {}
+    assert len(searched) == comparison._DELAYS
 
 
 def test_an_edge_that_ignores_the_velocity_feedforward_is_said_so():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from dataclasses import replace
 from functools import cache
@@ -12,6 +13,7 @@ import pytest
 from twin_messages import message_of
 
 from benchmarks.estimator_windows import cut
+from servotwin.estimation.core.response import Response
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.estimation.whitened.quick import quick_fit
@@ -115,3 +117,20 @@ def test_the_machines_spread_is_that_of_fits_to_other_machines() -> None:
         ends = [quick_fit(window, adapted(SERVO, mean + sign * axis), 10.0 * DEG).gap for sign in (1.0, -1.0)]
         moved.append(0.5 * (ends[0] - ends[1]))
     assert here.machine_spread().gap == pytest.approx(float(np.linalg.norm(moved)), rel=0.05)
+
+
+def test_glances_keep_little_of_the_machines_that_they_have_seen() -> None:
+    """A worker of a fleet meets thousands of machines, each of which comes back after all the others."""
+    window = decode_window(off_windows(OFF_BY[0], 10.0, False, 0.0)[0])
+    rng, covariance = np.random.default_rng(3), np.diag([1e-6, 1e-5, 1e-7, 1e-6])
+    gc.collect()
+    before = responses_in_memory()
+    for _ in range(200):
+        quick_fit(window, SERVO, 10.0 * DEG, None, FactorPrior(1e-3 * rng.standard_normal(4), covariance))
+    gc.collect()
+    assert responses_in_memory() - before < 100
+
+
+def responses_in_memory() -> int:
+    """Number of sampled responses that something still refers to."""
+    return sum(isinstance(one, Response) for one in gc.get_objects())

@@ -94,17 +94,13 @@ def orthonormal(columns: Array, basis: Array | None = None) -> Array:
     rows = np.empty((known + len(columns), columns.shape[1]))
     if basis is not None:
         rows[:known] = basis
-    for column in columns:
-        if add_direction(rows, known, column, _DEPENDENT):
-            known += 1
-    return rows[:known]
+    return rows[: add_directions(rows, known, np.ascontiguousarray(columns), _DEPENDENT)]
 
 
 def project_out(basis: Array, columns: Array) -> Array:
     """(k, n) what is left of the rows of `columns` (k, n) off the orthonormal rows of `basis` (r, n)."""
     left = columns.copy()
-    for row in left:
-        remove(basis, len(basis), row)
+    remove_from_all(basis, left)
     return left
 
 
@@ -154,3 +150,19 @@ def add_direction(rows: Array, known: int, column: Array, dependent: float) -> b
     for i in range(row.size):
         row[i] /= length
     return True
+
+
+@bare
+def add_directions(rows: Array, known: int, columns: Array, dependent: float) -> int:
+    """Put what is new in some columns (k, n) into the rows from `known` on; return the number of rows then."""
+    for k in range(len(columns)):
+        if add_direction(rows, known, columns[k], dependent):
+            known += 1
+    return known
+
+
+@bare
+def remove_from_all(basis: Array, columns: Array) -> None:
+    """Take off some columns (k, n) their parts along orthonormal rows."""
+    for k in range(len(columns)):
+        remove(basis, len(basis), columns[k])

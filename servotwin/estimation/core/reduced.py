@@ -214,6 +214,11 @@ def run_blocks(inputs: Array, angles: Array, decay: Array, gain: Array, table: A
                 table[j, block] = inputs[k, block * factor + j]
         for w in range(len(angles)):
             row = sums[w]
+            # Both at once, added in the order of the loops below: the paper's structure at 1 kHz.
+            if factor == 2:
+                for i in range(blocks):
+                    row[i] = angles[w, 1] * table[1, i] + angles[w, 0] * table[0, i]
+                continue
             for i in range(blocks):
                 row[i] = 0.0
             for j in range(0, factor - 3, 4):

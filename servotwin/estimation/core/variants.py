@@ -30,6 +30,8 @@ class _Parts(NamedTuple):
     velocity: Array
     row: Array
     direct: float
+    masses: Array
+    stiffnesses: Array
 
 
 @lru_cache(maxsize=64)
@@ -50,6 +52,8 @@ def _parts(servo: Servo, elastic: bool) -> _Parts:
         damped.B_velocity,
         none.C_last,
         float(none.D[-1]),
+        m,
+        k,
     )
 
 
@@ -69,21 +73,23 @@ def variants(
         N/m, the screw's stiffness in each machine; None: the servo's own.
     """
     k, c, pitch, last = np.exp(np.array(factors)).T
-    p = pitch * servo.p
-    parts = _parts(servo, screw is not None or not servo.rigid)
-    stiffness = np.array(screw) if screw is not None else np.full(k.size, 0.0 if servo.rigid else servo.k_d)
-    A = parts.upper + _times(k, parts.A_by_k) + _times(c, parts.A_by_c) + _times(stiffness, parts.A_by_screw)
-    masses = np.tile(servo.masses, (k.size, 1))
+    p, elastic = pitch * servo.p, screw is not None or not servo.rigid
+    parts = _parts(servo, elastic)
+    A = parts.upper + _times(k, parts.A_by_k) + _times(c, parts.A_by_c)
+    position, velocity = _times(k, parts.position_by_k), _times(c, parts.velocity)
+    if elastic:
+        stiffness = np.full(k.size, servo.k_d) if screw is None else np.array(screw)
+        A += _times(stiffness, parts.A_by_screw)
+        position += _times(stiffness, parts.position_by_screw)
+    masses = _times(np.ones(k.size), parts.masses)
     if servo.n > 2:
         A[:, -1] /= last[:, None]
         masses[:, -1] *= last
-    position = _times(k, parts.position_by_k) + _times(stiffness, parts.position_by_screw)
-    velocity = _times(c, parts.velocity)
     drive = p[:, None] * ((A @ velocity[:, :, None])[:, :, 0] + position)
-    unseen = np.sqrt(masses[:, 1:] / _times(k, servo.stiffnesses[1:])).sum(axis=1)
+    unseen = np.sqrt(masses[:, 1:] / _times(k, parts.stiffnesses[1:])).sum(axis=1)
     return Structures(A, drive, parts.row, p * (velocity @ parts.row + parts.direct), unseen).responses(sample_rate)
 
 
 def _times(factors: Array, part: Array) -> Array:
     """(s, ...) a part times each factor (s,)."""
-    return np.multiply.outer(factors, part)
+    return factors.reshape(-1, *part.ndim * [1]) * part

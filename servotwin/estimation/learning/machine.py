@@ -153,9 +153,10 @@ class LearntMachine(Struct, frozen=True):
 
     def prior(self, settings: LearningSettings, now: float) -> FactorPrior:
         """Prior of a window at a time, s: the factors, widened by their drift since then."""
-        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE) + np.diag(settings.walk(now - self.time))
-        short = np.maximum(0.0, settings.floor - np.diag(covariance))
-        return FactorPrior(np.array(self.factors), covariance + np.diag(short), self.softness)
+        covariance = np.array(self.covariance).reshape(_SIZE, _SIZE)
+        widened = covariance.diagonal() + settings.walk(now - self.time)
+        covariance.flat[:: _SIZE + 1] = widened + np.maximum(0.0, settings.floor - widened)
+        return FactorPrior(np.array(self.factors), covariance, self.softness)
 
     def surely(self) -> Array:
         """(4,) least sizes of the factors' logarithms, at 95 %."""

@@ -108,7 +108,10 @@ def evaluate(data: MisfitData, room: Room, gap: float, place: float, rows: Array
     else:
         for k in range(count):
             run_modes(screw[k], data.decay, data.gain, data.direct, moved[k])
-    whiten(moved, data.predictors, data.spread, white)
+    if data.spread.size == 1 and data.spread[0] == 1.0:
+        white = moved
+    else:
+        whiten(moved, data.predictors, data.spread, white)
     for k in range(count):
         row = rows[k]
         for i in range(white.shape[1]):

@@ -214,12 +214,12 @@ def fit(
     """
     if machine is None:
         return first or fit_gap_only(window, servo, prior, settings)
-    made = _unfitted(window, servo, prior, settings)
+    made = first or _unfitted(window, servo, prior, settings)
     if made.broken:
         return made
-    aligned, start = None if first is None else first.aligned, _start(prior)
+    start = _start(prior)
     learnt = learn_and_fit(
-        made.angle, window.position, window.sample_rate, servo, start, made.settings, machine, aligned
+        made.angle, window.position, window.sample_rate, servo, start, made.settings, machine, made.aligned
     )
     return replace(made, servo=learnt.servo, aligned=learnt.aligned, learnt=learnt)
 

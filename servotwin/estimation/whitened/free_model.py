@@ -255,9 +255,10 @@ class FreeProblem:
         residual, rows = self.rows(q)
         cost, count, floor = float(residual @ residual), 1, 0.0
         while count < evaluations and damping < _LARGEST_DAMPING and cost > enough:
-            floor = _linear_floor(residual, rows, movable)
-            if floor > hopeless or floor - most > cost - floor:
-                break
+            if most < math.inf:
+                floor = _linear_floor(residual, rows, movable)
+                if floor > hopeless or floor - most > cost - floor:
+                    break
             step = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high) - q
             if _promised(step, residual, rows) <= gain * cost / residual.size:
                 break

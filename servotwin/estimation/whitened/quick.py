@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares, project_out, remove
-from servotwin.estimation.core.response import Response, response
+from servotwin.estimation.core.response import response
 from servotwin.estimation.core.variants import variants
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.nearby import nearby
@@ -152,19 +151,13 @@ def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None, mach
     reduce = decimation(factor_for(response(servo, window.sample_rate), angle.size))
     rows = reduce.rows(np.vstack([angle - angle[0], position - position[0]]))
     rate = window.sample_rate / reduce.factor
-    model = response(servo, rate) if machine is None else _as_learnt(servo, tuple(machine.mean.tolist()), rate)
+    model = response(servo, rate) if machine is None else variants(servo, [machine.mean], rate)[0]
     if offset is None:
         return Reduction.of(rows[0], rows[1], model, skew=False, factor=1)
     first, home = float(angle[0] + rows[0, 0]), float(position[0] + rows[1, 0])
     gain = model.static_gain
     known = NuisancePrior(gain * (first + offset[0]) - home, abs(gain) * offset[1])
     return Reduction.of(rows[0], rows[1], model, known, skew=False, factor=1)
-
-
-@lru_cache(maxsize=8192)
-def _as_learnt(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
-    """Response of a servo with other logarithms of its factors, at a rate (Hz)."""
-    return variants(servo, [np.array(factors)], rate)[0]
 
 
 def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:
@@ -190,6 +183,6 @@ def _coloured(weights: Array, noise: Array) -> float:
     """Variance of the weighted sum (n,) of noise with the spectrum of one series (n,) of it."""
     count = weights.size
     size = 1 << (2 * count - 1).bit_length()  # at least twice as long, so that no end meets the other
-    gains, powers = (np.abs(np.fft.rfft(series, size)) ** 2 for series in (weights, noise))
+    gains, powers = np.abs(np.fft.rfft([weights, noise], size)) ** 2
     both = gains * powers
     return (2.0 * float(both.sum()) - float(both[0] + both[-1])) / (count * size)
