@@ -58,6 +58,6 @@ def _growths(found: Search) -> Array:
     problem, values = found.problem, found.best.values
     assert isinstance(problem, Problem)
     time = np.linspace(0.0, 1.0, problem.drive.size)
-    shapes: list[Array] = [time - 0.5, *((time > step) - 0.5 for step in _STEPS)]
+    shapes: list[Array] = [time - 0.5, *(np.where(time > step, 0.5, -0.5) for step in _STEPS)]
     grown = np.array([problem.misfit_in_growing_gap(values, 1.0 + _DIFFERENCE * shape) for shape in shapes])
     return found.noise.whiten((grown - found.best.raw) * (_GROWTH / _DIFFERENCE))
