@@ -185,7 +185,11 @@ def test_steps_of_1_mm_are_a_replacement_away():
             "'gap.from_deg' is missing (found 'gap.from_rad' instead)",
         ),
         ("total_deg = 10.0", "total_deg = 1\nto_deg = 3", "unknown key 'gap.to_deg'"),
-        ("[gap]", "[recording]\nsample_rate_hz = 5000\n[controller]\nsample_rate_hz = 3000\n[gap]", "5000.0 Hz: it and"),
+        (
+            "[gap]",
+            "[recording]\nsample_rate_hz = 5000\n[controller]\nsample_rate_hz = 3000\n[gap]",
+            "5000.0 Hz: it and",
+        ),
         ("[gap]", "[controller]\nsample_rate = 5000\n[gap]", "unknown key 'controller.sample_rate'"),
         ("[gap]", "[controller]\nleave_tolerances = 0.1\n[gap]", "[controller]: controller leave = 0.1"),
         ("[gap]", "[noise]\nstd_mm = 0.2\n[gap]", "noise needs a sampled controller"),

@@ -10,6 +10,7 @@ import pytest
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.learning.wear import Wear
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
@@ -28,10 +29,11 @@ def creeping(places: Sequence[float]) -> Array:
     return np.concatenate(parts)
 
 
-def window(places: Sequence[float], start: float) -> Window:
-    """What the encoders of a stage show whose screw is 0.3 % off its lead."""
+def window(places: Sequence[float], start: float, growth: float = 0.0) -> Window:
+    """What the encoders of a stage show whose screw is 0.3 % off its lead, the gap growing by a share of itself."""
     angle = creeping(places)
-    position = RATIO * STAGE.p * play(angle, GAP, angle[0])
+    gap = GAP * (1.0 + growth * np.linspace(-0.5, 0.5, angle.size))
+    position = RATIO * STAGE.p * play(angle, gap, angle[0])
     counts = STAGE.sensors.position_resolution, STAGE.sensors.encoder_resolution
     seen = [step * np.round(values / step) for step, values in zip(counts, (position, angle), strict=True)]
     return Window(*seen, sample_rate=1000.0, start=start)
@@ -58,6 +60,20 @@ def test_one_window_of_moves_of_different_lengths_makes_steps_between_two_places
     assert learnt is not None
     mean, std = learnt.pitch
     assert abs(mean - math.log(RATIO)) < 3.0 * std < 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("growth", [0.05, 0.14])
+def test_a_gap_that_grows_while_moves_teach_the_ratio_widens_what_is_learnt(growth: float) -> None:
+    """What it grows by would be taken for ratio, and later gaps be wrong with narrow intervals."""
+    settings = TwinSettings(policy="paper", k_dz=0.0)
+    expected = Wear(0.0).expect(settings.trend, "boot", 1.0, 1.0, settings.learning)
+    estimates = [estimator_of(STAGE, settings)(window(MANY_PLACES, 0.0, share), expected) for share in (0.0, growth)]
+    still, grown = (FactorPrior.of_reading(each.machine).pitch for each in estimates if each.machine is not None)
+    for mean, std in (still, grown):
+        assert abs(mean - math.log(RATIO)) < 2.0 * std
+    assert still[1] < 1e-4
+    assert grown[1] > 2.0 * still[1]
 
 
 def test_a_ratio_that_is_stated_better_is_known_so() -> None:

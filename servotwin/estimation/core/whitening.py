@@ -101,6 +101,11 @@ def with_noise_restored(residual: Array, columns: Array, root: Array, scale: flo
     return math.sqrt(1.0 + len(root)) * np.vstack([residual, scale * (root @ columns)])
 
 
+def criterion(series: Array, most: int) -> float:
+    """AICc of the autoregression that `burg` would choose for a series (n,)."""
+    return float(_criteria(recursion(series[None], most)[1], series.size).min())
+
+
 def _criteria(power: Array, size: int) -> Array:
     """AICc of Gaussian autoregressions of order 0, 1, ... with these powers; the power itself is one more parameter."""
     count = 1.0 + np.arange(power.size)

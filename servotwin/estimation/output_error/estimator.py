@@ -14,15 +14,16 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, MachineReading, no_estimate
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.output_error.fit import Search, search
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
 from servotwin.estimation.output_error.play_model import PlayModel
-from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
+from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
+from servotwin.estimation.output_error.taught import taught
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -38,7 +39,6 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
-_TELLS = 0.5  # of the standard deviation of a ratio that was known: a window that tells it better is learnt from
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -89,8 +89,9 @@ def estimate(
     if possible is None:
         return _with_shaft(stated, shaft_reading(found, machine, settings.calibration))
     # A spread that is small beside the motor's travel only is too large to tell a ratio.
-    taught = stated.std <= settings.largest_share * stated.gap
-    return replace(stated, machine=_taught(machine, possible, settings.calibration) if taught else None)
+    if stated.std > settings.largest_share * stated.gap:
+        return stated
+    return replace(stated, machine=taught(machine, found, possible, settings.calibration))
 
 
 def fit(
@@ -122,16 +123,6 @@ def _with_shaft(stated: GapEstimate, reading: ShaftReading) -> GapEstimate:
         refused = no_estimate(stated.time, (reading.sentence,), stated.model_version, stated.method)
         return replace(refused, status=GapStatus.MODEL_MISMATCH, rms=stated.rms, evaluations=stated.evaluations)
     return replace(stated, machine=reading.machine)
-
-
-def _taught(machine: FactorPrior, possible: PossibleHalf, calibration: float) -> MachineReading | None:
-    """The machine with the ratio that a window leaves possible; None where that was known nearly as well before.
-
-    Moves between the same two places tell a ratio hardly, and their errors of rounding repeat: many such windows would
-    only seem to tell more.
-    """
-    (mean, known), std = machine.pitch, calibration * possible.ratio_std
-    return machine.with_pitch(mean + possible.ratio, std).reading if std < _TELLS * known else None
 
 
 def _fit(

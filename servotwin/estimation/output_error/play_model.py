@@ -15,6 +15,7 @@ from servotwin.plant.backlash import play_samples
 from servotwin.plant.signals import Array
 
 LAG = 5  # place among the unknowns
+_CONSTANT = np.ones(1)  # size of a gap that stays as it is
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,18 @@ class PlayModel:
     def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
         """Position (N,) of the mass in `simulate`."""
         del measured, rate
-        return lagged(self._driven(drive, values)[2], float(values[LAG]) / interval)
+        return self.position_in_growing_gap(drive, interval, values, _CONSTANT)
 
-    def _driven(self, drive: Array, values: Array) -> tuple[Array, float, Array]:
-        """Motor (N,) at the load, half gap there, and place (N,) of the screw behind the gap."""
+    def position_in_growing_gap(self, drive: Array, interval: float, values: Array, sizes: Array) -> Array:
+        """Position (N,) of the mass in a gap of `sizes` (N,), shares of the one among the unknowns (u,); (1,) of one
+        size."""
+        return lagged(self._driven(drive, values, sizes)[2], float(values[LAG]) / interval)
+
+    def _driven(self, drive: Array, values: Array, sizes: Array = _CONSTANT) -> tuple[Array, float, Array]:
+        """Motor (N,) at the load, half gap there, and place (N,) of the screw behind a gap of `sizes` (N,) or (1,)."""
         half, offset, _, ratio, first, _ = values.tolist()
         driven, half = math.exp(ratio) * drive + offset, math.exp(ratio) * abs(half)
-        return driven, half, play_samples(driven, np.array([half]), first)
+        return driven, half, play_samples(driven, half * sizes, first)
 
 
 def lagged(values: Array, samples: float) -> Array:

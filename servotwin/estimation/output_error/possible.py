@@ -26,7 +26,7 @@ _FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next
 _WIDEST = 2.0  # factor between the best gap and the farthest ones
 _STEPS, _DEEPER = 15, 8
 _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
-_INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
+INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
 _IMPOSSIBLE = 200.0  # rise of the cost in noise, over its variance; in rounding the cost doubles
 _WALL = 0.1  # of that rise: what may be a wall
 _PATIENCE = 0.03  # logarithm of a ratio of gaps
@@ -106,7 +106,7 @@ def _ratio_std(found: Search, fit: Fit, rounding: bool) -> float:
     std, known = fit.std(RATIO, free), found.problem.model.unknowns[RATIO].std
     if not rounding:
         return std
-    told = max(0.0, std**-2 - known**-2) * min(1.0, _INDEPENDENT / fit.raw.size)
+    told = max(0.0, std**-2 - known**-2) * min(1.0, INDEPENDENT / fit.raw.size)
     return 1.0 / math.sqrt(told + known**-2)
 
 
@@ -123,7 +123,7 @@ def _in_rounding(found: Search, fits: list[Fit]) -> Array:
     """(f,) likelihoods of fits in a few independent normal errors of unknown size, over that of the best."""
     prior = np.array([_prior(found, fit) for fit in fits])
     misfit = np.array([fit.cost for fit in fits]) - prior
-    likely = -0.5 * (_INDEPENDENT * np.log(misfit) + prior)
+    likely = -0.5 * (INDEPENDENT * np.log(misfit) + prior)
     return np.exp(likely - likely.max())
 
 

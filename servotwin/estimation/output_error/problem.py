@@ -10,6 +10,7 @@ import numpy as np
 
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel
 from servotwin.estimation.output_error.motor_angle import noise_of
+from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
@@ -97,10 +98,18 @@ class Problem:
 
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
-        part = slice(self.margin, self.drive.size - self.margin)
         drive = delayed(self.drive, float(values[DELAY]) / self.interval)
-        position = self.model.position(drive, self.position, self.interval, values, rate)
-        misfit = np.asarray((position - self.position)[part])
+        return self._less_measured(self.model.position(drive, self.position, self.interval, values, rate))
+
+    def misfit_in_growing_gap(self, values: Array, sizes: Array) -> Array:
+        """`misfit` (m,) of a model without dynamics whose gap has `sizes` (N,), shares of the one in the unknowns."""
+        assert isinstance(self.model, PlayModel)
+        drive = delayed(self.drive, float(values[DELAY]) / self.interval)
+        return self._less_measured(self.model.position_in_growing_gap(drive, self.interval, values, sizes))
+
+    def _less_measured(self, position: Array) -> Array:
+        """A model's position (N,) less the measured one, (m,)."""
+        misfit = np.asarray((position - self.position)[self.margin : self.drive.size - self.margin])
         misfit[self.unsure] = 0.0
         return misfit
 

@@ -154,9 +154,11 @@ def refine(
         first, point, noise, evaluations = 0, begun.point, Autoregression.white(1.0), begun.evaluations
     else:
         first, point, noise, evaluations = passes - 1, points[0], nearby.noise, 0
-        reduction = replace(reduction, rate=nearby.reduction.rate)
+        reduction = replace(reduction, rate=nearby.reduction.rate, hum=nearby.reduction.hum)
     for number in range(first, passes):
         table = reduction.table(point)
+        if number == passes - 1 and not reduction.hum:
+            reduction, table, noise = _with_hum(reduction, point, table, noise, order)
         noise = estimate_noise(reduction, table, noise, order, number >= _PLAIN)
         reduction = reduction.growing(noise, table)
         # In a growing gap the rate, and with it the table, has changed.
@@ -173,6 +175,18 @@ def refine(
     table = reduction.table(fit.point)
     rows = reduction.prepared(noise, table, CONSTANT)
     return WhitenedFit(reduction, misfit, fit, noise, table, rows, evaluations + fit.evaluations)
+
+
+def _with_hum(
+    reduction: Reduction, point: Point, table: Array, noise: Autoregression, order: int
+) -> tuple[Reduction, Array, Autoregression]:
+    """Take hum that the residual at a point shows as a nuisance; the table and the noise are without it then."""
+    humming = reduction.humming(noise, table, order)
+    if not humming.hum:
+        return reduction, table, noise
+    table = humming.table(point)
+    # In noise that follows the hum its size would count as unknown, and be put back into the noise.
+    return humming, table, estimate_noise(humming, table, noise, order, restore=False)
 
 
 def _in_white_noise(reduction: Reduction, points: Sequence[Point], largest: float, tolerance: float) -> SearchResult:
@@ -194,12 +208,12 @@ def estimate_noise(
 
     With `restore`, the noise that the fit may have taken away is restored.
     """
-    rows = reduction.prepared(noise, table, CONSTANT)
-    residual = table[RESIDUAL] - least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients @ table[CONSTANT:]
+    residual = reduction.residual(noise, table)
     if not np.any(residual):
         return Autoregression.white(1.0)
     if not restore:
         return burg(residual[None], order).at_least(reduction.rounding)
+    rows = reduction.prepared(noise, table, CONSTANT)
     root = least_squares(rows[GAP:], rows[RESIDUAL]).root
     return burg(with_noise_restored(residual, table[GAP:], root), order).at_least(reduction.rounding)
 

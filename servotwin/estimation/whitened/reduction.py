@@ -16,6 +16,7 @@ from servotwin.estimation.core.reduced import ReducedResponse, reduced_response
 from servotwin.estimation.core.response import Response
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.whitened.descent import MisfitData, Room, evaluate_all, mix_places
+from servotwin.estimation.whitened.hum import hum, sines
 from servotwin.plant.signals import Array
 
 
@@ -101,6 +102,7 @@ RESIDUAL, GAP, PLACE, CONSTANT = range(4)  # rows of a table; the structure's fr
 _SAMPLES_PER_PERIOD, _FEWEST = 40.0, 100  # kept at least: of the fastest mode; in all
 
 _ROUNDING = 1e-13  # of the largest motion, some hundred times a float's
+_ABOVE = 2.0  # times the structure's fastest mode: it hardly moves there
 _MOST_GROWTH = 4.0  # standard deviations of the gap's rate
 
 
@@ -134,6 +136,8 @@ class Reduction:
         m: noise below this is rounding, which changes with every point and carries no information.
     skew : bool
         True: a delay between the channels is a nuisance.
+    hum : tuple of float
+        rad per reduced sample, frequencies of sines in the position that are nuisances too.
     """
 
     theta_m: Array
@@ -145,6 +149,7 @@ class Reduction:
     skew: bool = True
     rate: float = 0.0
     rounding: float = 0.0
+    hum: tuple[float, ...] = ()
 
     @classmethod
     def of(
@@ -188,7 +193,8 @@ class Reduction:
         """`table` for a screw's angle with its derivatives (4, n)."""
         moving = self.reduced.respond(screw if self.growth else screw[:BY_RATE])
         late = [self.reduced.velocities(screw[:1])] if self.skew else []
-        return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:], *late])
+        humming = sines(self.hum, self.position.size)
+        return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:], humming, *late])
 
     def prepared(self, noise: Autoregression, rows: Array, first: int) -> Array:
         """(k, m + e) whitened rows and what is known beforehand, as e more samples; nuisances begin at row `first`."""
@@ -222,6 +228,21 @@ class Reduction:
         extra = rows.shape[1] - self.position.size
         basis = orthonormal(rows[1:])
         return Misfit(self.theta_m, rows[0], basis, self.reduced, noise, extra, self.rate)
+
+    def humming(self, noise: Autoregression, table: Array, order: int) -> Reduction:
+        """Take sines that are in the residual of a fit, whose table and noise are given, as nuisances.
+
+        `order` is the noise's largest. Sines near the structure's own frequencies stay: they may be its motion.
+        """
+        fastest = float(np.abs(self.response.poles).max()) * self.response.interval * self.decimation.factor
+        rest = self.residual(noise, table)
+        return replace(self, hum=(*self.hum, *hum(rest, order, _ABOVE * fastest)))
+
+    def residual(self, noise: Autoregression, table: Array) -> Array:
+        """(m,) what nuisances leave of a table's residual in a noise."""
+        rows = self.prepared(noise, table, CONSTANT)
+        shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
+        return np.asarray(table[RESIDUAL] - shares @ table[CONSTANT:])
 
     def growing(self, noise: Autoregression, table: Array) -> Reduction:
         """Follow the screw at the rate of growth that a point and a noise make likely.
