@@ -147,7 +147,8 @@ def refine(
     """Fit in the noise of the fit's own residual, in some passes with autoregressions of at most `order`.
 
     The first fit and the last start from all `points`: in the right noise another minimum may lie lower. With a
-    `nearby` fit, of the same samples with nearly the same model, only the last pass is made, from the first point on.
+    `nearby` fit, of the same samples with nearly the same model, only the last pass is made, from the first point on,
+    and hum is the one that was found there.
     """
     if nearby is None:
         begun = _in_white_noise(reduction, points, largest, tolerance)
@@ -157,7 +158,7 @@ def refine(
         reduction = replace(reduction, rate=nearby.reduction.rate, hum=nearby.reduction.hum)
     for number in range(first, passes):
         table = reduction.table(point)
-        if number == passes - 1 and not reduction.hum:
+        if nearby is None and number == passes - 1:
             reduction, table, noise = _with_hum(reduction, point, table, noise, order)
         noise = estimate_noise(reduction, table, noise, order, number >= _PLAIN)
         reduction = reduction.growing(noise, table)

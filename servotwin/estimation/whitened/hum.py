@@ -16,7 +16,7 @@ from servotwin.plant.signals import Array
 
 _MOST = 3  # sines: mains and two harmonics
 _SURE = 30.0  # gain in likelihood: of the peaks of 150 frequencies of white noise one in 20000 has that by chance
-_FINER = 8  # frequencies tried for each that a window tells apart
+_FINER = 8  # frequencies tried, at least, for each that a window tells apart
 _PARAMETERS = 3.0  # of a sine: frequency, amplitude and phase
 
 
@@ -57,7 +57,8 @@ def _without(residual: Array, frequencies: tuple[float, ...]) -> Array:
 
 def _loudest(residual: Array, least: float) -> float:
     """Frequency (rad per sample) from `least` on at which a residual (m,) has most power."""
-    power = np.abs(np.fft.rfft(residual, _FINER * residual.size)) ** 2
+    # A power of two: a transform of a length with large prime factors takes ten times as long.
+    power = np.abs(np.fft.rfft(residual, 2 ** math.ceil(math.log2(_FINER * residual.size)))) ** 2
     step = math.pi / (power.size - 1)
     power[: math.ceil(least / step)] = 0.0
     top = int(np.argmax(power[1:-1])) + 1
