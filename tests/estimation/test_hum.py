@@ -11,7 +11,7 @@ SAMPLES, LEAST = 300, 0.3
 
 
 def test_a_sine_in_noise_is_found_at_its_frequency() -> None:
-    """Within a hundredth of what the window tells apart; nothing is left of it."""
+    """Within a tenth of what the window tells apart; nothing is left of it."""
     rng = np.random.default_rng(4)
     for frequency in rng.uniform(0.4, 2.8, 20).tolist():
         series = 5.0 * np.sin(frequency * np.arange(SAMPLES) + rng.uniform(0.0, 6.0)) + rng.normal(0.0, 1.0, SAMPLES)

@@ -16,7 +16,7 @@ from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.output_error.fit import Search, search
-from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, shaft_reading
+from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
 from servotwin.estimation.output_error.play_model import PlayModel
@@ -87,7 +87,8 @@ def estimate(
     if machine is None or not stated.ok:
         return stated
     if possible is None:
-        return _with_shaft(stated, shaft_reading(found, machine, settings.calibration))
+        reading = shaft_reading(found, machine, settings.calibration)
+        return _with_shaft(stated, reading, is_learnt(machine, settings))
     # A spread that is small beside the motor's travel only is too large to tell a ratio.
     if stated.std > settings.largest_share * stated.gap:
         return stated
@@ -117,9 +118,12 @@ def _known(axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | Non
     return axis.scaled({"p": math.exp(mean)}), replace(settings, ratio=std)
 
 
-def _with_shaft(stated: GapEstimate, reading: ShaftReading) -> GapEstimate:
-    """The estimate with the machine's numbers; refused where they contradict what was known of them."""
-    if reading.contradicts:
+def _with_shaft(stated: GapEstimate, reading: ShaftReading, learnt: bool) -> GapEstimate:
+    """The estimate with the machine's numbers; refused where they contradict what was learnt of them.
+
+    Before anything was learnt a damping may be off by any factor (`judge`).
+    """
+    if learnt and reading.contradicts:
         refused = no_estimate(stated.time, (reading.sentence,), stated.model_version, stated.method)
         return replace(refused, status=GapStatus.MODEL_MISMATCH, rms=stated.rms, evaluations=stated.evaluations)
     return replace(stated, machine=reading.machine)

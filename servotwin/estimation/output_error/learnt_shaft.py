@@ -22,18 +22,20 @@ from servotwin.estimation.estimate import MachineReading
 from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.models import LEARNT, ShaftModel
 from servotwin.estimation.output_error.rounding import per_count
+from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
 
 # Standard deviations of what the model leaves out, in the order of `FACTORS`: a window tells none of them better.
-_UNMODELLED = (5e-3, 2e-2, math.inf, 5e-3)
+_UNMODELLED = (1e-2, 2e-2, math.inf, 5e-3)
 # The same of the shaft's damping, of the critical one: a motor that is not straight between samples, and a filter of
 # its noise, damp. On a shaft of 0.007 a fit was 13 % off, and known to 3 % by itself.
 _DAMPED = 2e-3
 # The noise's spectrum and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0
 _TELLS = 0.5  # of the standard deviation that was known: what a window tells better counts
+_BETTER = 0.99  # times a usual spread: a smaller one was learnt
 _TOGETHER = 5.0  # standard deviations between a window's numbers and those that were known
 _LEAST_INFORMATION = 1e-2  # of what was known: where a window tells less, it shows nothing
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
@@ -47,6 +49,12 @@ def adapted_shaft(axis: Axis, factors: Array) -> Axis:
     screw, load = axis.transmission, axis.load
     shaft = replace(screw, p=pitch * screw.p, k_d=k * screw.k_d, c_d=c * screw.c_d)
     return axis.replace(transmission=shaft, load=replace(load, m=(*load.m[:-1], ratio * load.m[-1])))
+
+
+def is_learnt(machine: FactorPrior, settings: OutputErrorSettings) -> bool:
+    """True where windows have told stiffness or damping of a shaft: they are known better than they are usually."""
+    usual = np.array([settings.stiffness, settings.damping])
+    return bool(np.any(np.sqrt(np.diag(machine.covariance)[:2]) < _BETTER * usual))
 
 
 class ShaftReading(NamedTuple):
@@ -72,7 +80,7 @@ class ShaftReading(NamedTuple):
     def sentence(self) -> str:
         """Reason of a window that contradicts."""
         return (
-            f"stiffness and damping of the shaft are {self.away:.2g} standard deviations from what is known of "
+            f"stiffness, damping and masses of the shaft are {self.away:.2g} standard deviations from what is known of "
             f"them, and {_TOGETHER:g} are allowed"
         )
 

@@ -15,7 +15,7 @@ from servotwin.estimation.core.whitening import criterion
 from servotwin.plant.signals import Array
 
 _MOST = 3  # sines: mains and two harmonics
-_SURE = 30.0  # gain in likelihood: of the peaks of 150 frequencies of white noise one in 20000 has that by chance
+_SURE = 30.0  # gain in twice the logarithm of the likelihood, beyond what three parameters cost
 _FINER = 8  # frequencies tried, at least, for each that a window tells apart
 _PARAMETERS = 3.0  # of a sine: frequency, amplitude and phase
 

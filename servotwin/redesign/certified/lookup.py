@@ -27,7 +27,6 @@ from servotwin.redesign.certified.certify import certify, confirm, known_bias
 from servotwin.redesign.certified.learnt_servo import counts_learnt
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
-from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.
@@ -220,26 +219,34 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
     found = certify(lower, known, demands, policy.simulations, 0.0, noise, policy.clock)
     if isinstance(found, Certificate) and found.saturated:
         found = certify(policy.servo, known, demands, policy.simulations, 0.0, noise, policy.clock)
-        if isinstance(found, Certificate) and not _holds_with_feedforward(policy, known, found.setting, noise):
-            return None
+        if isinstance(found, Certificate):
+            found = _with_feedforwards(policy, known, found, noise)
     if isinstance(found, NotVerified) or found.settled < 1.0:
         return None
     law = found.setting.controller.replace(voltage_limit=limit)
     return replace(found, setting=replace(found.setting, controller=law))
 
 
-def _holds_with_feedforward(policy: CertifiedPolicy, known: Uncertainty, setting: Design, noise: float) -> bool:
-    """True where a setting settles every machine also with the largest feedforward of either sign, limits included."""
+def _with_feedforwards(
+    policy: CertifiedPolicy, known: Uncertainty, found: Certificate, noise: float
+) -> Certificate | NotVerified:
+    """Certificate whose worst effort and settling are those with the largest feedforwards, too, limits included."""
     (low, high), most, demands = known.input_bias, policy.feedforward_limit, policy.demands_within_band()
+    worst = found
     for feedforward in (-most, most) if most else ():
-        biased, fed = (
-            known.replace(input_bias=(low - feedforward, high - feedforward)),
-            with_feedforward(setting, feedforward),
-        )
+        biased = known.replace(input_bias=(low - feedforward, high - feedforward))
+        fed = with_feedforward(found.setting, feedforward)
         tried = confirm(policy.servo, biased, fed, demands, policy.simulations, noise, policy.clock)
-        if isinstance(tried, NotVerified) or tried.settled < 1.0:
-            return False
-    return True
+        if isinstance(tried, NotVerified):
+            return tried
+        if tried.settled < 1.0:
+            return NotVerified(f"with a feedforward of {feedforward:.3g} V not every machine settles", tried)
+        worst = replace(
+            worst,
+            effort=max(worst.effort, tried.effort),
+            settling_worst=max(worst.settling_worst, tried.settling_worst),
+        )
+    return worst
 
 
 def table_of(policy: CertifiedPolicy, grid: Grid, cells: dict[CellIndex, Certificate | None]) -> CertifiedTable:
