@@ -85,6 +85,15 @@ def test_a_free_shaft_s_stiffness_and_damping_are_learnt_and_its_ratio_is_not() 
 
 
 @pytest.mark.slow
+def test_a_damping_that_nothing_was_known_of_is_no_contradiction() -> None:
+    """Before the first window a damping may be off by any factor."""
+    ((estimate, wear),) = followed([seen(1.0, 0.04, 0)], Wear(0.0))
+    assert estimate.ok, estimate.reasons
+    assert estimate.interval[0] < GAP < estimate.interval[1]
+    assert machine_of(wear).factors[C] < math.log(0.5)
+
+
+@pytest.mark.slow
 def test_what_was_learnt_is_the_prior_of_the_next_window_and_repeats_bit_for_bit() -> None:
     (_, before), (estimate, _) = learnt()[0], learnt()[1]
     stored = msgspec.msgpack.decode(msgspec.msgpack.encode(before), type=Wear)
