@@ -33,10 +33,16 @@ _DRIFT = 5.0  # the same, of a window's own reading from what was learnt: above 
 class LearningSettings:
     """Settings of the learning of the machine's stiffness, damping, pitch and mass ratio.
 
-    How far they may be off at first is stated by `k_percent`, `c_percent` and `m_percent` of the uncertainty.
+    How far they may be off at first is stated by `k_percent`, `c_percent` and `m_percent` of the uncertainty; of a
+    shaft that is free in the gap by `OutputErrorSettings`.
     """
 
-    learn: Annotated[bool, key(help="Learn the machine's numbers from its windows; false: the model is exact.")] = True
+    learn: Annotated[
+        bool,
+        key(
+            help="Learn the machine's numbers from its windows; false: nothing is carried from one window to the next."
+        ),
+    ] = True
     pitch: Annotated[
         float, key("pitch_percent", above=0.0, below=1.0, help="Standard deviation of the pitch before any window.")
     ] = 0.01

@@ -34,7 +34,7 @@ _UNMODELLED = (1e-2, 2e-2, math.inf, 5e-3)
 _DAMPED = 2e-3
 # The noise's spectrum and the contacts come from the same window: tails are longer than normal.
 _DOUBT = 2.0
-_TELLS = 0.5  # of the standard deviation that was known: what a window tells better counts
+_TELLS = 0.5  # of the standard deviation that was known: a window counts where no more is left with it
 _BETTER = 0.99  # times a usual spread: a smaller one was learnt
 _TOGETHER = 5.0  # standard deviations between a window's numbers and those that were known
 _LEAST_INFORMATION = 1e-2  # of what was known: where a window tells less, it shows nothing

@@ -70,8 +70,7 @@ class PlayModel:
         return self.position_in_growing_gap(drive, interval, values, _CONSTANT)
 
     def position_in_growing_gap(self, drive: Array, interval: float, values: Array, sizes: Array) -> Array:
-        """Position (N,) of the mass in a gap of `sizes` (N,), shares of the one among the unknowns (u,); (1,) of one
-        size."""
+        """Position (N,) of the mass in a gap that changes: `sizes` (N,) or (1,) times the one of `values` (u,)."""
         return lagged(self._driven(drive, values, sizes)[2], float(values[LAG]) / interval)
 
     def _driven(self, drive: Array, values: Array, sizes: Array = _CONSTANT) -> tuple[Array, float, Array]:
