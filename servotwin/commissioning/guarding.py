@@ -123,7 +123,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, AnyGains]:
     limits = Limits(
         maximum=demands.tolerance,
         gain_factor=factor,
-        integral_factor=max(integral_shares(own, demands), default=0.0) * _ROUNDING,
+        integral_factor=max(integral_shares(policy.servo, demands), default=0.0) * _ROUNDING,
         feedforward=policy.feedforward_limit * _ROUNDING,
         # The centre follows the learnt machine.
         notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,

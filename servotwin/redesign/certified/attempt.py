@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +22,7 @@ from servotwin.redesign.certified.certificate import (
     BeyondResult,
     Certificate,
     Demands,
+    LongResult,
     LoopMargins,
     RampResult,
 )
@@ -40,6 +41,8 @@ ROUNDED = 1.0 + 1e-6
 # Machines that are simulated before the rest, in lots: a setting that leaves some of the gaps oscillating shows it on
 # them, and mostly on the first few.
 _LOTS = (12, 36, 75)
+# Long runs where an integral may wind up against friction: machines, and length in that of the other runs.
+_LONG_MACHINES, _LONG = 60, 20.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,9 @@ class Question:
         if tried.ramp is not None and tried.ramp.settled < 1.0:
             share = 100.0 * tried.ramp.settled
             return f"settles after a ramp and its reversal on {share:.0f} % of {tried.ramp.machines} machines only"
+        if tried.long is not None and tried.long.settled < 1.0:
+            share, long = 100.0 * tried.long.settled, tried.long
+            return f"stays at rest for {long.duration:.3g} s on {share:.1f} % of {long.machines} machines only"
         if tried.beyond is not None and tried.beyond.settled < 1.0:
             share = 100.0 * tried.beyond.settled
             return f"comes to rest on {share:.1f} % of {tried.beyond.machines} machines beyond the stated ranges only"
@@ -118,7 +124,7 @@ class Attempt:
             return True
         if any(self._refused_by(self._measured(lot)) for lot in _LOTS):
             return True
-        if self._ramp.settled < 1.0:
+        if self._ramp.settled < 1.0 or (self._long is not None and self._long.settled < 1.0):
             return True
         return self._beyond is not None and self._beyond.settled < 1.0
 
@@ -170,6 +176,7 @@ class Attempt:
             loop=loop,
             beyond=self._beyond,
             ramp=self._ramp,
+            long=self._long,
             rate=law.sample_rate,
             delay=0 if law.sample_rate is None else known.delay,
             error_per_volt=0.0 if integrates(law) else 1.0 / rest_gain(law),
@@ -202,6 +209,20 @@ class Attempt:
     def _ramp(self) -> RampResult:
         question = self.question
         return follow_ramp(question.servo, question.uncertainty, self.setting, question.trial, question.demands.seed)
+
+    @cached_property
+    def _long(self) -> LongResult | None:
+        """Result of long runs; None where no integral winds up against friction."""
+        question = self.question
+        held = question.uncertainty.friction[1] + question.servo.own_friction > 0.0
+        if not held or not integrates(self.setting.controller):
+            return None
+        duration = _LONG * question.trial.duration
+        trial = replace(question.trial, duration=duration, last=0.5 * duration)
+        members = self._members
+        few = members.part(0, min(_LONG_MACHINES, members.count))
+        (measures,) = assess([self.setting], few, trial)
+        return LongResult(few.count, duration, float(np.mean(measures.settled)))
 
     @cached_property
     def _beyond(self) -> BeyondResult | None:

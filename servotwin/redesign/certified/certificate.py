@@ -256,6 +256,24 @@ class RampResult:
     error: float
 
 
+@dataclass(frozen=True)
+class LongResult:
+    """Result of long runs of a law whose integral winds up where friction holds the motor: it may move again much later.
+
+    Attributes
+    ----------
+    machines : int
+    duration : float
+        s, of each run.
+    settled : float
+        Share of them that are settled in the second half.
+    """
+
+    machines: int
+    duration: float
+    settled: float
+
+
 @dataclass(frozen=True, repr=False)
 class Certificate:
     """A setting and its results on the simulated machines.
@@ -297,6 +315,8 @@ class Certificate:
         Result in ranges beyond the stated ones.
     ramp : RampResult, optional
         Result on a ramp and its reversal.
+    long : LongResult, optional
+        Result of long runs, of a law with integral action where friction acts.
     rate : float, optional
         Hz, at which the law was simulated; None: in continuous time.
     delay : int
@@ -334,6 +354,7 @@ class Certificate:
     loop: LoopMargins | None = None
     beyond: BeyondResult | None = None
     ramp: RampResult | None = None
+    long: LongResult | None = None
     rate: float | None = None
     delay: int = 0
     error_per_volt: float = 0.0
@@ -358,6 +379,8 @@ class Certificate:
             text += ", with the integral acting and stopped; the simulations contain the switching in between"
         if self.ramp is not None:
             text += f"; a ramp and its reversal on {self.ramp.machines} machines"
+        if self.long is not None:
+            text += f"; {self.long.machines} machines for {self.long.duration:.3g} s, for the integral to wind up"
         if self.beyond is not None:
             extra = self.beyond
             text += (

@@ -193,7 +193,7 @@ def candidates_of(
     InvalidInput
         No scaled controller is within the bounds on Ms.
     """
-    integral = integral_shares(servo.controller, demands, disturbed)
+    integral = integral_shares(servo, demands, disturbed)
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]

@@ -32,8 +32,11 @@ from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 
-# Shares of the integral action of laws other than the filtered PID.
-_LAW_INTEGRAL = (0.0, 0.1, 0.3, 1.0)
+# Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered PID
+# whose corner Ki / Kp is below this share of the crossover. A faster one swings in every gap, and `Demands.integral` are
+# small shares of it.
+_WHOLE_INTEGRAL = (0.0, 0.1, 0.3, 1.0)
+_SLOW_INTEGRAL = 0.25
 AnyPlantSet: TypeAlias = PlantSet | LawSet
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
@@ -235,17 +238,26 @@ def slow_response(servo: Plant) -> tuple[float, complex]:
     return slow, complex(plant.response(slow))
 
 
-def integral_shares(own: AnyController, demands: Demands, disturbed: bool = True) -> tuple[float, ...]:
+def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> tuple[float, ...]:
     """Factors on the own integral action that are tried, where friction or a bias act or not.
 
     That of a filtered PID acts on the position, across the gap; that of a cascade on the motor's speed, before it. One
     that is all of a controller is scaled like other gains.
     """
+    own = servo.controller
     if only_integrates(own):
         return (1.0,)
     if not disturbed:
         return (0.0,)
-    return demands.integral if isinstance(own, Controller) else _LAW_INTEGRAL
+    return demands.integral if isinstance(own, Controller) and not _is_slow(servo, own) else _WHOLE_INTEGRAL
+
+
+def _is_slow(servo: Plant, own: Controller) -> bool:
+    """True where the own integral acts well below the crossover, as a textbook has it."""
+    if not own.Ki or not own.Kp:
+        return False
+    crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
+    return bool(crossovers) and own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
 
 
 def _keeps_to(plants: AnyPlantSet, law: AnyController, delays: tuple[int, ...], demands: Demands) -> bool:

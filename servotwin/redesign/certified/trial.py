@@ -82,7 +82,7 @@ def trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial
 
 @lru_cache(maxsize=16)
 def _trial_for(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Trial:
-    laws = laws_within(servo, uncertainty, demands, integral_shares(servo.controller, demands, disturbed=False))
+    laws = laws_within(servo, uncertainty, demands, integral_shares(servo, demands, disturbed=False))
     plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
     slowest = min(float(plants.decays(law, delay).min()) for law in laws for delay in delays_of(law, uncertainty))
     loop = nominal_margins(servo, law_for_margins(_reference(servo.controller, laws)))
