@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
@@ -41,6 +43,7 @@ ROUNDED = 1.0 + 1e-6
 # Machines that are simulated before the rest, in lots: a setting that leaves some of the gaps oscillating shows it on
 # them, and mostly on the first few.
 _LOTS = (12, 36, 75)
+_HARD = 4  # machines that a failed attempt leaves for the next candidates
 # Long runs where an integral may wind up against friction: machines, and length in that of the other runs.
 _LONG_MACHINES, _LONG = 60, 20.0
 
@@ -92,6 +95,15 @@ class Question:
         sensor = setting.controller.leave * setting.tolerance + COUNTS * self.servo.position_resolution
         return min(self.demands.tail, self.demands.error * self.uncertainty.step[1] + sensor)
 
+    def margins(self, setting: Design) -> LoopMargins:
+        """Margins of a setting on the plants of the stated ranges and beyond."""
+        return margins_in_every_zone(self.servo, widened(self.uncertainty, self.demands), setting.controller)
+
+    def missed(self, setting: Design, few: MachineMeasures) -> NDArray[np.bool_]:
+        """True for machines on which a setting misses a demand: it does not settle, is off in the end or overshoots."""
+        off = few.tail > ROUNDED * self.largest_error(setting)
+        return np.asarray(~few.settled | off | (few.overshoot > self.demands.overshoot))
+
     def cost(self, setting: Design, costs: Array) -> float:
         """s: 95th percentile of the error's integral per step (s, of each machine), plus the price of the noise."""
         return float(np.percentile(costs, 95.0)) + self.price(setting)
@@ -117,6 +129,17 @@ class Attempt:
         self._seed = _seed(question.servo, question.uncertainty, setting, question.demands.seed)
         self._measures: MachineMeasures | None = None
 
+    def fails_early(self, hard: Sequence[SimulatedMachines]) -> bool:
+        """True where what is cheap shows that the demands are not met: margins, `hard` machines and a ramp."""
+        question, setting = self.question, self.setting
+        if margins_missing(self._loop, setting.controller.sample_rate, question.demands):
+            return True
+        for machines in hard:
+            (few,) = assess([setting], machines, question.trial)
+            if question.missed(setting, few).any():
+                return True
+        return self._ramp.settled < 1.0
+
     def cannot_pass(self) -> bool:
         """True where a part shows already that the certificate would not meet the demands."""
         demands, rate = self.question.demands, self.setting.controller.sample_rate
@@ -135,6 +158,13 @@ class Attempt:
         if share_at_least(most, demands.machines, demands.confidence) < demands.settled:
             return True
         return bool(few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot)
+
+    def missed(self) -> list[SimulatedMachines]:
+        """Machines on which the setting was simulated so far and missed a demand: the first few."""
+        if self._measures is None:
+            return []
+        places = np.flatnonzero(self.question.missed(self.setting, self._measures))[:_HARD]
+        return [self._members.each(places)] if places.size else []
 
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
@@ -185,9 +215,7 @@ class Attempt:
 
     @cached_property
     def _loop(self) -> LoopMargins:
-        question = self.question
-        known = widened(question.uncertainty, question.demands)
-        return margins_in_every_zone(question.servo, known, self.setting.controller)
+        return self.question.margins(self.setting)
 
     @cached_property
     def _members(self) -> SimulatedMachines:

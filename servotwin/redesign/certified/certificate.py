@@ -169,7 +169,7 @@ class Demands:
     screened: int = 4
     conditions: int = 8
     machines: int = 300
-    attempts: int = 4
+    attempts: int = 8
     seed: int = 0
 
     def __post_init__(self) -> None:

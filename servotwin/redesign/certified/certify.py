@@ -23,10 +23,17 @@ from servotwin.plant.plants import Plant, check_load_encoder
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
-from servotwin.redesign.certified.margins import integral_shares, laws_within, own_static_gain, widened, with_margins
+from servotwin.redesign.certified.margins import (
+    has_slow_integral,
+    integral_shares,
+    laws_within,
+    own_static_gain,
+    widened,
+    with_margins,
+)
 from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain
 from servotwin.redesign.certified.trial import Trial, trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty
 from servotwin.redesign.design import Design
 
 _Gains = tuple[float, ...]
@@ -34,8 +41,12 @@ _Gains = tuple[float, ...]
 _GAINS_WITH_INTEGRAL = 3
 # Time constant of a velocity feedforward's filter, in units of 1 / crossover of a motor that Kp alone moves.
 _VELOCITY_TIME = 0.5
+# Candidates that fail at little expense before all count as attempts.
+_LEFT_OUT = 64
 # Tolerances at which an integral that stops within the lost motion begins again.
 _LEAVES = 2.0
+# Zones that stop the integral of a filtered PID, in lost motions, and where it begins again.
+_GAP_ZONES = ((0.5, 2.0), (1.0, 1.0))
 # Candidates that are compared on a machine that was observed.
 _MOVED = 12
 # Cost of the running setting over that of the cheapest one, up to which the running one stays.
@@ -89,17 +100,17 @@ def certify(
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
     attempts: list[Attempt] = []
     screening = Screening(question)
-    ranked = _ranked_in_stages(question, screening, candidates, in_force)
-    for setting in _shortlist(screening, ranked, has_widest_integral_zone(candidates), demands.attempts):
-        attempt = Attempt(question, setting)
+    hard = list[SimulatedMachines]()
+    likely = _likely(question, hard, _ranked_in_stages(question, screening, candidates, in_force))
+    for attempt in _shortlist(screening, likely, has_widest_integral_zone(candidates), demands.attempts):
         attempts.append(attempt)
-        if attempt.cannot_pass():
-            continue
-        tried = replace(attempt.certificate(), looked_at=len(candidates), seconds=clock() - begin)
-        if not question.shortcoming(tried):
-            return tried
+        if not attempt.cannot_pass():
+            tried = replace(attempt.certificate(), looked_at=len(candidates), seconds=clock() - begin)
+            if not question.shortcoming(tried):
+                return tried
+        hard += attempt.missed()
     # Only where all fail do the figures of each count: the rest of their machines are simulated now.
-    failed = [attempt.certificate() for attempt in attempts]
+    failed = [attempt.certificate() for attempt in attempts or [Attempt(question, candidates[0])]]
     best = replace(max(failed, key=lambda each: each.settled), looked_at=len(candidates), seconds=clock() - begin)
     return NotVerified(f"none of {len(candidates)} candidates is verified: the best {question.shortcoming(best)}", best)
 
@@ -131,17 +142,31 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
+def _likely(question: Question, hard: list[SimulatedMachines], ranked: Iterator[Design]) -> Iterator[Attempt]:
+    """Candidates without those that fail at little expense, some of them on the `hard` machines: where others failed.
+
+    `hard` may grow meanwhile. After so many that fail nothing is left out: all may.
+    """
+    left_out = 0
+    for setting in ranked:
+        attempt = Attempt(question, setting)
+        if left_out < _LEFT_OUT and attempt.fails_early(hard):
+            left_out += 1
+        else:
+            yield attempt
+
+
 def _shortlist(
-    screening: Screening, ranked: Iterator[Design], widest: Callable[[Design], bool], attempts: int
-) -> Iterator[Design]:
+    screening: Screening, likely: Iterator[Attempt], widest: Callable[[Design], bool], attempts: int
+) -> Iterator[Attempt]:
     """The first candidates, then as many of each kind that settles most surely: those whose integral stops the furthest
     from the reference, and those without integral action and dead zone."""
     kinds = (widest, is_plain)
     yielded = [0, 0]
-    for place, setting in enumerate(ranked):
-        kind = next((k for k, of_kind in enumerate(kinds) if of_kind(setting)), None)
+    for place, attempt in enumerate(likely):
+        kind = next((k for k, of_kind in enumerate(kinds) if of_kind(attempt.setting)), None)
         if place < attempts or (kind is not None and yielded[kind] < attempts):
-            yield setting
+            yield attempt
         if kind is not None:
             yielded[kind] += 1
         if place + 1 >= attempts:
@@ -200,6 +225,7 @@ def candidates_of(
     plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0] + servo.own_friction, demands)]
     zone = servo.tolerance_for(uncertainty.gap[1])
     plain += _zones_in_gap(servo, within, zone, demands)
+    plain += _stopped_in_gap(servo, plain, zone, demands)
     opens = isinstance(servo.controller, Controller) and not only_integrates(servo.controller)
     if not (0.0 < zone <= demands.tolerance and noisy and opens):
         return plain
@@ -261,6 +287,22 @@ def _zones_in_gap(servo: Plant, laws: tuple[AnyController, ...], zone: float, de
     opening = [law.replace(integral_only=False) for law in laws]
     opened = [law.replace(enter=enter, leave=leave) for law in opening for enter, leave in demands.hysteresis]
     return [Design(law, zone) for law in (*stopped, *opened)]
+
+
+def _stopped_in_gap(servo: Plant, plain: list[Design], zone: float, demands: Demands) -> list[Design]:
+    """Filtered PIDs whose integral may act as a whole, with zones about the lost motion (m) that stop it.
+
+    Within the lost motion the integral pushes the motor from flank to flank and does not move the load.
+    """
+    if not isinstance(servo.controller, Controller) or not has_slow_integral(servo):
+        return []
+    laws = [each.controller for each in plain if integrates(each.controller) and not each.tolerance]
+    zones = [(share * zone, leave) for share, leave in _GAP_ZONES if 0.0 < share * zone <= demands.tolerance]
+    return [
+        Design(law.replace(integral_only=True, enter=1.0, leave=leave), tolerance)
+        for law in laws
+        for tolerance, leave in zones
+    ]
 
 
 def _gains(law: AnyController) -> _Gains:

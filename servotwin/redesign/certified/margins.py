@@ -249,12 +249,13 @@ def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> t
         return (1.0,)
     if not disturbed:
         return (0.0,)
-    return demands.integral if isinstance(own, Controller) and not _is_slow(servo, own) else _WHOLE_INTEGRAL
+    return demands.integral if isinstance(own, Controller) and not has_slow_integral(servo) else _WHOLE_INTEGRAL
 
 
-def _is_slow(servo: Plant, own: Controller) -> bool:
-    """True where the own integral acts well below the crossover, as a textbook has it."""
-    if not own.Ki or not own.Kp:
+def has_slow_integral(servo: Plant) -> bool:
+    """True where a filtered PID's own integral acts well below the crossover, as a textbook has it."""
+    own = servo.controller
+    if not isinstance(own, Controller) or not own.Ki or not own.Kp:
         return False
     crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
     return bool(crossovers) and own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
