@@ -58,6 +58,11 @@ class Question:
     trial: Trial
     noise: float
 
+    @property
+    def is_held(self) -> bool:
+        """True where friction may hold the motor."""
+        return self.uncertainty.friction[1] + self.servo.own_friction > 0.0
+
     def shortcoming(self, tried: Certificate) -> str:
         """Name the demand that is not met; empty where all are met."""
         demands, loop = self.demands, tried.loop
@@ -242,8 +247,7 @@ class Attempt:
     def _long(self) -> LongResult | None:
         """Result of long runs; None where no integral winds up against friction."""
         question = self.question
-        held = question.uncertainty.friction[1] + question.servo.own_friction > 0.0
-        if not held or not integrates(self.setting.controller):
+        if not question.is_held or not integrates(self.setting.controller):
             return None
         duration = _LONG * question.trial.duration
         trial = replace(question.trial, duration=duration, last=0.5 * duration)

@@ -81,6 +81,8 @@ class Screening:
     def __init__(self, question: Question) -> None:
         demands, known = question.demands, question.uncertainty
         self.question = question
+        # Half as long where nothing integrates against friction: cost is decided soon after the step.
+        self._trial = question.trial if question.is_held else question.trial.half
         self.only: Callable[[Design], bool] | None = None
         self._moves = known.replace(step=known.usual_step or known.step)
         self._members = draw(question.servo, self._moves, demands.screened, demands.conditions, demands.seed)
@@ -166,7 +168,7 @@ class Screening:
             return
         largest = known.replace(step=(_LARGEST * known.step[1], known.step[1]))
         machines = draw(question.servo, largest, question.demands.screened, 2, question.demands.seed)
-        tried = assess([self._quick(each) for each in pushed], machines, question.trial.half)
+        tried = assess([self._quick(each) for each in pushed], machines, self._trial)
         self._far |= {each: bool(self._is_off(each, few).any()) for each, few in zip(pushed, tried, strict=True)}
 
     def _finish(self, settings: list[Design]) -> None:
@@ -188,7 +190,7 @@ class Screening:
         machines = self._members.each(places)
         quick = [self._quick(each) for each in settings]
         for setting, new in zip(
-            settings, assess(quick, machines, self.question.trial.half, self._largest), strict=True
+            settings, assess(quick, machines, self._trial, self._largest), strict=True
         ):
             before = self._known.get(setting)
             self._known[setting] = new if before is None else joined(before, new)
