@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import msgspec
@@ -19,10 +20,10 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
-from servotwin.redesign.certified.learnt_servo import learnt_servo
+from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, TablePolicy, certify_cell
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
 from servotwin.redesign.policy import Evidence
 from servotwin.simulation import simulate
 from servotwin.twin.lookups import Lookups, LookupState, VerificationRequest, decode_request, encode_request
@@ -91,9 +92,27 @@ def test_the_pitch_counts_with_its_covariance() -> None:
     assert factors.covariance[0][2] == covariance[0, 2]
 
 
-def test_a_free_shaft_keeps_its_stated_ranges_in_the_verification() -> None:
-    """Its load's mass and damping are not learnt, and both act on the loop."""
-    assert learnt_servo(Axis.preset("gantry"), POLICY.uncertainty, learnt(OFF_BY[0]), None) is None
+def test_of_a_free_shaft_the_stiffness_over_the_mass_counts() -> None:
+    """The load's mass and its dampings stay as stated: both act on the loop, and are not learnt."""
+    axis, known = Axis.preset("gantry"), POLICY.uncertainty
+    made = learnt_servo(axis, known, learnt(OFF_BY[0]), None)
+    assert made is not None
+    machines = draw_independently(made[0], narrowed(known, made[1]), 400, 1).plants
+    shafts = [each for each in machines if isinstance(each, Axis)]
+    mass = np.array([each.load.m[0] for each in shafts]) / axis.load.m[0]
+    over_mass = np.array([each.transmission.k_d for each in shafts]) / axis.transmission.k_d / mass
+    assert np.all(np.abs(over_mass / OFF_BY[0][0] - 1.0) < 0.02)
+    assert np.ptp(mass) > 1.9 * known.m
+    assert np.ptp([each.transmission.c_d for each in shafts]) > 1.9 * known.c * axis.transmission.c_d
+
+
+def test_a_free_shaft_that_is_hardly_known_or_has_springs_behind_it_keeps_its_stated_ranges() -> None:
+    axis, known = Axis.preset("gantry"), POLICY.uncertainty
+    unknown = FactorPrior(np.zeros(4), np.diag(np.square([0.08, 0.3, 0.01, 0.01])))
+    assert learnt_servo(axis, known, unknown, None) is None
+    m = axis.load.m[0]
+    sprung = axis.replace(load=replace(axis.load, m=(0.5 * m, 0.5 * m), k=(0.0, 1e8), c=(*axis.load.c, 1e3)))
+    assert learnt_servo(sprung, known, learnt(OFF_BY[0]), None) is None
 
 
 @cache

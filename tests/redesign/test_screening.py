@@ -13,7 +13,7 @@ import pytest
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import screening as module
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.attempt import ROUNDED, Question
+from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import _shortlist, candidates_of
 from servotwin.redesign.certified.screening import Screening, exceeds_error_limit, has_widest_integral_zone, is_plain
@@ -116,12 +116,16 @@ def test_after_the_first_the_settings_that_settle_most_surely_are_verified() -> 
     question, _ = question_and_candidates()
     near, far, plain = (kind[:8] for kind in settings_of_each_kind())
     screening = Screening(question)
-    tried = list(_shortlist(screening, iter([*near, *far, *plain]), has_widest_integral_zone([*near, *far, *plain]), 3))
-    assert tried == [*near[:3], *far[:3], *plain[:3]]
+
+    def tried(screening: Screening, settings: list[Design], widest: list[Design]) -> list[Design]:
+        attempts = (Attempt(question, each) for each in settings)
+        return [each.setting for each in _shortlist(screening, attempts, has_widest_integral_zone(widest), 3)]
+
+    every = [*near, *far, *plain]
+    assert tried(screening, every, every) == [*near[:3], *far[:3], *plain[:3]]
     assert screening.only is not None
     assert not screening.only(near[0])
-    mixed = list(_shortlist(Screening(question), iter([*plain, *far]), has_widest_integral_zone(far), 3))
-    assert mixed == [*plain[:3], *far[:3]]
+    assert tried(Screening(question), [*plain, *far], far) == [*plain[:3], *far[:3]]
 
 
 def test_what_friction_leaves_at_most_counts_and_not_where_a_few_machines_stop() -> None:

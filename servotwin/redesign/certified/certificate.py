@@ -169,7 +169,7 @@ class Demands:
     screened: int = 4
     conditions: int = 8
     machines: int = 300
-    attempts: int = 8
+    attempts: int = 4
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -258,7 +258,7 @@ class RampResult:
 
 @dataclass(frozen=True)
 class LongResult:
-    """Result of long runs of a law whose integral winds up where friction holds the motor: it may move again much later.
+    """Result of long runs of a law whose integral winds up while friction holds the motor, which may move much later.
 
     Attributes
     ----------

@@ -10,8 +10,9 @@ from servotwin.control.retuning import integrates
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
-from servotwin.redesign.certified.learnt_servo import counts_learnt, learnt_servo
+from servotwin.redesign.certified.learnt_servo import learnt_servo
 from servotwin.redesign.certified.margins import own_static_gain
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
 from servotwin.redesign.dead_zones import gap_range
@@ -140,7 +141,7 @@ class EvidenceRanges:
         gains, rested = evidence.gains, math.isfinite(evidence.disturbance.bias_std)
         if gains is None or not rested or evidence.estimate.ok:
             return False
-        if evidence.estimate.machine is not None and counts_learnt(self.servo):
+        if evidence.estimate.machine is not None and self.servo.backlash_kind is not BacklashKind.FREE:
             return True
         fed, _ = self.input_bias(evidence)
         if abs(fed - gains.feedforward) > SAME_FEEDFORWARD * self.smallest_answer:

@@ -22,19 +22,26 @@ _LEAST_K, _LEAST_C = 0.002, 0.01
 _WELL_KNOWN = 0.5
 
 
-def counts_learnt(servo: Plant) -> bool:
+def counts_learnt(servo: Plant, machine: FactorPrior | None, known: Uncertainty) -> bool:
     """True where a learnt machine counts in place of the stated half-widths.
 
-    Of a free shaft it does not: the verification draws one factor for all stiffnesses and one for all dampings, and the
-    load's own damping is not learnt. Its mass, which acts back on the motor there, is not either.
+    Of a free shaft its stiffness over the load's mass does, once it is known to half of what is stated. Of its load
+    nothing is learnt: one with springs of its own, which the verification draws with the shaft's, does not count.
     """
-    return servo.backlash_kind is not BacklashKind.FREE
+    if machine is None:
+        return False
+    if servo.backlash_kind is not BacklashKind.FREE:
+        return True
+    alone = isinstance(servo, Axis) and len(servo.load.m) == 1 and not any(servo.load.k)
+    return alone and math.sqrt(3.0 * machine.covariance[0, 0]) < _WELL_KNOWN * known.k
 
 
 def narrowed(known: Uncertainty, learnt: LearntFactors) -> Uncertainty:
     """Prior knowledge with what was learnt in place of the stated half-widths."""
-    # Learnt stiffness and damping are those over the masses, which are then taken as the model's.
-    return known.replace(learnt=learnt, m=0.0 if "k" in learnt.names else known.m)
+    # Learnt stiffness and damping are those over the masses, which are then taken as the model's, unless the mass acts
+    # back on the motor.
+    alone = "k" in learnt.names and not learnt.per_mass
+    return known.replace(learnt=learnt, m=0.0 if alone else known.m)
 
 
 def learnt_servo(
@@ -45,10 +52,16 @@ def learnt_servo(
     The motor's numbers count where the windows told more of them than was stated.
     """
     names, variances = list[str](), list[Array]()
-    if machine is not None and counts_learnt(servo):
-        servo = adapted(servo, machine.mean) if isinstance(servo, Servo) else _scaled(servo, machine.mean)
-        names += ["k", "c", "p"]
-        variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))
+    shaft = servo.backlash_kind is BacklashKind.FREE
+    if machine is not None and counts_learnt(servo, machine, known):
+        if shaft:
+            servo = servo.scaled({"k": math.exp(machine.mean[0])})
+            names.append("k")
+            variances.append(machine.covariance[:1, :1] + _LEAST_K**2)
+        else:
+            servo = adapted(servo, machine.mean) if isinstance(servo, Servo) else _scaled(servo, machine.mean)
+            names += ["k", "c", "p"]
+            variances.append(machine.covariance[:3, :3] + np.diag([_LEAST_K**2, _LEAST_C**2, 0.0]))
     if motor is not None:
         for name, index, sign, width in (("k_B", BACK_EMF, 1, known.k_B), ("k_T", LAG, -1, known.k_T)):
             relative = motor.std(index) / (1.0 + motor.mean[index])
@@ -63,7 +76,7 @@ def learnt_servo(
 
     covariance = block_diag(*variances)
     spread = tuple(tuple(row) for row in covariance.tolist())
-    return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread)
+    return servo, LearntFactors(tuple(names), (0.0,) * len(names), spread, per_mass=shaft)
 
 
 def _scaled(axis: Axis, factors: Array) -> Axis:

@@ -20,6 +20,8 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting
+from servotwin.plant.basis import BacklashKind
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.attempt import with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
@@ -276,8 +278,8 @@ class TablePolicy:
 
         A machine that was learnt to lie outside of the stated half-widths is in no cell: its settings are verified.
         """
-        learnt = evidence.machine if counts_learnt(self.policy.servo) else None
-        if learnt is not None and not _is_stated(learnt, self.policy.uncertainty):
+        servo, learnt, known = self.policy.servo, evidence.machine, self.policy.uncertainty
+        if learnt is not None and counts_learnt(servo, learnt, known) and not _is_stated(servo, learnt, known):
             return self.policy.redesign(evidence)
         return self.policy.decide(evidence, self)
 
@@ -309,11 +311,15 @@ class _WithdrawnTable:
         return self.certificate
 
 
-def _is_stated(machine: FactorPrior, known: Uncertainty) -> bool:
-    """True where stiffness and damping over the masses, as learnt, lie within what the half-widths allow."""
-    spread = NORMAL_95 * np.sqrt(np.diag(machine.covariance)[:2])
-    low, high = np.exp(machine.mean[:2] - spread), np.exp(machine.mean[:2] + spread)
-    widths = np.array([known.k, known.c])
+def _is_stated(servo: Plant, machine: FactorPrior, known: Uncertainty) -> bool:
+    """True where stiffness and damping over the masses, as learnt, lie within what the half-widths allow.
+
+    Of a free shaft the stiffness alone counts.
+    """
+    count = 1 if servo.backlash_kind is BacklashKind.FREE else 2
+    spread = NORMAL_95 * np.sqrt(np.diag(machine.covariance)[:count])
+    low, high = np.exp(machine.mean[:count] - spread), np.exp(machine.mean[:count] + spread)
+    widths = np.array([known.k, known.c])[:count]
     return bool(np.all((1.0 - widths) / (1.0 + known.m) <= low) and np.all(high <= (1.0 + widths) / (1.0 - known.m)))
 
 

@@ -32,9 +32,9 @@ from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 
-# Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered PID
-# whose corner Ki / Kp is below this share of the crossover. A faster one swings in every gap, and `Demands.integral` are
-# small shares of it.
+# Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered
+# PID whose corner Ki / Kp is below this share of the crossover. A faster one swings in every gap: only the small shares
+# of `Demands.integral` are tried.
 _WHOLE_INTEGRAL = (0.0, 0.1, 0.3, 1.0)
 _SLOW_INTEGRAL = 0.25
 AnyPlantSet: TypeAlias = PlantSet | LawSet

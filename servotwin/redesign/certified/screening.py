@@ -189,9 +189,7 @@ class Screening:
         """Simulate settings on the machines at these places."""
         machines = self._members.each(places)
         quick = [self._quick(each) for each in settings]
-        for setting, new in zip(
-            settings, assess(quick, machines, self._trial, self._largest), strict=True
-        ):
+        for setting, new in zip(settings, assess(quick, machines, self._trial, self._largest), strict=True):
             before = self._known.get(setting)
             self._known[setting] = new if before is None else joined(before, new)
             self._places[setting] = places if before is None else np.concatenate([self._places[setting], places])

@@ -44,6 +44,8 @@ class LearntFactors:
         Of `PARAMETERS`.
     mean : tuple of N float
     covariance : tuple of N tuples of N float
+    per_mass : bool
+        True where the stiffness is that over the mass: it is drawn times the mass's factor.
 
     Raises
     ------
@@ -54,6 +56,8 @@ class LearntFactors:
     names: tuple[str, ...]
     mean: tuple[float, ...]
     covariance: tuple[tuple[float, ...], ...]
+    # Not in the representation, which seeds the verification: a servo's factors always have the same one.
+    per_mass: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:
         if len(set(self.names)) < len(self.names) or not set(self.names) <= set(PARAMETERS):
@@ -332,6 +336,8 @@ def _factors(uncertainty: Uncertainty, places: Array) -> Array:
     if learnt is not None and learnt.names:
         which = [PARAMETERS.index(name) for name in learnt.names]
         factors[:, which] = learnt.factors(places[:, which])
+        if learnt.per_mass and "k" in learnt.names:
+            factors[:, PARAMETERS.index("k")] *= factors[:, PARAMETERS.index("m")]
     return np.asarray(factors)
 
 
