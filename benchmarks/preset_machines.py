@@ -178,7 +178,10 @@ class PresetMachine:
                 pre_trigger=_whole(duty.before * duty.half_period, rate),
                 probe=ProbeLimits(probe) if probe else None,
             ),
-            twin=TwinSettings(uncertainty=ranges, excitation=excitation) if self.certified else own,
+            # A gap that grows tenfold within the run: a setting is to hold until the next one.
+            twin=TwinSettings(uncertainty=ranges, excitation=excitation, horizon=duty.hold * duty.half_period)
+            if self.certified
+            else own,
         )
 
     def alone(self) -> Run:

@@ -76,6 +76,11 @@ class EvidenceRanges:
         trend, bias_known = evidence.trend, math.isfinite(evidence.disturbance.bias_std)
         return trend.as_estimate() if bias_known and trend is not None and trend.updates > 0 else None
 
+    def gap_now(self, evidence: Evidence) -> Range:
+        """Range of gaps at the window, as stated where none was estimated."""
+        estimate = self.estimate(evidence)
+        return self.uncertainty.gap if estimate is None else gap_range(estimate)
+
     def _gap(self, estimate: GapEstimate, trend: Trend | None) -> Range:
         """Range of gaps until `horizon` has passed; one window alone tells nothing about wear."""
         low, high = gap_range(estimate)

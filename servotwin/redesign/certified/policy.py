@@ -101,7 +101,8 @@ class CertifiedPolicy:
         """Choose the verified setting for the evidence; without one the fallback set, and the reason.
 
         The setting must stay within the fallback set's band, since the edge falls back when the loop leaves it. Where
-        the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. Where
+        the gap may be wider than the stated range nothing is sent: not even the fallback set is verified there. It is
+        sent where the gap may only grow so wide: the one in force is for the gap of before. Where
         the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
         learnt = learnt_servo(self.servo, self.uncertainty, evidence.machine, evidence.motor)
@@ -115,7 +116,7 @@ class CertifiedPolicy:
         best = math.nan if estimate is None else estimate.gap
         region = self.ranges.region(evidence)
         if too_wide := self._too_wide(region):
-            return Redesign(None, math.nan, too_wide)
+            return self._for_growth(evidence, verifier.fallback(), region) or Redesign(None, math.nan, too_wide)
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
             return _fallback_redesign(verifier.fallback(), region, result.reason)
@@ -130,6 +131,18 @@ class CertifiedPolicy:
             return ""
         low, high, most = (math.degrees(x) for x in (*region.gap, self.uncertainty.gap[1]))
         return f"the gap may be {low:.3g} to {high:.3g} deg, and at most {most:.3g} deg are certified: nothing is sent"
+
+    def _for_growth(self, evidence: Evidence, fallback: Certificate, region: Region) -> Redesign | None:
+        """The fallback set, where the gap is within the stated range and may only grow beyond it; None: it is not."""
+        if self.ranges.gap_now(evidence)[1] > self.uncertainty.gap[1]:
+            return None
+        high, most = (math.degrees(x) for x in (region.gap[1], self.uncertainty.gap[1]))
+        reason = (
+            f"the gap may grow to {high:.3g} deg within {self.horizon:g} s, and at most {most:.3g} deg are certified"
+        )
+        if alike(fallback.setting, evidence.setting):
+            return Redesign(None, math.nan, f"{reason}; the fallback set stays")
+        return _fallback_redesign(fallback, region, reason)
 
     def fall_back(self, evidence: Evidence, reason: str) -> Redesign:
         """Choose the fallback set, whatever else would be verified."""
