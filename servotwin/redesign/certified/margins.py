@@ -30,6 +30,7 @@ from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
+from servotwin.redesign.certified.rest_in_gap import floats_in_gap
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 
 # Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered
@@ -253,9 +254,12 @@ def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> t
 
 
 def has_slow_integral(servo: Plant) -> bool:
-    """True where a filtered PID's own integral acts well below the crossover, as a textbook has it."""
+    """True where a filtered PID's own integral acts well below the crossover, as a textbook has it.
+
+    That on a load that nothing holds in the gap does not count: it pushes the load to and fro there, for long.
+    """
     own = servo.controller
-    if not isinstance(own, Controller) or not own.Ki or not own.Kp:
+    if not isinstance(own, Controller) or not own.Ki or not own.Kp or floats_in_gap(servo):
         return False
     crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
     return bool(crossovers) and own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega

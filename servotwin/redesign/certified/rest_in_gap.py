@@ -25,7 +25,7 @@ _HARDLY = 1e-6
 def coasting_time(servo: Plant, uncertainty: Uncertainty) -> float:
     """s, longest time constant with which a load that floats in its gap loses its speed; 0 where none floats, friction
     stops it, or nothing does."""
-    if not isinstance(servo, Axis) or not _floats(servo) or not servo.load.c[0]:
+    if not isinstance(servo, Axis) or not floats_in_gap(servo) or not servo.load.c[0]:
         return 0.0
     return (1.0 + uncertainty.m) * sum(servo.load.m) / ((1.0 - uncertainty.c) * servo.load.c[0])
 
@@ -39,7 +39,8 @@ def check_rests(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Non
         Its load floats there without friction and damping, or its law drives the motor to and fro there.
     """
     # Within one count of its encoder a load is at rest as far as anybody can measure.
-    if not isinstance(servo, Axis) or not _floats(servo) or servo.p * uncertainty.gap[1] <= servo.position_resolution:
+    seen = servo.p * uncertainty.gap[1] > servo.position_resolution
+    if not isinstance(servo, Axis) or not floats_in_gap(servo) or not seen:
         return
     load = servo.load
     if not load.c[0]:
@@ -59,8 +60,10 @@ def check_rests(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Non
         )
 
 
-def _floats(axis: Axis) -> bool:
+def floats_in_gap(axis: Plant) -> bool:
     """True where neither spring nor friction stops the load inside the gap."""
+    if not isinstance(axis, Axis):
+        return False
     return axis.backlash_kind is BacklashKind.FREE and axis.load.free and not axis.load.friction
 
 
