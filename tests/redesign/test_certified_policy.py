@@ -77,6 +77,24 @@ def test_a_gap_beyond_the_certified_range_gets_nothing_and_a_reason(policy: Cert
     assert "at most 60 deg are certified: nothing is sent" in made.reason
 
 
+def test_where_the_gap_may_only_grow_beyond_the_range_the_fallback_set_is_sent(policy: CertifiedPolicy) -> None:
+    """What is in force was verified for the gap of before."""
+    trend = Trend.start()
+    for time in range(6):
+        trend = trend.update(replace(estimated(40.0 + 1.5 * time), time=10.0 * time))
+    last = replace(estimated(47.5), time=50.0)
+    assert gap_range(last)[1] < 60.0 * DEG < 47.5 * DEG + 200.0 * trend.rate_interval[1]
+    far = replace(policy, horizon=200.0)
+    made = far.redesign(Evidence(last, at_rest(0.01), trend, rests=(0.01, 0.01)))
+    assert made.setting is not None
+    assert structs.replace(made.setting.gains, feedforward=0.0) == gains_of(far.fallback().setting.controller)
+    assert made.reason.startswith("the gap may grow to")
+    assert "within 200 s, and at most 60 deg are certified; the fallback set is sent" in made.reason
+    again = far.redesign(Evidence(last, at_rest(0.01), trend, rests=(0.01, 0.01), setting=made.setting))
+    assert again.setting is None
+    assert again.reason.endswith("the fallback set stays")
+
+
 @pytest.mark.slow
 def test_without_a_verified_setting_the_fallback_set_is_sent_with_the_bias(policy: CertifiedPolicy) -> None:
     """The fallback set is verified for an unknown bias, without a bound on the overshoot."""

@@ -1,0 +1,134 @@
+"""Integral action among the candidates: which of it is tried, and the long runs that show whether it hunts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from servotwin.control.controller import Controller
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.redesign.certified.attempt import Attempt, Question
+from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.certify import candidates_of, is_disturbed
+from servotwin.redesign.certified.margins import integral_shares, nominal_margins
+from servotwin.redesign.certified.trial import trial_for
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.design import Design
+from servotwin.simulation import simulate
+
+SCREW, DEMANDS = Axis.preset("ball-screw"), Demands()
+OWN = SCREW.pidf
+KNOWN = Uncertainty(gap=(0.0, 75e-6 / SCREW.p), step=(1.5e-4, 1e-3))
+
+
+def with_law(servo: Axis, **changes: float) -> Axis:
+    return servo.replace(controller=servo.pidf.replace(**changes))
+
+
+@pytest.mark.parametrize(
+    ("servo", "shares"),
+    [
+        (SCREW, (0.0, 0.1, 0.3, 1.0)),
+        (Axis.preset("telescope"), (0.0, 0.1, 0.3, 1.0)),
+        # Half the crossover: the paper's loop cycles in every gap with all of it.
+        (Servo.preset("paper"), DEMANDS.integral),
+        # Nothing holds this load in its gap.
+        (Axis.preset("robot-joint"), DEMANDS.integral),
+        (Axis.preset("stepper-stage"), (1.0,)),
+    ],
+)
+def test_an_integral_that_is_slow_beside_the_crossover_is_tried_as_a_whole(
+    servo: Plant, shares: tuple[float, ...]
+) -> None:
+    assert integral_shares(servo, DEMANDS) == shares
+
+
+def test_what_is_slow_is_a_quarter_of_the_crossover() -> None:
+    crossover = nominal_margins(SCREW, OWN.replace(Ki=0.0)).gain_crossovers[-1].omega
+    slow, fast = (with_law(SCREW, Ki=share * OWN.Kp * crossover) for share in (0.2, 0.35))
+    assert len(integral_shares(slow, DEMANDS)) == 4
+    assert integral_shares(slow, DEMANDS) != DEMANDS.integral
+    assert integral_shares(fast, DEMANDS) == DEMANDS.integral
+
+
+@pytest.mark.parametrize("servo", [SCREW, Axis.preset("gantry")])
+def test_zones_that_stop_the_integral_span_the_lost_motion(servo: Axis) -> None:
+    known = KNOWN.replace(gap=(0.0, 10.0 * KNOWN.step[0] / servo.p))
+    disturbed = is_disturbed(servo, known, DEMANDS, 0.0)
+    zone = servo.tolerance_for(known.gap[1])
+    found = {
+        each.tolerance
+        for each in candidates_of(servo, known, DEMANDS, disturbed, noisy=False)
+        if isinstance(each.controller, Controller) and each.controller.Ki and each.controller.integral_only
+    }
+    assert {0.5 * zone, zone} <= found
+
+
+@cache
+def question() -> Question:
+    return Question(SCREW, KNOWN, replace(DEMANDS, machines=60, settled=0.95), trial_for(SCREW, KNOWN, DEMANDS), 0.0)
+
+
+def lively(tolerance: float, leave: float = 2.0) -> Design:
+    """The own law with 0.85 times its gain and a zone (m) that stops its integral."""
+    law = OWN.replace(Kp=0.85 * OWN.Kp, Kd=0.85 * OWN.Kd, integral_only=tolerance > 0.0, leave=leave)
+    return Design(law, tolerance)
+
+
+def test_a_motor_that_friction_holds_may_move_again_much_later() -> None:
+    """A machine on which the integral hunts is at rest at the end of the usual run; a zone that stops it keeps it."""
+    hunting, resting = Attempt(question(), lively(0.0)), Attempt(question(), lively(15e-6))
+    assert hunting._long is not None
+    assert resting._long is not None
+    assert hunting._long.settled < 1.0
+    assert resting._long.settled == 1.0
+    assert resting._long.duration == pytest.approx(20.0 * question().trial.duration)
+    assert "stays at rest" in question().shortcoming(replace(resting.certificate(), long=hunting._long))
+
+
+def test_long_runs_are_for_an_integral_against_friction_only() -> None:
+    plain = Design(OWN.replace(Ki=0.0), 0.0)
+    assert Attempt(question(), plain)._long is None
+    paper, known = Servo.preset("paper"), Uncertainty(gap=(0.0, 0.1), input_bias=(-0.01, 0.01))
+    free = Question(paper, known, DEMANDS, trial_for(paper, known, DEMANDS), 0.0)
+    integral = Design(paper.controller.replace(Ki=0.01 * paper.controller.Ki), 0.0)
+    assert Attempt(free, integral)._long is None
+
+
+def test_where_a_candidate_failed_the_next_ones_are_tried_first() -> None:
+    own = Attempt(
+        replace(question(), uncertainty=KNOWN.replace(gap=(60e-6 / SCREW.p, 75e-6 / SCREW.p))), Design(OWN, 0.0)
+    )
+    assert own.cannot_pass()
+    (machines,) = own.missed()
+    assert 0 < machines.count <= 4
+    assert own.fails_early([machines])
+    calm = Attempt(question(), Design(OWN.replace(Kp=0.6 * OWN.Kp, Kd=0.6 * OWN.Kd, Ki=0.0), 0.0))
+    assert not calm.fails_early([machines])
+    assert not calm.missed()
+
+
+def test_a_machine_that_an_attempt_leaves_swings_in_a_run_of_its_own() -> None:
+    """The oracle is the simulation of one machine, with steps to and fro instead of one."""
+    own = Attempt(
+        replace(question(), uncertainty=KNOWN.replace(gap=(60e-6 / SCREW.p, 75e-6 / SCREW.p))), Design(OWN, 0.0)
+    )
+    assert own.cannot_pass()
+    (machines,) = own.missed()
+    trial, gap, size = question().trial, float(machines.gap[0, 0]), float(machines.step[0, 0])
+    run = simulate(
+        machines.plants[0],
+        4.0 * trial.duration,
+        controller=OWN,
+        reference=SquareWave(0.5 * size, 4.0 * trial.duration),
+        gap=gap,
+        sample_rate=OWN.sample_rate,
+    )
+    last = (run.reference - run.position)[-len(run.time) // 6 :]
+    assert 0.5 * np.ptp(last) > 0.02 * SCREW.p * gap
