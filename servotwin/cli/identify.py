@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,18 +15,23 @@ from rich.table import Table
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.gap import is_motors_position
 from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
+from servotwin.plant.axis import Axis
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.display_units import command_unit, position_unit
-from servotwin.plant.plants import Plant, check_load_encoder, plant_of, resolve_plant
+from servotwin.plant.plants import Plant, plant_of, resolve_plant
 from servotwin.plant.scales import scales
+from servotwin.plant.sensors import LOAD
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 WINDOW = 1.0  # s of the servo's own
+_FREE = 8.0  # windows: a load behind a free shaft needs so much longer to come to rest
 
 
 @dataclass(frozen=True)
@@ -79,8 +84,9 @@ def identify(options: IdentifyOptions) -> Identification:
     """
     log, stated = read_log(options.log), _settings(options)
     servo = _servo(options, log)
-    settings, windows = stated.on(servo), cut(log, options, servo)
-    estimator, wear = estimator_of(servo, settings), Wear(settings.initial_gap)
+    settings, wear = stated.on(servo), Wear(stated.initial_gap)
+    estimator = estimator_of(_with_seen_load(servo, log.whole), settings)
+    windows = cut(log, options, servo)
     estimates = []
     for window in windows:
         now = window.mid_time
@@ -105,7 +111,7 @@ def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
             f"{whole.where}there is no column 'reference_{position_unit(servo).si}' to find the steps in: "
             "give --start and --duration"
         )
-    length = _option("window", options.window, log.metadata.get("window_s"), WINDOW * scales(servo).time)
+    length = _option("window", options.window, log.metadata.get("window_s"), _usual_window(servo))
     before = _option("pre-trigger", options.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
     if not 0.0 <= before < length:
         raise InvalidInput(f"--pre-trigger {before!r} s: must be at least 0 and below the window's {length!r} s")
@@ -114,6 +120,11 @@ def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
         shown = f"no change of the reference is followed by {length:g} s"
         raise InvalidInput(f"{whole.where}{shown}; give --start and --duration")
     return tuple(whole.slice(whole.start + first / whole.sample_rate, length) for first in firsts)
+
+
+def _usual_window(servo: Plant) -> float:
+    """s."""
+    return WINDOW * scales(servo).time * (_FREE if servo.backlash_kind is BacklashKind.FREE else 1.0)
 
 
 def window_starts(reference: Sequence[float] | np.ndarray[Any, Any], length: int, before: int) -> list[int]:
@@ -129,7 +140,7 @@ def window_starts(reference: Sequence[float] | np.ndarray[Any, Any], length: int
 
 def _one(whole: Window, options: IdentifyOptions) -> Window:
     start = whole.start if options.start is None else options.start
-    end = float(whole.start + whole.position.size / whole.sample_rate)
+    end = float(whole.start + whole.samples / whole.sample_rate)
     duration = end - start if options.duration is None else options.duration
     if not (math.isfinite(start) and math.isfinite(duration) and duration > 0.0):
         shown = f"--start {start!r} s, --duration {duration!r} s"
@@ -153,14 +164,23 @@ def _servo(options: IdentifyOptions, log: Log) -> Plant:
         servo = plant_of(text, f"log {options.log}, servo")
     else:
         raise InvalidInput(f"{log.whole.where}the log does not describe its servo: give --servo, a preset or a TOML")
-    check_load_encoder(servo, "the estimate of the gap")
-    for channel, unit in (("position", position_unit(servo).si), ("voltage", command_unit(servo))):
+    position = position_unit(servo).si
+    for channel, unit in (("position", position), ("reference", position), ("voltage", command_unit(servo))):
         if channel in log.names and log.unit(channel) != unit:
             raise InvalidInput(
                 f"{log.whole.where}column {log.names[channel]!r} is in {log.unit(channel)}, and the machine counts it "
                 f"in {unit}: give the log's own machine with --servo"
             )
     return servo
+
+
+def _with_seen_load(servo: Plant, whole: Window) -> Plant:
+    """The axis as its log shows it: one whose controller reads the motor may have an encoder at the load too."""
+    if not isinstance(servo, Axis) or not servo.at_motor or not whole.has_position:
+        return servo
+    if is_motors_position(whole, servo):
+        return servo
+    return servo.replace(sensors=replace(servo.sensors, feedback=LOAD))
 
 
 def _settings(options: IdentifyOptions) -> TwinSettings:

@@ -118,7 +118,7 @@ def default_method(servo: Plant) -> str:
 
 def _method_for(window: Window, servo: Plant) -> str:
     """The default method for a window: without the load's position the one that reads the motor."""
-    if window.has_position and not (isinstance(servo, Axis) and _at_motor(window, servo)):
+    if window.has_position and not (isinstance(servo, Axis) and is_motors_position(window, servo)):
         return default_method(servo)
     return motor_side.METHOD
 
@@ -155,8 +155,8 @@ def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.Wh
     )
 
 
-def _at_motor(window: Window, axis: Axis) -> bool:
-    """True where a window's position is the motor's own."""
+def is_motors_position(window: Window, axis: Axis) -> bool:
+    """True where a window's position is the motor's own, of an axis whose controller reads the motor's encoder."""
     if not window.has_position or window.theta_m is None or not axis.at_motor:
         return False
     lead = window.position - axis.p * window.theta_m
@@ -165,7 +165,7 @@ def _at_motor(window: Window, axis: Axis) -> bool:
 
 def _check_position(window: Window, axis: Axis) -> None:
     """Refuse a window whose position is the motor's own."""
-    if _at_motor(window, axis):
+    if is_motors_position(window, axis):
         raise InvalidInput(
             f'{window.where}axis sensors feedback = "motor": position is the motor\'s angle times the ratio, and '
             'the gap lies behind the motor; give the load\'s own position, or method = "motor_side"'

@@ -54,7 +54,7 @@ def holds_signals(path: Path) -> bool:
 
 
 def read_log(path: Path) -> Log:
-    """Read a log, complete and uniformly sampled.
+    """Read a log, complete and uniformly sampled; with motor angle and command it may lack the position.
 
     Raises
     ------
@@ -139,13 +139,16 @@ def _chosen(path: Path, columns: LogColumns) -> dict[str, str]:
     """Names of the columns by channel."""
     every = SIGNAL_COLUMNS.items()
     chosen = {channel: next((n for n in names if n in columns.values), None) for channel, names in every}
-    for name, place in (("position_m", chosen["position"]), (TIME, TIME if TIME in columns.values else None)):
+    seen = chosen["position"] or (chosen["theta_m"] and chosen["voltage"])
+    for name, place in (("position_m", seen), (TIME, TIME if TIME in columns.values else None)):
         if place is None:
             hint, known = did_you_mean(name, columns.names), ", ".join(columns.names)
-            raise InvalidInput(f"log {path}: column {name!r} is missing{hint}; it has {known or 'none'}")
+            # The motor may feel its load.
+            other = "" if name == TIME else ", and so are theta_m_rad and a command, which may take its place"
+            raise InvalidInput(f"log {path}: column {name!r} is missing{hint}{other}; it has {known or 'none'}")
     names = {channel: name for channel, name in chosen.items() if name is not None}
-    position, reference = names["position"], names.get("reference")
-    if reference is not None and unit_of(reference).si != unit_of(position).si:
+    position, reference = names.get("position"), names.get("reference")
+    if position is not None and reference is not None and unit_of(reference).si != unit_of(position).si:
         raise InvalidInput(
             f"log {path}: columns {position!r} and {reference!r}: must both be lengths or both be angles"
         )

@@ -1,6 +1,7 @@
 """`servotwin identify` on logs of axes made of parts."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -60,3 +61,56 @@ def test_a_log_in_degrees_is_the_log_in_radians(logs: Path) -> None:
 def test_a_log_of_another_machine_is_refused(logs: Path, name: str, servo: str, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
         identify(IdentifyOptions(logs / f"{name}.npz", servo, start=0.0, duration=2.0))
+
+
+JOINT = st.Axis.preset("robot-joint")
+SEMI_CLOSED = JOINT.replace(sensors=replace(JOINT.sensors, feedback="motor"))
+JOINT_GAP = math.radians(21.0)
+
+
+@pytest.fixture(scope="module")
+def motor_logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A joint off its model whose controller reads the motor: the motor's columns alone, and with an encoder behind."""
+    folder = tmp_path_factory.mktemp("motor")
+    machine = SEMI_CLOSED.scaled({"k": 1.03, "c": 0.85, "k_T": 1.05})
+    run = st.simulate(machine, 2.0, reference=st.SquareWave(0.05, 16.0), gap=JOINT_GAP, sample_rate=1000.0)
+    own = {name: run.columns[name] for name in ("time_s", "theta_m_rad", "command_n_m", "reference_rad")}
+    for name, columns in {
+        "motor": own,
+        "written": dict(run.columns),
+        "load": {**own, "position_rad": run.position},
+        "no-command": {name: values for name, values in own.items() if name != "command_n_m"},
+    }.items():
+        write_log(SignalTable(columns, {}), folder / f"{name}.csv")
+    (folder / "joint.toml").write_text(SEMI_CLOSED.dumps())
+    light = SEMI_CLOSED.replace(load=replace(SEMI_CLOSED.load, m=(1.0,)))
+    (folder / "light.toml").write_text(light.dumps())
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "method"), [("motor", "motor_side"), ("written", "motor_side"), ("load", "output_error")]
+)
+def test_a_log_of_a_controller_that_reads_the_motor_shows_the_gap(motor_logs: Path, name: str, method: str) -> None:
+    """With the load's own position both encoders tell it, and more closely."""
+    found = identify(IdentifyOptions(motor_logs / f"{name}.csv", str(motor_logs / "joint.toml")))
+    (estimate,) = found.estimates
+    assert estimate.ok
+    assert estimate.method == method
+    assert estimate.interval[0] <= JOINT_GAP <= estimate.interval[1]
+    assert estimate.gap == pytest.approx(JOINT_GAP, rel=0.05 if method == "motor_side" else 0.001)
+
+
+@pytest.mark.parametrize(
+    ("name", "servo", "words"),
+    [
+        ("no-command", "joint.toml", "column 'position_m' is missing, and so are theta_m_rad and a command"),
+        ("motor", "robot-joint", "the window has no position of the load"),
+        ("motor", "light.toml", "the motor's encoder and the command do not show the gap"),
+    ],
+)
+def test_a_log_of_a_motor_that_shows_nothing_is_refused(motor_logs: Path, name: str, servo: str, words: str) -> None:
+    named = str(motor_logs / servo) if servo.endswith(".toml") else servo
+    with pytest.raises(InvalidInput, match=words):
+        identify(IdentifyOptions(motor_logs / f"{name}.csv", named))
