@@ -123,7 +123,7 @@ def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
 
 
 def _usual_window(servo: Plant) -> float:
-    """s."""
+    """Length of windows where neither command nor log states one, s."""
     return WINDOW * scales(servo).time * (_FREE if servo.backlash_kind is BacklashKind.FREE else 1.0)
 
 

@@ -114,6 +114,16 @@ def test_where_a_candidate_failed_the_next_ones_are_tried_first() -> None:
     assert not calm.missed()
 
 
+def test_where_the_demands_allow_that_a_machine_fails_no_candidate_is_left_out_for_one() -> None:
+    wide = KNOWN.replace(gap=(60e-6 / SCREW.p, 75e-6 / SCREW.p))
+    strict = Attempt(replace(question(), uncertainty=wide, demands=replace(DEMANDS, machines=300)), Design(OWN, 0.0))
+    lenient = Attempt(replace(strict.question, demands=replace(DEMANDS, settled=0.5)), Design(OWN, 0.0))
+    for attempt in (strict, lenient):
+        attempt.cannot_pass()
+    assert strict.missed()
+    assert not lenient.missed()
+
+
 def test_a_machine_that_an_attempt_leaves_swings_in_a_run_of_its_own() -> None:
     """The oracle is the simulation of one machine, with steps to and fro instead of one."""
     own = Attempt(

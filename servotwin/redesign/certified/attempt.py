@@ -159,14 +159,15 @@ class Attempt:
     def _refused_by(self, few: MachineMeasures) -> bool:
         """True where some of the machines show already that a demand is not met."""
         demands, allowed = self.question.demands, self.question.largest_error(self.setting)
-        most = demands.machines - int(np.sum(~few.settled))
-        if share_at_least(most, demands.machines, demands.confidence) < demands.settled:
+        if not _most_settle(demands, demands.machines - int(np.sum(~few.settled))):
             return True
         return bool(few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot)
 
     def missed(self) -> list[SimulatedMachines]:
-        """Machines on which the setting was simulated so far and missed a demand: the first few."""
-        if self._measures is None:
+        """Machines on which the setting was simulated so far and missed a demand: the first few; none where the demands
+        allow that one does."""
+        demands = self.question.demands
+        if self._measures is None or _most_settle(demands, demands.machines - 1):
             return []
         places = np.flatnonzero(self.question.missed(self.setting, self._measures))[:_HARD]
         return [self._members.each(places)] if places.size else []
@@ -296,6 +297,11 @@ def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> 
     if loop.Ms_worst > ROUNDED * demands.Ms_worst:
         return f"has Ms = {loop.Ms_worst:.3g}{at} on a plant of the stated ranges, and {demands.Ms_worst:g} is allowed"
     return ""
+
+
+def _most_settle(demands: Demands, settled: int) -> bool:
+    """True where so many of the machines of a verification are the share that is demanded."""
+    return share_at_least(settled, demands.machines, demands.confidence) >= demands.settled
 
 
 def _lag(servo: Plant, law: AnyController) -> float:
