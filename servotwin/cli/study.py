@@ -130,7 +130,10 @@ def identify(
         float | None, typer.Option(help="Length of that window, s; by default to the end of the log.")
     ] = None,
     window: Annotated[
-        float | None, typer.Option(help="Length of the windows at the steps, s; by default the log's, or 1.")
+        float | None,
+        typer.Option(
+            help="Length of the windows at the steps, s; by default the log's, or 1 s of the machine's own (8 of a free shaft)."
+        ),
     ] = None,
     pre_trigger: Annotated[float | None, typer.Option(help="Length of the part before the step, s.")] = None,
     method: Annotated[str, typer.Option(help="whitened or paper.")] = "whitened",
