@@ -132,7 +132,7 @@ def identify(
     window: Annotated[
         float | None,
         typer.Option(
-            help="Length of the windows at the steps, s; by default the log's, or 1 s of the machine's own (8 of a free shaft)."
+            help="Length of the windows at the steps, s; by default the log's, or 1 of the machine's own (8: free shaft)."
         ),
     ] = None,
     pre_trigger: Annotated[float | None, typer.Option(help="Length of the part before the step, s.")] = None,
