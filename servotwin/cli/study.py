@@ -132,7 +132,7 @@ def identify(
     window: Annotated[
         float | None,
         typer.Option(
-            help="Length of the windows at the steps, s; by default the log's, or 1 of the machine's own (8: free shaft)."
+            help="Length of the windows at the steps, s; by default the log's, or 1 (free shaft: 8) of the machine."
         ),
     ] = None,
     pre_trigger: Annotated[float | None, typer.Option(help="Length of the part before the step, s.")] = None,
