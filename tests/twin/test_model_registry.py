@@ -78,7 +78,7 @@ def test_without_a_start_it_is_the_verified_fallback_set_as_in_a_scenario():
 @pytest.mark.slow
 def test_where_nothing_is_verified_nothing_is_known_of_the_start():
     wide = TwinSettings().uncertainty.replace(gap=(0.0, 6.0), input_bias=(-9.0, 9.0))
-    few = Demands(machines=40, screened=2, conditions=4, scales=(0.5,), beyond=Beyond(machines=4), settled=0.9)
+    few = Demands(machines=40, screened=2, conditions=4, scales=(0.5,), beyond=Beyond(machines=4))
     settings = TwinSettings(uncertainty=wide, demands=few)
     assert ServoModel("axis", Servo.preset("paper"), settings).first_setting is None
 
