@@ -13,6 +13,7 @@ from servotwin.config.keys import Form, key
 from servotwin.config.table import Table, did_you_mean, parse_toml, read_toml
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import AXES, Axis
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.servo import PRESETS, Servo
 
 Plant: TypeAlias = Servo | Axis
@@ -82,18 +83,19 @@ def check_homogeneous(plant: Plant, described: str) -> None:
         )
 
 
-def check_load_encoder(plant: Plant, described: str) -> None:
-    """Refuse an axis without an encoder at the load for what needs the load's position.
+def check_gap_in_loop(plant: Plant) -> None:
+    """Refuse an axis whose loop does not depend on the gap, for the verification of settings.
 
     Raises
     ------
     InvalidInput
-        Its feedback is the motor's encoder.
+        Its controller reads the motor's encoder, and no load acts back on the motor.
     """
-    if plant.at_motor:
+    if plant.at_motor and plant.backlash_kind is not BacklashKind.FREE:
         raise InvalidInput(
-            f'sensors.feedback = "motor": {described} needs the position of the load, which the motor does not show; '
-            'the feedback must be "load"'
+            'sensors.feedback = "motor": the controller reads the motor, on which no load acts back in this model, so '
+            "that its loop does not depend on the gap and there is nothing to verify; the feedback must be "
+            '"load", or the transmission free in the gap'
         )
 
 

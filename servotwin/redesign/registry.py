@@ -11,7 +11,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.retuning import static_gain
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
-from servotwin.plant.plants import Plant, check_homogeneous, check_load_encoder
+from servotwin.plant.plants import Plant, check_gap_in_loop, check_homogeneous
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
@@ -84,10 +84,10 @@ def check_verifiable(servo: Plant) -> None:
     Raises
     ------
     InvalidInput
-        An axis without an encoder at the load.
+        An axis whose loop does not depend on the gap.
         A cascade or a linear law without a sample rate, or one that does not answer to a constant error.
     """
-    check_load_encoder(servo, "the verification of settings")
+    check_gap_in_loop(servo)
     law = servo.controller
     if isinstance(law, Controller):
         return

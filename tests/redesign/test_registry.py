@@ -12,7 +12,6 @@ from servotwin.edge.guard import Limits
 from servotwin.errors import InvalidInput
 from servotwin.messages import Gains
 from servotwin.plant.axis import Axis
-from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import candidates_of
@@ -220,9 +219,9 @@ def test_hysteresis_may_send_its_thresholds_and_no_other_gains(tmp_path):
     assert isinstance(agent.supervision.fallback.setting.gains, Gains)
 
 
-def test_verified_settings_of_an_axis_without_a_load_encoder_are_refused_at_configuration():
-    axis = Axis.preset("two-mass-drive").replace(sensors=Sensors(feedback="motor"))
-    with pytest.raises(InvalidInput, match="the verification of settings needs the position of the load"):
+def test_verified_settings_of_an_axis_whose_loop_has_no_gap_are_refused_at_configuration():
+    axis = Axis.preset("emps")
+    with pytest.raises(InvalidInput, match="its loop does not depend on the gap and there is nothing to verify"):
         policy_of(axis, TwinSettings())
 
 

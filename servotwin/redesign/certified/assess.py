@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from servotwin.control.retuning import friction_feedforward, rest_gain
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
+from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.trial import Trial
@@ -197,10 +198,24 @@ def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -
     """(P, C) m, error within which the loop has arrived, for steps (m).
 
     It is 2 % of the step, plus the error that input bias and friction leave where nothing integrates, plus the dead
-    zone and two counts of the sensor.
+    zone and two counts of the sensor, plus what the controller does not see of the load.
     """
     model = members.model
-    return arrival_error(setting, model, members.input_bias, members.friction, step)
+    seen = arrival_error(setting, model, members.input_bias, members.friction, step)
+    return np.asarray(seen + unseen_error(model, members.gap))
+
+
+def unseen_error(model: Plant, gap: Array | float) -> Array:
+    """m, largest distance at rest of the load from where the motor would have it, for gaps (rad); 0 where the
+    controller reads the load.
+
+    It is half the lost motion, and the wind-up of the shaft by what the load's friction and a constant force may hold.
+    """
+    if not isinstance(model, Axis) or not model.at_motor:
+        return np.zeros_like(gap, dtype=float)
+    load = model.load
+    held = max(load.friction, load.static or 0.0) + abs(load.force)
+    return np.asarray(0.5 * model.p * np.asarray(gap) + held / model.transmission.k_d)
 
 
 def arrival_error(setting: Design, model: Plant, input_bias: Array, friction: Array, step: Array | float) -> Array:

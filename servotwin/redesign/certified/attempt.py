@@ -19,7 +19,7 @@ from servotwin.plant.display_units import position_unit
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
-from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined
+from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined, unseen_error
 from servotwin.redesign.certified.certificate import (
     BeyondResult,
     Certificate,
@@ -98,7 +98,8 @@ class Question:
     def largest_error(self, setting: Design) -> float:
         """m, that may be left in the end."""
         sensor = setting.controller.leave * setting.tolerance + COUNTS * self.servo.position_resolution
-        return min(self.demands.tail, self.demands.error * self.uncertainty.step[1] + sensor)
+        unseen = float(unseen_error(self.servo, self.uncertainty.gap[1]))
+        return min(self.demands.tail, self.demands.error * self.uncertainty.step[1] + sensor + unseen)
 
     def margins(self, setting: Design) -> LoopMargins:
         """Margins of a setting on the plants of the stated ranges and beyond."""

@@ -19,7 +19,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates, only_integrates, static_gain
-from servotwin.plant.plants import Plant, check_load_encoder
+from servotwin.plant.plants import Plant, check_gap_in_loop
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
@@ -90,7 +90,7 @@ def certify(
         No candidate is within the bounds on Ms.
     """
     begin = clock()
-    check_load_encoder(servo, "the verification of settings")
+    check_gap_in_loop(servo)
     demands = demands or Demands()
     trial = trial or trial_for(servo, uncertainty, demands)
     disturbed = is_disturbed(servo, uncertainty, demands, feedforward)
@@ -223,7 +223,8 @@ def candidates_of(
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]
     plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0] + servo.own_friction, demands)]
-    zone = servo.tolerance_for(uncertainty.gap[1])
+    # The lost motion is no part of an error of the motor.
+    zone = 0.0 if servo.at_motor else servo.tolerance_for(uncertainty.gap[1])
     plain += _zones_in_gap(servo, within, zone, demands)
     plain += _stopped_in_gap(servo, plain, zone, demands)
     opens = isinstance(servo.controller, Controller) and not only_integrates(servo.controller)

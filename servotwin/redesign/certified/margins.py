@@ -256,10 +256,11 @@ def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> t
 def has_slow_integral(servo: Plant) -> bool:
     """True where a filtered PID's own integral acts well below the crossover, as a textbook has it.
 
-    That on a load that nothing holds in the gap does not count: it pushes the load to and fro there, for long.
+    That on a load that nothing holds in the gap does not count: it pushes the load to and fro there, for long. An
+    integral of the motor's error ends there.
     """
     own = servo.controller
-    if not isinstance(own, Controller) or not own.Ki or not own.Kp or floats_in_gap(servo):
+    if not isinstance(own, Controller) or not own.Ki or not own.Kp or (floats_in_gap(servo) and not servo.at_motor):
         return False
     crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
     return bool(crossovers) and own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
