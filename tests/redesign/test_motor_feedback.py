@@ -47,7 +47,7 @@ def test_nothing_is_unseen_where_the_controller_reads_the_load() -> None:
     design = Design(GANTRY.pidf, 0.0)
     more = nearness(design, behind, behind.step) - nearness(design, members, members.step)
     counts = 2.0 * (GANTRY.position_resolution - load.position_resolution)
-    assert more == pytest.approx(counts + unseen_error(GANTRY, members.gap))
+    assert more == pytest.approx(counts + unseen_error(behind.model, members.gap))
 
 
 def test_the_motors_error_has_no_zone_of_the_lost_motion_and_its_integral_acts_before_the_gap() -> None:
