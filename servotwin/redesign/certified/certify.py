@@ -49,6 +49,8 @@ _LEAVES = 2.0
 _GAP_ZONES = ((0.5, 2.0), (1.0, 1.0))
 # Candidates that are compared on a machine that was observed.
 _MOVED = 12
+# The same where each law with integral action has six zones.
+_MOVED_IN_ZONES = 36
 # Cost of the running setting over that of the cheapest one, up to which the running one stays.
 _WORTH = 1.03
 
@@ -367,7 +369,8 @@ def _by_moves(
     screening: Screening, candidates: list[Design], always: list[Design], running: Design | None
 ) -> Iterator[Design]:
     """The first candidates and those of `always` by their cost while they move to and fro, then the others."""
-    settings = dict.fromkeys([*islice(screening.ranked(candidates, passing=True), _MOVED), *always])
+    moved = _MOVED_IN_ZONES if has_slow_integral(screening.question.servo) else _MOVED
+    settings = dict.fromkeys([*islice(screening.ranked(candidates, passing=True), moved), *always])
     costs = screening.expected_costs([each for each in settings if not screening.fails(each)])
     yield from sorted(costs, key=lambda each: costs[each] / (_WORTH if each == running else 1.0))
     yield from (each for each in screening.ranked(candidates) if each not in costs)

@@ -18,6 +18,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.retuning import friction_feedforward, integrates, rest_gain
 from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined
 from servotwin.redesign.certified.attempt import ROUNDED, Question
+from servotwin.redesign.certified.margins import has_slow_integral
 from servotwin.redesign.certified.uncertainty import draw
 from servotwin.redesign.design import Design
 
@@ -81,8 +82,9 @@ class Screening:
     def __init__(self, question: Question) -> None:
         demands, known = question.demands, question.uncertainty
         self.question = question
-        # Half as long where nothing integrates against friction: cost is decided soon after the step.
-        self._trial = question.trial if question.is_held else question.trial.half
+        # Cost is decided soon after the step, but where a slow integral works against friction.
+        whole = question.is_held and has_slow_integral(question.servo)
+        self._trial = question.trial if whole else question.trial.half
         self.only: Callable[[Design], bool] | None = None
         self._moves = known.replace(step=known.usual_step or known.step)
         self._members = draw(question.servo, self._moves, demands.screened, demands.conditions, demands.seed)
