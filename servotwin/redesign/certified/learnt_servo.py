@@ -13,6 +13,7 @@ from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
+from servotwin.redesign.certified.rest_in_gap import floats_in_gap
 from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 
 # Standard deviations, relative, of stiffness and damping below which a learnt machine is not believed: what the model
@@ -26,13 +27,14 @@ def counts_learnt(servo: Plant, machine: FactorPrior | None, known: Uncertainty)
     """True where a learnt machine counts in place of the stated half-widths.
 
     Of a free shaft its stiffness over the load's mass does, once it is known to half of what is stated. Of its load
-    nothing is learnt: one with springs of its own, which the verification draws with the shaft's, does not count.
+    nothing is learnt: one with springs of its own, which the verification draws with the shaft's, does not count, nor
+    does one that floats in the gap, whose mass and damping decide how it comes to rest.
     """
     if machine is None:
         return False
     if servo.backlash_kind is not BacklashKind.FREE:
         return True
-    alone = isinstance(servo, Axis) and len(servo.load.m) == 1 and not any(servo.load.k)
+    alone = isinstance(servo, Axis) and len(servo.load.m) == 1 and not any(servo.load.k) and not floats_in_gap(servo)
     return alone and math.sqrt(3.0 * machine.covariance[0, 0]) < _WELL_KNOWN * known.k
 
 
