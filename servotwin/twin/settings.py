@@ -26,6 +26,11 @@ from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.registry import POLICIES
 
 _LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
+# Smallest change of the gap that counts, and largest spread of a glance that decides: of the gap, and at most.
+_NEWS, _TOLD, _MOST = 0.01, 0.05, math.radians(0.1)
+# Of the command that the model's friction holds: rests from either side are twice as far apart, on a machine whose
+# friction is up to a quarter larger.
+_RESTS = 2.5
 _LARGEST_BIAS = 0.01  # of a command's limit: no larger offset of a drive is assumed where its file states none
 
 
@@ -40,15 +45,27 @@ class TriageSettings:
         A value is not finite and above 0, or `every` is not a whole number.
     """
 
-    gap: Annotated[float, key("gap_deg", above=0.0, help="A smaller change of the gap needs no estimate.")] = (
-        math.radians(0.1)
-    )
+    gap: Annotated[
+        float | None,
+        key(
+            "gap_deg",
+            above=0.0,
+            help="A smaller change of the gap needs no estimate; where absent 1 % of the gap estimated last, at most "
+            "0.1 deg.",
+        ),
+    ] = None
     deviations: Annotated[
         float, key(above=0.0, help="Smallest change of gap and input bias, in standard deviations.")
     ] = 3.0
     widest: Annotated[
-        float, key("widest_deg", above=0.0, help="Largest standard deviation of a glance that decides.")
-    ] = math.radians(0.1)
+        float | None,
+        key(
+            "widest_deg",
+            above=0.0,
+            help="Largest standard deviation of a glance that decides; that of the last estimate where it is more. "
+            "Where absent 5 % of the gap estimated last, at most 0.1 deg.",
+        ),
+    ] = None
     misfit: Annotated[
         float, key(above=0.0, help="Factor above the usual misfit from which a misfit counts as unusual.")
     ] = 3.0
@@ -66,8 +83,8 @@ class TriageSettings:
         key(
             "bias_mv",
             above=0.0,
-            help="A smaller change of the input bias needs no estimate; where absent 2 mV on the preset paper, and as "
-            "much of another's own volt.",
+            help="A smaller change of the input bias needs no estimate; where absent 2 mV on the preset paper, as much "
+            "of another's own volt, and the difference between two rests that the model's friction allows.",
         ),
     ] = None
     every: Annotated[int, key(minimum=1, help="Largest number of windows from one estimate to the next.")] = 50
@@ -76,12 +93,23 @@ class TriageSettings:
     def __post_init__(self) -> None:
         check(self)
 
-    def on(self, volt: float, step: float) -> TriageSettings:
-        """The settings for a servo whose own volt (`plant.scales`) is so many V, and a smallest step (m)."""
+    def on(self, volt: float, friction: float, step: float) -> TriageSettings:
+        """The settings for a servo with a smallest step (m).
+
+        Its own volt (`plant.scales`) is so many V, and its friction holds it at rest under a command of `friction`.
+        """
         usual = _LEAST_MISFIT * (step / Uncertainty().step[0])
         misfit = usual if self.least_misfit is None else self.least_misfit
-        bias = _BIAS * volt if self.bias is None else self.bias
+        bias = max(_BIAS * volt, _RESTS * friction) if self.bias is None else self.bias
         return replace(self, least_misfit=misfit, bias=bias)
+
+    def gap_limit(self, gap: float) -> float:
+        """Smallest change (rad) that counts of a gap (rad)."""
+        return min(_MOST, _NEWS * gap) if self.gap is None else self.gap
+
+    def widest_limit(self, gap: float) -> float:
+        """Largest standard deviation (rad) of a glance at a gap (rad) that decides."""
+        return min(_MOST, _TOLD * gap) if self.widest is None else self.widest
 
     @property
     def misfit_limit(self) -> float:
@@ -243,12 +271,12 @@ class TwinSettings:
         A trend that differs from the default one was stated, and stays.
         """
         second, _, volt = scales(servo)
-        step = self.uncertainty.step[0]
+        friction = float(servo.command_of(servo.own_friction))
         return replace(
             self,
             trend=TrendSettings.on(second) if self.trend == TrendSettings() else self.trend,
             excitation=None if self.excitation is None else self.excitation.on(second),
-            triage=None if self.triage is None else self.triage.on(volt, step),
+            triage=None if self.triage is None else self.triage.on(volt, friction, self.uncertainty.step[0]),
         )
 
     def initial_tolerance(self, servo: Plant) -> float:

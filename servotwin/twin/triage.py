@@ -1,6 +1,6 @@
 """Triage of windows: all get a glance, and only informative ones a full estimate. An optional part, pure.
 
-A glance is the plain fit that starts from the gap estimated last; the two are compared. A window is estimated, and the
+A glance is a quick fit beside the window estimated last; the two gaps are compared. A window is estimated, and the
 reason stored, where the gap is not identifiable from it, the fit does not converge, or anything is unusual. After every
 estimate the glance at the same window is compared with it: where glances mislead, every window is estimated.
 A glance stands on the machine as learnt, where one was; what is still open of its numbers is no news.
@@ -15,16 +15,16 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate, MachineReading
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.whitened.free_model import FactorPrior
-from servotwin.estimation.whitened.quick import NO_SPREAD, MachineSpread, QuickFit, quick_fit
+from servotwin.estimation.whitened.quick import NO_SPREAD, MachineSpread, QuickFit
 from servotwin.estimation.window import Window
 from servotwin.messages import WindowMessage
 from servotwin.plant.plants import Plant
+from servotwin.twin.quick_fits import Known, QuickFits, quick_fits_of
 from servotwin.twin.settings import TriageSettings
 
 ROUTINE = ("reference", "periodic")
@@ -60,6 +60,8 @@ class TriageState(Struct, frozen=True):
         Windows since.
     vain : int
         Estimates in a row that did not count.
+    unknowns : tuple of float
+        What the quick fit of the window estimated last had beside the gap, where its kind needs that.
     """
 
     doubt: str = "no window was estimated yet"
@@ -74,6 +76,7 @@ class TriageState(Struct, frozen=True):
     glances: int = 0
     vain: int = 0
     model_std: float = 0.0
+    unknowns: tuple[float, ...] = ()
 
     def doubted(self, why: str) -> TriageState:
         """Copy with a reason for which the next window is estimated in any case."""
@@ -173,15 +176,17 @@ def glance(
         return _without_result("the window has no theta_m, or too few samples: the estimator decides")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _without_result(state.doubt or "the motor's angle is constant")
-    model = servo_for(servo)
-    if model is None:
+    fits = quick_fits_of(servo)
+    if fits is None:
         return _without_result("only the estimator can read this axis")
-    fit = quick_fit(window, model, state.gap, offset, machine)
+    fit = fits.beside(window, Known(state.gap, state.unknowns, offset, machine))
+    if fit is None:
+        return _without_result("no window was fitted before")
     bias, bias_std = quick_bias(window, servo)
     numbers = None if machine is None else machine.reading
     total = math.hypot(fit.std, state.model_std)
     result = Glance(fit.gap, fit.std, fit.misfit, bias, bias_std, True, "", numbers, total)
-    why = due(message, state, settings) or _unclear(fit, settings) or _moved(result, fit, state, settings)
+    why = due(message, state, settings) or _unclear(fit, state, settings) or _moved(result, fit, state, settings)
     return replace(result, moved=bool(why), why=why or "nothing moved")
 
 
@@ -194,12 +199,12 @@ def _without_result(why: str, moved: bool = True) -> Glance:
     return Glance(math.nan, math.inf, math.nan, math.nan, math.inf, moved, why)
 
 
-def _unclear(fit: QuickFit, settings: TriageSettings) -> str:
+def _unclear(fit: QuickFit, state: TriageState, settings: TriageSettings) -> str:
     """Reason why a glance cannot decide whether the gap moved; empty: none."""
     if not fit.converged:
-        return "the plain fit did not converge"
-    if not fit.std <= settings.widest:
-        return f"at a glance the window shows the gap to {math.degrees(fit.std):.3g} deg only"
+        return "the quick fit did not converge"
+    if not fit.noise_std <= max(settings.widest_limit(state.gap), state.std):
+        return f"at a glance the window shows the gap to {math.degrees(fit.noise_std):.3g} deg only"
     return ""
 
 
@@ -207,10 +212,10 @@ def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSe
     """Change since the last estimate, in words; empty: none."""
     off, std = abs(result.gap - state.gap), math.hypot(result.std, state.std)
     usual, spread = max(state.misfit, settings.misfit_limit), NO_SPREAD
-    if not (off <= allowed(std, settings) and result.misfit <= settings.misfit * usual):
+    if not (off <= allowed(std, state.gap, settings) and result.misfit <= settings.misfit * usual):
         # Only here does it matter what is open of the machine: it may be all that differs.
-        spread = _open(fit, settings)
-    if not off <= allowed(math.hypot(std, spread.gap), settings):
+        spread = _open(fit, state.gap, settings)
+    if not off <= allowed(math.hypot(std, spread.gap), state.gap, settings):
         now, before = math.degrees(result.gap), math.degrees(state.gap)
         return f"the gap moved: {now:.4g} deg at a glance, {before:.4g} deg estimated before"
     if not result.misfit <= settings.misfit * max(usual, spread.misfit):
@@ -221,15 +226,15 @@ def _moved(result: Glance, fit: QuickFit, state: TriageState, settings: TriageSe
     return ""
 
 
-def _open(fit: QuickFit, settings: TriageSettings) -> MachineSpread:
-    """Effect of what is open of the machine; none where it is so much that it could hide any move."""
+def _open(fit: QuickFit, gap: float, settings: TriageSettings) -> MachineSpread:
+    """Effect of what is open of the machine; none where it is so much that it could hide any move of the gap (rad)."""
     spread = fit.machine_spread()
-    return spread if spread.gap <= settings.widest else NO_SPREAD
+    return spread if spread.gap <= settings.widest_limit(gap) else NO_SPREAD
 
 
-def allowed(std: float, settings: TriageSettings) -> float:
-    """Largest difference (rad) of two estimates of one gap, for a standard deviation (rad) of the difference."""
-    return max(settings.gap, settings.deviations * std)
+def allowed(std: float, gap: float, settings: TriageSettings) -> float:
+    """Largest difference (rad) of two estimates of one gap (rad), for a standard deviation (rad) of the difference."""
+    return max(settings.gap_limit(gap), settings.deviations * std)
 
 
 @dataclass(frozen=True)
@@ -240,10 +245,13 @@ class Triage:
     ----------
     servo : Servo or Axis
     settings : TriageSettings
+    fits : QuickFits
+        Of the servo's windows.
     """
 
     servo: Plant
     settings: TriageSettings
+    fits: QuickFits
 
     @classmethod
     def of(cls, servo: Plant, settings: TriageSettings | None) -> Triage | None:
@@ -256,12 +264,13 @@ class Triage:
         """
         if settings is None:
             return None
-        if servo.at_motor or servo_for(servo) is None:
+        fits = None if servo.at_motor else quick_fits_of(servo)
+        if fits is None:
             raise InvalidInput(
-                "[twin.triage]: needs an axis with an encoder at the load that is held in the gap and has two masses "
-                "or more; leave the table out for this axis: every window is estimated"
+                "[twin.triage]: needs an axis with an encoder at the load; leave the table out for this axis: every "
+                "window is estimated"
             )
-        return cls(servo, settings)
+        return cls(servo, settings, fits)
 
     def glance(
         self,
@@ -311,10 +320,11 @@ class Triage:
         if rejection or window is None:
             boot, version = message.boot, message.parameter_version
             return replace(state, doubt=rejection, glances=0, vain=state.vain + 1, boot=boot, version=version)
-        model = servo_for(self.servo)
-        if model is None:
+        known = Known(estimate.gap, (), _offset(trend), machine)
+        known = known._replace(unknowns=self.fits.unknowns_at(window, known))
+        fit = self.fits.beside(window, known)
+        if fit is None:
             return state
-        fit = quick_fit(window, model, estimate.gap, _offset(trend), machine)
         bias, bias_std = quick_bias(window, self.servo)
         return TriageState(
             doubt=self._misled(fit, estimate),
@@ -327,15 +337,17 @@ class Triage:
             bias=bias,
             bias_std=bias_std,
             misfit=fit.misfit if math.isnan(state.misfit) else max(_FADES * state.misfit, fit.misfit),
+            unknowns=known.unknowns,
         )
 
     def _misled(self, fit: QuickFit, estimate: GapEstimate) -> str:
         """Error of a glance, in words; empty where it is small enough."""
         off = abs(fit.gap - estimate.gap)
         std = math.hypot(fit.std, estimate.std)
-        if off <= allowed(std, self.settings) or off <= allowed(
-            math.hypot(std, _open(fit, self.settings).gap), self.settings
-        ):
+        gap, settings = estimate.gap, self.settings
+        if off <= allowed(std, gap, settings):
+            return ""
+        if off <= allowed(math.hypot(std, _open(fit, gap, settings).gap), gap, settings):
             return ""
         return f"a glance misled by {math.degrees(off):.3g} deg at the window that was estimated last"
 

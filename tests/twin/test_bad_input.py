@@ -197,12 +197,6 @@ def test_a_file_that_states_no_estimator_suits_a_free_shaft(name):
         estimator_of(axis, read_twin_settings(other, plant=axis))
 
 
-@pytest.mark.parametrize("name", ["two-mass-drive", "ball-screw"])
-def test_triage_of_an_axis_that_no_glance_can_read_is_refused_at_configuration(name):
-    with pytest.raises(InvalidInput, match=r"\[twin\.triage\]: needs an axis with an encoder at the load"):
-        TwinModel.of(Axis.preset(name), TwinSettings(policy="paper", triage=TriageSettings()))
-
-
 def test_triage_of_an_axis_without_an_encoder_at_the_load_is_refused():
     with pytest.raises(InvalidInput, match=r"\[twin\.triage\]: needs an axis with an encoder at the load"):
         Triage.of(Axis.preset("emps"), TriageSettings())

@@ -235,7 +235,7 @@ def test_what_is_estimated_whatever_it_shows(changes: dict, watch: dict, why: st
 def triaged(windows, settings: TwinSettings | None = None, gap: float = 25.0) -> tuple[Twin, EvidenceLog]:
     """A twin that leaves everything as it is."""
     settings = settings or TwinSettings(triage=SETTINGS, policy="paper")
-    model = TwinModel(estimator_of(SERVO, settings), eq_21(), settings, triage=Triage(SERVO, SETTINGS))
+    model = TwinModel(estimator_of(SERVO, settings), eq_21(), settings, triage=Triage.of(SERVO, SETTINGS))
     twin = Twin("servo", model)
     for message in windows:
         twin.receive(msgspec.structs.replace(message, servo="servo"), message.start + 3.0)
@@ -303,7 +303,7 @@ def test_a_crash_in_a_steady_loop_is_estimated_at_once() -> None:
 @pytest.mark.slow
 def test_a_servo_on_which_glances_mislead_gets_none() -> None:
     message = msgspec.structs.replace(calm_windows()[1], servo="servo")
-    triage, window = Triage(SERVO, SETTINGS), decode_window(message)
+    triage, window = Triage.of(SERVO, SETTINGS), decode_window(message)
     estimate = estimator_of(SERVO, TwinSettings())(window, Expectation(0.0))
     assert estimate.ok
     wrong = replace(estimate, gap=estimate.gap + 1.0 * DEG)

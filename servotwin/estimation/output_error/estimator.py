@@ -108,6 +108,13 @@ def fit(
     return _fit(window, theta_m, axis, prior, settings, machine)[0]
 
 
+def problem_of(window: Window, axis: Axis, machine: FactorPrior | None) -> tuple[Problem, Axis]:
+    """The window with its model, and the axis with what is known of it; raises InvalidInput as `estimate` does."""
+    theta_m = _checked(window, axis)
+    axis, settings = _known(axis, OutputErrorSettings(), machine)
+    return _prepared(window, theta_m, axis, settings, machine)[0], axis
+
+
 def _known(axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None) -> tuple[Axis, OutputErrorSettings]:
     """The axis with the numbers that are known of it, and the settings with the spread of a rigid one's ratio."""
     if machine is None:
@@ -138,11 +145,19 @@ def _fit(
     machine: FactorPrior | None,
 ) -> tuple[Search, float]:
     """The fit of a window, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
+    expected = prior.gap if isinstance(prior, GapEstimate) else prior
+    problem, noise = _prepared(window, theta_m, axis, settings, machine)
+    return search(problem, 0.5 * axis.p * (expected or 0.0)), noise
+
+
+def _prepared(
+    window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None
+) -> tuple[Problem, float]:
+    """The window with its model, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
     free = axis.backlash_kind is BacklashKind.FREE
     motor = MotorAngle(theta_m, 0.0) if free else without_noise(theta_m, _count_of_motor(axis, theta_m))
-    expected = prior.gap if isinstance(prior, GapEstimate) else prior
-    problem = _problem(window, motor.angle, axis, settings, None if machine is None else machine.covariance)
-    return search(problem, 0.5 * axis.p * (expected or 0.0)), motor.noise
+    learnt = None if machine is None else machine.covariance
+    return _problem(window, motor.angle, axis, settings, learnt), motor.noise
 
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:

@@ -49,13 +49,15 @@ class Unknown(NamedTuple):
     """One unknown of a model: name, standard deviation beforehand (inf: nothing known), and unit of its size.
 
     The unit is "load" (m or rad at the load), "speed" (that per s), "time" (s), "factor" (a logarithm), or "damping": a
-    factor on a number that is hardly ever known. A `positive` one is never below 0.
+    factor on a number that is hardly ever known. A `positive` one is never below 0. A `first` one is of the window's
+    first sample, so that another window says nothing of it.
     """
 
     name: str
     std: float
     unit: str
     positive: bool = False
+    first: bool = False
 
 
 class FittedModel(Protocol):
@@ -198,8 +200,8 @@ class ShaftModel:
             factors.append(Unknown("mass ratio", mass_ratio, "factor"))
         if not load.free:
             factors.append(Unknown("position offset", math.inf, "load"))
-        places = [Unknown(f"q{i + 1}", math.inf, "load") for i in range(load.n)]
-        speeds = [Unknown(f"v{i + 1}", math.inf, "speed") for i in range(load.n)]
+        places = [Unknown(f"q{i + 1}", math.inf, "load", first=True) for i in range(load.n)]
+        speeds = [Unknown(f"v{i + 1}", math.inf, "speed", first=True) for i in range(load.n)]
         return (*common(known._replace(ratio=ratio)), *factors, *places, *speeds)
 
     @cached_property

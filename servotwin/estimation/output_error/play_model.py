@@ -43,7 +43,7 @@ class PlayModel:
         """
         return (
             *common(self.priors),
-            Unknown("first place", math.inf, "load"),
+            Unknown("first place", math.inf, "load", first=True),
             Unknown("lag", self.priors.delay, "time", positive=True),
         )
 

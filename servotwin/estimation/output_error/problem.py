@@ -20,7 +20,8 @@ _HALVES = (0.5, 0.4, 0.3, 0.22, 0.15, 0.1, 0.06, 0.03, 0.015, 0.005)  # of the l
 _PLACES = tuple(0.1 * step for step in range(-5, 6))  # of the lead's range
 _WIDE = 5.0  # of the lead's range
 _SLOW = 0.1  # of the motor's largest speed
-_MOVED = 0.02  # of the window: what shows the first speed
+_MOVED, _FEWEST = 0.02, 8  # of the window: what shows the first speed; samples
+_ON_A_LINE = 1.5  # times the noise, or a count: what a line leaves of them
 _SHARPEST = 0.1  # of the window: larger parts in which the motor's speed jumps are its usual motion
 
 
@@ -132,7 +133,7 @@ class Problem:
         """First position and speed of the load, by a line through the first samples where it has dynamics."""
         if self.model.speed == 0.0:
             return float(self.position[0]), 0.0
-        size = max(8, round(_MOVED * self.position.size))
+        size = max(_FEWEST, round(_MOVED * self.position.size))
         slope, value = np.polyfit(self.interval * np.arange(size), self.position[:size], 1)
         return float(value), float(slope)
 
@@ -143,16 +144,37 @@ class Problem:
 
     def grid(self, gap: float) -> list[list[Array]]:
         """Unknowns (u,) to begin with, a list for each half gap: `gap` is an expected one at the load, 0: none."""
-        lead, reach, first = self.lead, self.range, self.first()
-        middle = -0.5 * float(lead.max() + lead.min())
-        halves = [share * reach for share in _HALVES] + ([gap] if gap > 0.0 else [])
-        tables = [[self.model.start(half, middle + place * reach, first) for place in _PLACES] for half in halves]
+        halves = [share * self.range for share in _HALVES] + ([gap] if gap > 0.0 else [])
+        tables = [self.places(half) for half in halves]
         if self.model.speed > 0.0:
             return tables
         # Without dynamics the load is on a flank wherever the motor turns, and a delay shows least there.
         speed = np.abs(np.gradient(self.drive))
-        slow = lead[speed <= _SLOW * speed.max()]
+        slow, first = self.lead[speed <= _SLOW * speed.max()], self.first()
         return [*tables, [self.model.start(0.5 * float(np.ptp(slow)), -0.5 * float(slow.max() + slow.min()), first)]]
+
+    def places(self, half: float) -> list[Array]:
+        """Unknowns (u,) to begin with at a half gap, in different places of the load in it."""
+        first, middle = self.first(), -0.5 * float(self.lead.max() + self.lead.min())
+        return [self.model.start(half, middle + place * self.range, first) for place in _PLACES]
+
+    def beside(self, values: Array) -> Array:
+        """Unknowns (u,) to begin with where another window had `values` (u,)."""
+        start = self.model.start(float(values[HALF]), float(values[OFFSET]), self._first_of_few())
+        return np.where([unknown.first for unknown in self.model.unknowns], start, values)
+
+    def _first_of_few(self) -> tuple[float, float]:
+        """`first` by as few samples as are on a line: a load may be hit soon after the window's begin."""
+        if self.model.speed == 0.0:
+            return self.first()
+        noise = _ON_A_LINE * max(noise_of(self.position), self.count)
+        size = max(_FEWEST, round(_MOVED * self.position.size))
+        while True:
+            time, seen = self.interval * np.arange(size), self.position[:size]
+            slope, value = np.polyfit(time, seen, 1)
+            if size == _FEWEST or float(np.std(seen - slope * time - value)) <= noise:
+                return float(value), float(slope)
+            size = max(_FEWEST, size // 2)
 
     def on_one_flank(self, values: Array) -> list[list[Array]]:
         """Unknowns (u,) of a gap whose other flank is out of reach, a list for each flank, the lower one first."""

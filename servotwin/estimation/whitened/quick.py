@@ -80,19 +80,27 @@ class QuickFit:
     gap : float
         rad, total.
     std : float
-        rad: spread for noise coloured like the residual and for the offset's stated spread; inf where nothing shows the
-        gap.
+        rad: spread for noise coloured like the residual, for the offset's stated spread and `least`; inf where nothing
+        shows the gap.
     misfit : float
         m, root mean square of the residual.
     converged : bool
         True where the gap would move no more; the place may still move along a valley that does not change the gap.
+    least : float
+        rad: the part of `std` that every window has.
     """
 
     gap: float
     std: float
     misfit: float
     converged: bool
+    least: float = 0.0
     _learnt: _LearntMinimum | None = field(default=None, repr=False, compare=False)
+
+    @property
+    def noise_std(self) -> float:
+        """Spread (rad) without the part that every window has."""
+        return math.sqrt(max(0.0, self.std**2 - self.least**2))
 
     def machine_spread(self) -> MachineSpread:
         """Effect of what is open of the machine; none on an exact model."""
@@ -136,7 +144,7 @@ def quick_fit(
     std = math.sqrt(variance)
     still = abs(float(weights @ residual))
     learnt = None if machine is None else _LearntMinimum(reduction, misfit, servo, machine, fit.point, weights)
-    return QuickFit(float(fit.point.gap), std, rms, still <= max(_LAST_STEP * std, _CLOSE * span), learnt)
+    return QuickFit(float(fit.point.gap), std, rms, still <= max(_LAST_STEP * std, _CLOSE * span), 0.0, learnt)
 
 
 def _freedom(misfit: Misfit) -> int:

@@ -1,0 +1,90 @@
+"""Quick fits by which windows of a servo are glanced at: those of a servo, and those of an axis without one. Pure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from servotwin.estimation.axis_model import servo_for
+from servotwin.estimation.output_error import quick as output_error
+from servotwin.estimation.whitened import quick as whitened
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.whitened.quick import QuickFit
+from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
+from servotwin.plant.servo import Servo
+
+
+class Known(NamedTuple):
+    """What a window is fitted beside.
+
+    Attributes
+    ----------
+    gap : float
+        rad, total, as estimated last.
+    unknowns : tuple of float
+        What the fit of the window that was estimated last had beside the gap; empty where the kind needs none, or no
+        window was fitted.
+    offset : (float, float), optional
+        The encoder's offset from earlier windows, mean and standard deviation, rad.
+    machine : FactorPrior, optional
+        The machine's numbers over the model's, as learnt.
+    """
+
+    gap: float
+    unknowns: tuple[float, ...] = ()
+    offset: tuple[float, float] | None = None
+    machine: FactorPrior | None = None
+
+
+class QuickFits(Protocol):
+    """Quick fits of one servo's windows; both raise InvalidInput where the estimator would."""
+
+    def beside(self, window: Window, known: Known) -> QuickFit | None:
+        """Fit a window; None: no window was fitted before that it could be compared with."""
+
+    def unknowns_at(self, window: Window, known: Known) -> tuple[float, ...]:
+        """Unknowns of a window that was estimated, for the next ones."""
+
+
+@dataclass(frozen=True)
+class ServoFits:
+    """Plain fits of a servo's windows."""
+
+    model: Servo
+
+    def beside(self, window: Window, known: Known) -> QuickFit:
+        """Fit gap and place of the screw."""
+        return whitened.quick_fit(window, self.model, known.gap, known.offset, known.machine)
+
+    def unknowns_at(self, _window: Window, _known: Known) -> tuple[float, ...]:
+        """None: the gap is all that windows have in common."""
+        return ()
+
+
+@dataclass(frozen=True)
+class AxisFits:
+    """Output-error fits of the windows of a shaft that is free in the gap, or of one mass behind a rigid screw."""
+
+    axis: Axis
+
+    def beside(self, window: Window, known: Known) -> QuickFit | None:
+        """Fit gap and offset beside what the window that was estimated last had."""
+        if not known.unknowns:
+            return None
+        return output_error.quick_fit(window, self.axis, np.array(known.unknowns), known.machine)
+
+    def unknowns_at(self, window: Window, known: Known) -> tuple[float, ...]:
+        """Unknowns of the whole model, at the gap."""
+        return tuple(output_error.unknowns_at(window, self.axis, known.gap, known.machine).tolist())
+
+
+def quick_fits_of(servo: Plant) -> QuickFits | None:
+    """Make the quick fits of a servo's windows; None: only the estimator can read them."""
+    model = servo_for(servo)
+    if model is not None:
+        return ServoFits(model)
+    return AxisFits(servo) if isinstance(servo, Axis) and not servo.at_motor else None
