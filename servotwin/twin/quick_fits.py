@@ -1,4 +1,4 @@
-"""Quick fits by which windows of a servo are glanced at: those of a servo, and those of an axis without one. Pure."""
+"""Quick fits by which windows are glanced at, for each of the ways to estimate a gap. Pure."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from servotwin.estimation.axis_model import servo_for
+from servotwin.estimation.motor_side import check_reaction
+from servotwin.estimation.motor_side import quick as motor_side
 from servotwin.estimation.output_error import quick as output_error
 from servotwin.estimation.whitened import quick as whitened
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -82,9 +84,35 @@ class AxisFits:
         return tuple(output_error.unknowns_at(window, self.axis, known.gap, known.machine).tolist())
 
 
-def quick_fits_of(servo: Plant) -> QuickFits | None:
-    """Make the quick fits of a servo's windows; None: only the estimator can read them."""
+@dataclass(frozen=True)
+class MotorFits:
+    """Output-error fits of windows without the load's position."""
+
+    axis: Axis
+
+    def beside(self, window: Window, known: Known) -> QuickFit | None:
+        """Fit the gap beside what the window that was estimated last had."""
+        return motor_side.quick_fit(window, self.axis, np.array(known.unknowns)) if known.unknowns else None
+
+    def unknowns_at(self, window: Window, known: Known) -> tuple[float, ...]:
+        """Unknowns of the whole model, at the gap."""
+        return tuple(motor_side.unknowns_at(window, self.axis, known.gap).tolist())
+
+
+def quick_fits_of(servo: Plant) -> QuickFits:
+    """Make the quick fits of a servo's windows.
+
+    Raises
+    ------
+    InvalidInput
+        Without an encoder at the load no window shows the gap, or the load has friction that its estimator knows not.
+    """
+    if servo.at_motor:
+        check_reaction(servo)
+        assert isinstance(servo, Axis)
+        return MotorFits(servo)
     model = servo_for(servo)
     if model is not None:
         return ServoFits(model)
-    return AxisFits(servo) if isinstance(servo, Axis) and not servo.at_motor else None
+    assert isinstance(servo, Axis)
+    return AxisFits(servo)

@@ -176,10 +176,7 @@ def glance(
         return _without_result("the window has no theta_m, or too few samples: the estimator decides")
     if not (math.isfinite(state.gap) and float(window.theta_m.max() - window.theta_m.min()) > 0.0):
         return _without_result(state.doubt or "the motor's angle is constant")
-    fits = quick_fits_of(servo)
-    if fits is None:
-        return _without_result("only the estimator can read this axis")
-    fit = fits.beside(window, Known(state.gap, state.unknowns, offset, machine))
+    fit = quick_fits_of(servo).beside(window, Known(state.gap, state.unknowns, offset, machine))
     if fit is None:
         return _without_result("no window was fitted before")
     bias, bias_std = quick_bias(window, servo)
@@ -260,17 +257,9 @@ class Triage:
         Raises
         ------
         InvalidInput
-            No window of this axis can be glanced at.
+            No window of this axis shows the gap.
         """
-        if settings is None:
-            return None
-        fits = None if servo.at_motor else quick_fits_of(servo)
-        if fits is None:
-            raise InvalidInput(
-                "[twin.triage]: needs an axis with an encoder at the load; leave the table out for this axis: every "
-                "window is estimated"
-            )
-        return cls(servo, settings, fits)
+        return None if settings is None else cls(servo, settings, quick_fits_of(servo))
 
     def glance(
         self,

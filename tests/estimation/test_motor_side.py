@@ -21,6 +21,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.simulation import Run, simulate
 from servotwin.twin.estimating import estimator_of
+from servotwin.twin.quick_fits import Known, quick_fits_of
 from servotwin.twin.settings import TwinSettings
 
 LIGHT = Axis.preset("ball-screw")
@@ -76,6 +77,22 @@ def test_the_twin_of_an_axis_without_a_load_encoder_estimates_its_gap(window: Wi
     assert estimate.interval[0] <= GAP <= estimate.interval[1]
     assert abs(estimate.gap - GAP) < 0.06 * GAP
     assert estimate.interval[1] - estimate.interval[0] < 0.5 * GAP
+
+
+@pytest.mark.parametrize("moved", [1.0, 1.06])
+def test_a_quick_fit_beside_another_window_tells_whether_the_gap_moved(window: Window, moved: float) -> None:
+    """In a twentieth of the time of an estimate, with the machine's numbers of the other window."""
+    axis = SCREW.replace(sensors=dataclasses.replace(SCREW.sensors, feedback="motor"))
+    fits = quick_fits_of(axis)
+    known = Known(GAP, fits.unknowns_at(window, Known(GAP)))
+    run = simulate(SCREW, 1.0, reference=SquareWave(2.5e-4, 0.8), gap=moved * GAP, sample_rate=RATE)
+    seen = Window.from_run(run, 0.78, LENGTH)
+    found = fits.beside(Window(theta_m=seen.theta_m, voltage=seen.voltage, sample_rate=RATE, start=0.78), known)
+    assert found is not None
+    assert found.converged
+    assert found.gap == pytest.approx(moved * GAP, abs=0.02 * GAP)
+    assert 3.0 * found.std < 0.05 * GAP
+    assert fits.beside(window, Known(GAP)) is None
 
 
 @pytest.mark.parametrize("name", ["stepper-stage", "telescope", "emps"])

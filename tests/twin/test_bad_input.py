@@ -197,6 +197,6 @@ def test_a_file_that_states_no_estimator_suits_a_free_shaft(name):
         estimator_of(axis, read_twin_settings(other, plant=axis))
 
 
-def test_triage_of_an_axis_without_an_encoder_at_the_load_is_refused():
-    with pytest.raises(InvalidInput, match=r"\[twin\.triage\]: needs an axis with an encoder at the load"):
+def test_triage_of_an_axis_whose_motor_feels_no_load_is_refused():
+    with pytest.raises(InvalidInput, match="the motor's encoder and the command do not show the gap"):
         Triage.of(Axis.preset("emps"), TriageSettings())

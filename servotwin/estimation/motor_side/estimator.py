@@ -116,9 +116,14 @@ def estimate(
 
 def fit(window: Window, axis: Axis, prior: float | GapEstimate | None, settings: MotorSideSettings) -> Search:
     """Fit a window as `estimate` does; raises InvalidInput as it does."""
-    theta_m, command = _checked(window.driven(axis.command_limit))
     expected = prior.gap if isinstance(prior, GapEstimate) else prior
-    return search(_problem(window, theta_m, command, axis, settings), 0.5 * axis.p * (expected or 0.0))
+    return search(problem_of(window, axis, settings), 0.5 * axis.p * (expected or 0.0))
+
+
+def problem_of(window: Window, axis: Axis, settings: MotorSideSettings) -> MotorProblem:
+    """The window with its model; raises InvalidInput as `estimate` does."""
+    theta_m, command = _checked(window.driven(axis.command_limit))
+    return _problem(window, theta_m, command, axis, settings)
 
 
 def _checked(window: Window) -> tuple[Array, Array]:

@@ -73,7 +73,8 @@ class MotorModel:
         """Those of the load's motion, and those of the motor."""
         stds = (self.load, self.torque, self.damping, self.damping, math.inf, self.delay, math.inf)
         units = ("factor", "factor", "damping", "damping", "command", "time", "speed")
-        return (*self.shaft.unknowns, *map(Unknown, _MOTOR, stds, units))
+        of_motor = list(map(Unknown, _MOTOR, stds, units))
+        return (*self.shaft.unknowns, *of_motor[:-1], of_motor[-1]._replace(first=True))
 
     @cached_property
     def root(self) -> Array:
@@ -203,7 +204,16 @@ class MotorProblem:
     def grid(self, gap: float) -> list[list[Array]]:
         """Unknowns (u,) to begin with, a list for each half gap: `gap` is an expected one at the load, 0: none."""
         halves = [share * self.range for share in _HALVES] + ([gap] if gap > 0.0 else [])
-        return [[self.start(half, place) for place in _PLACES] for half in halves]
+        return [self.places(half) for half in halves]
+
+    def places(self, half: float) -> list[Array]:
+        """Unknowns (u,) to begin with at a half gap, in different places of the load in it."""
+        return [self.start(half, place) for place in _PLACES]
+
+    def beside(self, values: Array) -> list[Array]:
+        """Unknowns (u,) to begin with where another window had `values` (u,), in different places of the load."""
+        first = [unknown.first for unknown in self.model.unknowns]
+        return [np.where(first, start, values) for start in self.places(float(values[HALF]))]
 
     def on_one_flank(self, values: Array) -> list[list[Array]]:
         """Unknowns (u,) of a gap whose other flank is out of reach, a list for each flank, the lower one first."""

@@ -158,10 +158,10 @@ class Problem:
         first, middle = self.first(), -0.5 * float(self.lead.max() + self.lead.min())
         return [self.model.start(half, middle + place * self.range, first) for place in _PLACES]
 
-    def beside(self, values: Array) -> Array:
+    def beside(self, values: Array) -> list[Array]:
         """Unknowns (u,) to begin with where another window had `values` (u,)."""
         start = self.model.start(float(values[HALF]), float(values[OFFSET]), self._first_of_few())
-        return np.where([unknown.first for unknown in self.model.unknowns], start, values)
+        return [np.where([unknown.first for unknown in self.model.unknowns], start, values)]
 
     def _first_of_few(self) -> tuple[float, float]:
         """`first` by as few samples as are on a line: a load may be hit soon after the window's begin."""

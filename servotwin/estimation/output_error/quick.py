@@ -8,15 +8,15 @@ with dynamics begins as the first samples show, and an observer forgets what is 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.output_error.estimator import problem_of
-from servotwin.estimation.output_error.fit import Fit, Search, descend, noise_in
+from servotwin.estimation.output_error.fit import Fit, FitProblem, Search, descend, noise_in
 from servotwin.estimation.output_error.models import HALF, Flags
-from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import rounded
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -32,6 +32,33 @@ _ROUNDED = 1.0 / 3.0  # of a count: what rounding leaves is no less
 _LAST_STEP = 0.3  # standard deviations: largest last step of a gap that has converged
 
 
+class QuickProblem(FitProblem, Protocol):
+    """A window and a model of it, with starts (u,) at a half gap, and beside the unknowns (u,) of another window."""
+
+    def places(self, half: float) -> list[Array]: ...
+    def beside(self, values: Array) -> list[Array]: ...
+
+
+class Spread(NamedTuple):
+    """What the spread of a quick fit contains.
+
+    Attributes
+    ----------
+    noise : float
+        Times the computed standard deviation.
+    share, counts : float
+        Of the half gap, and counts: the part that every window has.
+    """
+
+    noise: float
+    share: float
+    counts: float
+
+
+_OWN = OutputErrorSettings()
+_SPREAD = Spread(_OWN.calibration, _OWN.model_share, 0.5)
+
+
 def quick_fit(window: Window, axis: Axis, unknowns: Array, machine: FactorPrior | None = None) -> QuickFit:
     """Fit gap and offset of a window; raises InvalidInput as the estimator does, and for unknowns of another model.
 
@@ -45,35 +72,62 @@ def quick_fit(window: Window, axis: Axis, unknowns: Array, machine: FactorPrior 
         What is known of the machine, as for the other window.
     """
     problem, known = problem_of(window, axis, machine)
-    if unknowns.size != len(problem.model.unknowns):
-        count = len(problem.model.unknowns)
-        raise InvalidInput(f"{window.where}fitted beside {unknowns.size} unknowns, and the model has {count}")
-    free = _of_each_window(problem)
-    found = _in_own_noise(problem, problem.beside(unknowns), free, _STEPS)
-    # The load's first motion counts last: under friction, or in wrong noise, it goes astray.
-    first = np.array([each.first for each in problem.model.unknowns])
-    for _ in range(_PASSES):
-        found = _further(found, free | first, _STEPS)
-    return _answer(found, 2.0 / known.p)
+    return fit_beside(problem, unknowns, 2.0 / known.p, _SPREAD)
 
 
 def unknowns_at(window: Window, axis: Axis, gap: float, machine: FactorPrior | None = None) -> Array:
     """Unknowns (u,) of a window whose total gap (rad) was estimated; raises InvalidInput as the estimator does."""
     problem, known = problem_of(window, axis, machine)
-    tried = problem.places(0.5 * known.p * gap)
-    costs = [float(np.sum(problem.misfit(values, problem.model.speed) ** 2)) for values in tried]
-    starts = [tried[place] for place in np.argsort(costs, kind="stable")[:_KEPT]]
+    return unknowns_in(problem, 0.5 * known.p * gap)
+
+
+def fit_beside(problem: QuickProblem, unknowns: Array, unit: float, spread: Spread) -> QuickFit:
+    """Fit a window beside the unknowns (u,) of another one.
+
+    Parameters
+    ----------
+    problem : QuickProblem
+    unknowns : (u,) array
+    unit : float
+        Total gap at the motor (rad) per half gap at the load.
+    spread : Spread
+
+    Raises
+    ------
+    InvalidInput
+        The unknowns are not those of the problem's model.
+    """
+    if unknowns.size != (count := len(problem.model.unknowns)):
+        raise InvalidInput(f"fitted beside {unknowns.size} unknowns, and the model has {count}")
+    free, first = _of_each_window(problem), [each.first for each in problem.model.unknowns]
+    found = _in_own_noise(problem, _best(problem, problem.beside(unknowns))[0], free, _STEPS)
+    # The load's first motion counts last: under friction, or in wrong noise, it goes astray.
+    for _ in range(_PASSES):
+        found = _further(found, problem.free & (free | first), _STEPS)
+    return _answer(found, unit, spread)
+
+
+def unknowns_in(problem: QuickProblem, half: float) -> Array:
+    """Unknowns (u,) of a window with a half gap (m or rad at the load)."""
+    starts = _best(problem, problem.places(half))[:_KEPT]
     found = [_in_own_noise(problem, start, problem.free, _MANY_STEPS).best for start in starts]
     return min(found, key=lambda fit: float(np.sum(fit.raw**2))).values
 
 
-def _of_each_window(problem: Problem) -> Flags:
-    """(u,) unknowns that each window has of its own."""
+def _best(problem: QuickProblem, tried: list[Array]) -> list[Array]:
+    """Starts (u,), those that leave least first."""
+    costs = [float(np.sum(problem.misfit(values, problem.model.speed) ** 2)) for values in tried]
+    return [tried[place] for place in np.argsort(costs, kind="stable")]
+
+
+def _of_each_window(problem: QuickProblem) -> Flags:
+    """(u,) unknowns that each window has of its own, but the load's first motion where an observer sees that."""
     still = problem.model.speed == 0.0
-    return np.array([each.unit == "load" and (still or not each.first) for each in problem.model.unknowns])
+    unknowns = problem.model.unknowns
+    return problem.free & [each.unit == "load" and (still or not each.first) for each in unknowns]
 
 
-def _in_own_noise(problem: Problem, start: Array, free: Flags, steps: int) -> Search:
+def _in_own_noise(problem: QuickProblem, start: Array, free: Flags, steps: int) -> Search:
     """Descend from a start, at first in white noise, then in what that leaves."""
     speed = problem.model.speed
     rough = float(np.sqrt(np.mean(problem.misfit(start, speed) ** 2)))
@@ -89,14 +143,13 @@ def _further(found: Search, free: Flags, steps: int) -> Search:
     return Search(problem, noise, descend(problem, found.best.values, noise, free, steps, slowly), (), free)
 
 
-def _answer(found: Search, unit: float) -> QuickFit:
-    """The fit with its spread; `unit` is the total gap (rad) per half gap at the load."""
-    fit, settings = found.best, OutputErrorSettings()
+def _answer(found: Search, unit: float, spread: Spread) -> QuickFit:
+    fit, count = found.best, found.problem.count
     half, own = abs(float(fit.values[HALF])), math.hypot(fit.std(HALF, found.free), rounded(found))
-    least = math.hypot(settings.model_share * half, 0.5 * found.problem.count)
-    std = math.hypot(settings.calibration * own, least)
+    least = math.hypot(spread.share * half, spread.counts * count)
+    std = math.hypot(spread.noise * own, least)
     still = abs(_step(fit, found.free)) <= _LAST_STEP * std
-    misfit = max(float(np.sqrt(np.mean(fit.raw**2))), _ROUNDED * found.problem.count)
+    misfit = max(float(np.sqrt(np.mean(fit.raw**2))), _ROUNDED * count)
     return QuickFit(unit * half, unit * std, misfit, still, unit * least)
 
 
