@@ -121,8 +121,8 @@ def test_one_mass_on_a_rigid_screw(moved: float) -> None:
     values = unknowns_at(seen(2e-6, 0.3), STAGE, 2e-6 / p)
     found = quick_fit(seen(gap, 1.9), STAGE, values)
     assert abs(found.gap - gap / p) < found.std < 0.01 * gap / p
-    # Half a count of either encoder at the load, and 0.2 % of the gap.
-    assert found.least == pytest.approx(math.hypot(1e-8, 0.002 * gap) / p, rel=0.2)
+    # Half a count of the encoder at the load, and 0.2 % of the gap.
+    assert found.least == pytest.approx(math.hypot(0.5e-8, 0.002 * gap) / p, rel=0.2)
 
 
 def test_unknowns_of_another_model_are_refused() -> None:

@@ -56,7 +56,7 @@ class Spread(NamedTuple):
 
 
 _OWN = OutputErrorSettings()
-_SPREAD = Spread(_OWN.calibration, _OWN.model_share, 0.5)
+_SPREAD = Spread(_OWN.calibration, _OWN.model_share, 0.25)  # a quarter of a count: half a count of the whole gap
 
 
 def quick_fit(window: Window, axis: Axis, unknowns: Array, machine: FactorPrior | None = None) -> QuickFit:
