@@ -39,7 +39,7 @@ class QuickProblem(FitProblem, Protocol):
     def beside(self, values: Array) -> list[Array]: ...
 
 
-class Spread(NamedTuple):
+class SpreadParts(NamedTuple):
     """What the spread of a quick fit contains.
 
     Attributes
@@ -56,7 +56,7 @@ class Spread(NamedTuple):
 
 
 _OWN = OutputErrorSettings()
-_SPREAD = Spread(_OWN.calibration, _OWN.model_share, 0.25)  # a quarter of a count: half a count of the whole gap
+_SPREAD = SpreadParts(_OWN.calibration, _OWN.model_share, 0.25)  # a quarter of a count: half a count of the whole gap
 
 
 def quick_fit(window: Window, axis: Axis, unknowns: Array, machine: FactorPrior | None = None) -> QuickFit:
@@ -81,7 +81,7 @@ def unknowns_at(window: Window, axis: Axis, gap: float, machine: FactorPrior | N
     return unknowns_in(problem, 0.5 * known.p * gap)
 
 
-def fit_beside(problem: QuickProblem, unknowns: Array, unit: float, spread: Spread) -> QuickFit:
+def fit_beside(problem: QuickProblem, unknowns: Array, unit: float, spread: SpreadParts) -> QuickFit:
     """Fit a window beside the unknowns (u,) of another one.
 
     Parameters
@@ -90,7 +90,7 @@ def fit_beside(problem: QuickProblem, unknowns: Array, unit: float, spread: Spre
     unknowns : (u,) array
     unit : float
         Total gap at the motor (rad) per half gap at the load.
-    spread : Spread
+    spread : SpreadParts
 
     Raises
     ------
@@ -143,7 +143,7 @@ def _further(found: Search, free: Flags, steps: int) -> Search:
     return Search(problem, noise, descend(problem, found.best.values, noise, free, steps, slowly), (), free)
 
 
-def _answer(found: Search, unit: float, spread: Spread) -> QuickFit:
+def _answer(found: Search, unit: float, spread: SpreadParts) -> QuickFit:
     fit, count = found.best, found.problem.count
     half, own = abs(float(fit.values[HALF])), math.hypot(fit.std(HALF, found.free), rounded(found))
     least = math.hypot(spread.share * half, spread.counts * count)
