@@ -88,7 +88,10 @@ def enroll(
     role: Annotated[
         str, typer.Option(help="control: the edge runs the controller; supervise: the drive does.")
     ] = "supervise",
-    sample_rate_hz: Annotated[float, typer.Option(help="Sample rate of the edge, Hz.")] = 5000.0,
+    sample_rate_hz: Annotated[
+        float | None,
+        typer.Option(help="Sample rate of the edge, Hz; by default that of the servo's controller, or 5000."),
+    ] = None,
     drive: Annotated[
         Path | None, typer.Option(help="TOML file with the table drive; by default a simulated drive.")
     ] = None,

@@ -14,6 +14,8 @@ from typing import Any
 
 from servotwin.commissioning.edge_settings import Commissioning, Recording
 from servotwin.config.table import did_you_mean, read_toml
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
 from servotwin.edge_process.config import ROLES, UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
@@ -28,6 +30,7 @@ TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
 LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S = 4.0, 0.3
 """Limits of the windows that a twin with [twin.excitation] may request, in the servo's own seconds: a calm loop
 reverses the screw late."""
+_RATE = 5000.0  # Hz
 SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
 
 
@@ -42,8 +45,8 @@ class Enrolment:
         Created if it is missing.
     role : str
         "control" or "supervise".
-    sample_rate : float
-        Hz.
+    sample_rate : float or None
+        Hz; None: that of the servo's own controller, or 5000 where that has none.
     drive : mapping
         The table [drive] of the edge's file.
     url : str or None
@@ -60,7 +63,7 @@ class Enrolment:
     servo: str
     folder: Path
     role: str = "supervise"
-    sample_rate: float = 5000.0
+    sample_rate: float | None = None
     drive: Mapping[str, object] = field(default_factory=lambda: SIMULATED)
     url: str | None = None
     replace_token: bool = False
@@ -172,10 +175,11 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
         The servo has no model, or no setting is verified for its stated range.
     """
     model = twin.fleet.model_of(request.servo)
-    sampled = request.role == "control" or request.noise > 0.0
-    law = model.servo.pidf.replace(sample_rate=request.sample_rate if sampled else None)
+    own = model.servo.controller
+    rate = request.sample_rate or own.sample_rate or _RATE
+    law = _running_law(own, request, rate)
     servo = model.servo.replace(controller=law)
-    commissioning = Commissioning(servo, law, model.settings, Recording(request.sample_rate), noise=request.noise)
+    commissioning = Commissioning(servo, law, model.settings, Recording(rate), noise=request.noise)
     most = twin.service.samples_per_window
     commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S, most)
     commissioning.check_window()
@@ -183,6 +187,23 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE
     link = TwinLink(request.url or _url_of(twin.service), token_file=TOKEN, ca_file=certificate)
     return EdgeConfig(agent, request.role, agent.controller or law, request.drive, link, folder=request.folder)
+
+
+def _running_law(own: AnyController, request: Enrolment, rate: float) -> AnyController:
+    """The law that runs: the edge's at the rate (Hz) of its samples, a drive's at its own.
+
+    Raises
+    ------
+    InvalidInput
+        The edge is to tick a law that was made for another rate.
+    """
+    if request.role != "control" and (own.sample_rate is not None or request.noise == 0.0):
+        return own
+    if isinstance(own, LinearLaw) and own.discrete and own.sample_rate != rate:
+        raise InvalidInput(
+            f"sample_rate_hz = {rate!r} Hz: the servo's controller has matrices for {own.sample_rate!r} Hz; give that"
+        )
+    return own.replace(sample_rate=rate)
 
 
 def _url_of(service: ServiceConfig) -> str:

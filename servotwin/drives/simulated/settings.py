@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -16,11 +17,17 @@ from servotwin.drives.simulated.machine_state import read_speed, read_state
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import as_pieces
 
+_NO_TWIN: Mapping[str, object] = {"policy": "paper", "k_dz": 0.0}
+
 
 def _scenario(table: Table, name: str, scenario: object, folder: Path) -> Scenario:
-    """Read the scenario: a preset's name, a file, or a table."""
+    """Read the scenario: a preset's name, a file, or a table, of which no twin is asked where it states none.
+
+    A machine begins with its own controller, and gets its settings from its edge.
+    """
     if isinstance(scenario, dict):
-        return Scenario.from_table(table.table(name), folder)
+        stated = table.table(name)
+        return Scenario.from_table(Table(stated.source, {"twin": _NO_TWIN, **stated.values}, stated.name), folder)
     given = table.text(name)
     if given in PRESETS:
         return Scenario.preset(given)
