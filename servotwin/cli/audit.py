@@ -6,7 +6,7 @@ import json as jsons
 import ssl
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,8 +16,9 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Requ
 
 import msgspec
 
-from servotwin.cli.audit_report import JsonObject, lines_of, servo_lines
+from servotwin.cli.audit_report import JsonObject, Units, lines_of, servo_lines
 from servotwin.config.table import did_you_mean
+from servotwin.dashboard.series import machine_series
 from servotwin.errors import InvalidInput
 from servotwin.link.url import in_clear, is_encrypted
 from servotwin.runtime import files
@@ -56,11 +57,12 @@ class Source:
 
 
 class _ServoEvidence(NamedTuple):
-    """A servo, its windows, and the events without a window, in the form of the API."""
+    """A servo, its windows, the events without a window, and the facts of its machine, in the form of the API."""
 
     servo: JsonObject
     traces: list[JsonObject]
     events: list[JsonObject]
+    machine: JsonObject
 
 
 def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> None:
@@ -91,7 +93,8 @@ def audit(servo: str, source: Source, limit: int, changes: bool, json: bool) -> 
     if json:
         print(msgspec.json.format(msgspec.json.encode(evidence.traces)).decode())
         return
-    for line in lines_of(*evidence, changes=changes):
+    servo_row, traces, events, machine = evidence
+    for line in lines_of(servo_row, traces, events, Units.of(machine), changes):
         print(line)
 
 
@@ -163,10 +166,14 @@ def _read_store(servo: str, config: Path, limit: int) -> _ServoEvidence:
     try:
         summary, traces = known_servo(store, servo), store.audit(servo, limit=limit)
         if not traces:
-            return _ServoEvidence({}, [], [])
+            return _ServoEvidence({}, [], [], {})
         events = store.events(servo, _since(traces[-1].window.received), MAX_ROWS)
+        series = store.reading(lambda connection: machine_series(connection, servo, 1))
         return _ServoEvidence(
-            summary._asdict(), [trace_as_json(trace) for trace in traces], [evidence_as_json(each) for each in events]
+            summary._asdict(),
+            [trace_as_json(trace) for trace in traces],
+            [evidence_as_json(each) for each in events],
+            asdict(series["machine"]),
         )
     finally:
         store.close()
@@ -177,9 +184,10 @@ def _read_service(servo: str, source: Source, limit: int) -> _ServoEvidence:
     traces = get_json(f"/v1/servos/{name}/audit?limit={limit}")
     summary = get_json(f"/v1/servos/{name}")
     if not traces:
-        return _ServoEvidence({}, [], [])
+        return _ServoEvidence({}, [], [], {})
     since = _since(traces[-1]["window"]["received"])
-    return _ServoEvidence(summary, traces, get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}"))
+    events = get_json(f"/v1/servos/{name}/events?since={since!r}&limit={MAX_ROWS}")
+    return _ServoEvidence(summary, traces, events, get_json(f"/v1/servos/{name}/gaps?limit=1").get("machine", {}))
 
 
 def _since(oldest: float) -> float:

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from typing import Any
+from typing import Any, NamedTuple
 
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.messages import Cause
+from servotwin.plant.display_units import DEGREES, MILLIMETRES, DisplayUnit
 
 DEG = 180.0 / math.pi
 HOUR = 3600.0
 _STATUS_HEADS = f"{'gap ± 95 %, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'pending':>7}"
-HEAD = f"{'received, UTC':19}  {'window':>6}  {'gap ± 95 %, deg':>15}  {'error, um':>9}  {'version':>7}  what followed"
 _OPEN = "a setting was found and waits to be sent"
 _UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
 JsonObject = Mapping[str, Any]
@@ -22,8 +22,40 @@ Entry = tuple[float, str, str]
 """Time (s since the epoch), boot (empty: of none), and the line."""
 
 
+class Units(NamedTuple):
+    """Units of a machine's small lengths or angles, and of its command; volts are shown in mV."""
+
+    position: DisplayUnit = MILLIMETRES.small
+    command: str = "V"
+
+    @classmethod
+    def of(cls, machine: JsonObject) -> Units:
+        """Units in the facts of a machine, as the API returns them; those of a linear servo where they are unknown."""
+        rotary = machine.get("travel_unit") == DEGREES.si
+        return cls((DEGREES if rotary else MILLIMETRES).small, str(machine.get("command_unit") or "V"))
+
+    @property
+    def head(self) -> str:
+        """Heading of the table."""
+        columns = f"{'received, UTC':19}", f"{'window':>6}", f"{'gap ± 95 %, deg':>15}", f"{self.error:>9}", "version"
+        return "  ".join([*columns, "what followed"])
+
+    @property
+    def error(self) -> str:
+        """Heading of the errors."""
+        return f"error, {self.position.name}"
+
+    def of_command(self, value: float) -> str:
+        """A small command with its unit."""
+        return f"{value * 1e3:.1f} mV" if self.command == "V" else f"{value:.4g} {self.command}"
+
+
 def lines_of(
-    servo: JsonObject, traces: Sequence[JsonObject], events: Iterable[JsonObject], changes: bool = False
+    servo: JsonObject,
+    traces: Sequence[JsonObject],
+    events: Iterable[JsonObject],
+    units: Units,
+    changes: bool = False,
 ) -> Iterator[str]:
     """Make all lines, oldest first.
 
@@ -35,14 +67,16 @@ def lines_of(
         `store.records.WindowTrace` as the API returns them, newest first.
     events : iterable of mappings
         Evidence that belongs to no window.
+    units : Units
     changes : bool
         Only windows that led to more than an estimate.
     """
-    yield from _head(servo, traces)
+    yield from _head(servo, traces, units)
     chosen = [trace for trace in traces if not changes or _matters(trace)]
-    entries = [entry for trace in chosen for entry in _window(trace)] + [_event(event) for event in events]
+    entries = [entry for trace in chosen for entry in _window(trace, units)]
+    entries += [_event(event, units) for event in events]
     yield ""
-    yield HEAD
+    yield units.head
     boot = ""
     for _, line_boot, line in sorted(entries, key=lambda entry: entry[0]):
         if line_boot not in ("", boot):
@@ -71,7 +105,7 @@ def _status(servo: JsonObject) -> str:
     return "unchanged" if servo["status"] == _UNCHANGED else str(servo["status"])
 
 
-def _head(servo: JsonObject, traces: Sequence[JsonObject]) -> Iterator[str]:
+def _head(servo: JsonObject, traces: Sequence[JsonObject], units: Units) -> Iterator[str]:
     """Summary of the servo, and its newest trend and disturbance."""
     gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg (95 %; {_status(servo) or 'unchanged'})"
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
@@ -79,9 +113,9 @@ def _head(servo: JsonObject, traces: Sequence[JsonObject]) -> Iterator[str]:
     last = "" if servo["last_message"] is None else f", last message {_time(servo['last_message'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
     yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{last}"
-    newest = [line for line in (_wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"))) if line]
-    if newest:
-        yield f"  {', '.join(newest)}"
+    newest = _wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"), units)
+    if any(newest):
+        yield f"  {', '.join(filter(None, newest))}"
 
 
 def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
@@ -98,10 +132,10 @@ def _wear(trend: JsonObject) -> str:
         return ""
 
 
-def _disturbance(body: JsonObject) -> str:
-    fields = (("bias", "input bias {:.1f} mV", 1e3), ("noise", "noise {:.1f} um", 1e6))
-    values = ((text, scale, body.get(name)) for name, text, scale in fields)
-    return ", ".join(text.format(x * scale) for text, scale, x in values if isinstance(x, float) and math.isfinite(x))
+def _disturbance(body: JsonObject, units: Units) -> str:
+    fields = (("bias", units.of_command, "input bias {}"), ("noise", units.position.text, "noise {}"))
+    values = ((text, shown, body.get(name)) for name, shown, text in fields)
+    return ", ".join(text.format(shown(x)) for text, shown, x in values if isinstance(x, float) and math.isfinite(x))
 
 
 def _matters(trace: JsonObject) -> bool:
@@ -110,15 +144,17 @@ def _matters(trace: JsonObject) -> bool:
     return bool(trace["steps"]) or not quiet or any(_failed(one) for one in trace["evidence"])
 
 
-def _window(trace: JsonObject) -> Iterator[Entry]:
+def _window(trace: JsonObject, units: Units) -> Iterator[Entry]:
     window, estimate = trace["window"], _estimate(trace)
-    remarks = [*_remarks(trace)] or [""]
+    remarks = [*_remarks(trace, units)] or [""]
+    head = units.head
     version = "" if estimate is None or estimate["version"] is None else estimate["version"]
-    values = f"{_gap(estimate):>15}  {_error(estimate):>9}  {version:>7}"
+    width = max(9, len(units.error))
+    values = f"{_gap(estimate):>15}  {_error(estimate, units):>{width}}  {version:>7}"
     line = f"{_time(window['received'])}  {window['sequence']:>6}  {values}  {remarks[0]}".rstrip()
     yield window["received"], window["boot"], line
     for remark in remarks[1:]:
-        yield window["received"], window["boot"], f"{'':{len(HEAD) - len('what followed')}}{remark}"
+        yield window["received"], window["boot"], f"{'':{len(head) - len('what followed')}}{remark}"
 
 
 def _estimate(trace: JsonObject) -> JsonObject | None:
@@ -127,7 +163,7 @@ def _estimate(trace: JsonObject) -> JsonObject | None:
     return estimates[-1] if estimates else None
 
 
-def _remarks(trace: JsonObject) -> Iterator[str]:
+def _remarks(trace: JsonObject, units: Units) -> Iterator[str]:
     """Remarks on a window."""
     window = trace["window"]
     if window["done"] is None:
@@ -143,10 +179,10 @@ def _remarks(trace: JsonObject) -> Iterator[str]:
         elif repeated_by.get(one["kind"]) not in with_remark:
             yield from _remark(one)
     for step in trace["steps"]:
-        yield _sent_update(step["update"])
+        yield _sent_update(step["update"], units)
         yield from (_receipt(answer) for answer in step["answers"] if answer["kind"] == "receipt")
         if step["effect"] is not None:
-            yield _effect(step["effect"])
+            yield _effect(step["effect"], units)
 
 
 _REMARKS = {
@@ -193,18 +229,19 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _sent_update(update: JsonObject) -> str:
+def _sent_update(update: JsonObject, units: Units) -> str:
     """Contents of an update, and its verification."""
     body = update["body"] or {}
     setting = body.get("setting") or {}
     tolerance = setting.get("tolerance", body.get("tolerance"))  # flat in updates of the version before
     gains, verification = setting.get("gains", body.get("controller")), body.get("verification", body.get("proof"))
-    parts = [] if tolerance is None else [f"dead zone {tolerance * 1e6:.4g} um" if tolerance else "no dead zone"]
+    zone = "no dead zone" if not tolerance else f"dead zone {units.position.text(tolerance, '.4g')}"
+    parts = [] if tolerance is None else [zone]
     if gains:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
-        parts += [f"feedforward {gains['feedforward'] * 1e3:.1f} mV"] if gains.get("feedforward") else []
+        parts += [f"feedforward {units.of_command(gains['feedforward'])}"] if gains.get("feedforward") else []
         friction = gains.get("friction_feedforward")
-        parts += [f"friction feedforward {friction * 1e3:.1f} mV"] if friction else []
+        parts += [f"friction feedforward {units.of_command(friction)}"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     law = setting.get("law") or {}
     parts += [", ".join(f"{name} {value:.6g}" for name, value in law.items() if _is_number(value) and value)] * bool(
@@ -222,18 +259,19 @@ def _receipt(receipt: JsonObject) -> str:
     return f"version {receipt['version']} REFUSED by the edge: {receipt['status']}"
 
 
-def _effect(effect: JsonObject) -> str:
+def _effect(effect: JsonObject, units: Units) -> str:
     """Remark with the largest error at the end of a window, before and under the version."""
     window, before, after = effect["window"], effect["before"], effect["after"]
-    return f"version {after['version']} in window {window['sequence']}: error {_error(before)} -> {_error(after)} um"
+    errors = f"{_error(before, units)} -> {_error(after, units)} {units.position.name}"
+    return f"version {after['version']} in window {window['sequence']}: error {errors}"
 
 
-def _event(one: JsonObject) -> Entry:
+def _event(one: JsonObject, units: Units) -> Entry:
     kind, body = one["kind"], one["body"] or {}
     if kind == "hello":
         text = f"edge connected: boot {one['status']}, version {one['version']} in force"
     elif kind == "fallback":
-        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body)}"
+        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body, units)}"
     elif kind == "answer":
         text = f"the edge answers a request: {one['status']}"
     elif kind == "alarm":
@@ -243,11 +281,13 @@ def _event(one: JsonObject) -> Entry:
     return one["created"], "", f"{_time(one['created'])}  {text}"
 
 
-def _measured(body: JsonObject) -> str:
+def _measured(body: JsonObject, units: Units) -> str:
     """Measured and allowed value, in the cause's unit."""
     if body.get("cause") in (Cause.DRIVE, Cause.CONFLICT):
         return ""
-    scale, unit = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, "V")}.get(body.get("cause", ""), (1e6, "um"))
+    small = units.position
+    known = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, units.command)}
+    scale, unit = known.get(body.get("cause", ""), (small.factor, small.name))
     try:
         return f", {body['measured'] * scale:.4g} {unit} where {body['allowed'] * scale:.4g} {unit} are allowed"
     except (KeyError, TypeError):
@@ -265,8 +305,8 @@ def _gap(estimate: JsonObject | None) -> str:
     return f"{estimate['gap'] * DEG:.3f}{spread}"
 
 
-def _error(estimate: JsonObject | None) -> str:
-    return "?" if estimate is None or estimate["tail"] is None else f"{estimate['tail'] * 1e6:.1f}"
+def _error(estimate: JsonObject | None, units: Units) -> str:
+    return "?" if estimate is None or estimate["tail"] is None else f"{estimate['tail'] * units.position.factor:.1f}"
 
 
 def _time(seconds: float) -> str:

@@ -22,7 +22,7 @@ from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.edge.settings_file import gains_stay_table, setting_table, start_table
 from servotwin.edge_process.config import EdgeConfig
-from servotwin.edge_process.config_file import update_gains_table
+from servotwin.edge_process.config_file import LAWS, update_gains_table
 from servotwin.estimation.gap import METHODS
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
@@ -138,6 +138,11 @@ _EITHER = {
 }
 AXIS_SHOWN = _axis(TableSpec(help=_SHOWN_HELP, kinds=_EITHER), _SENSORS_SHOWN)
 """File of an axis for the reference, with one controller for all units."""
+_TAGGED = _kinds(
+    "Controller, a filtered PID where `kind` is absent; needed to control and where updates set gains.",
+    {kind: maker for kind, maker in LAWS.items() if maker is not Controller},
+)
+_EDGE_CONTROLLER = replace(_TAGGED, kinds={"filtered PID": TableSpec((Controller,)), **_TAGGED.kinds})
 FILES = {
     "servo": ("Servo: `servo.toml`", TableSpec((Servo,))),
     "axis": ("Axis made of parts: `axis.toml`", _axis(_CONTROLLERS, _SENSORS)),
@@ -179,7 +184,7 @@ FILES = {
             (AgentSettings, EdgeConfig, update_gains_table),
             tables={
                 "drive": TableSpec(help="The drive.", kinds=_DRIVES),
-                "controller": TableSpec((Controller,), "Controller; needed to control and where updates set gains."),
+                "controller": _EDGE_CONTROLLER,
                 "own": _OWN,
                 "start": _START,
                 "supervision": TableSpec((Supervision,), "Supervision of the loop.", {"fallback": _EDGE_FALLBACK}),

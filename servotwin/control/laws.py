@@ -25,14 +25,21 @@ else:
         StoredController.register(_kind)
 
 
-FILTERED_PID, CASCADE = "filtered_pid", "cascade"
+FILTERED_PID, CASCADE, LINEAR_LAW = "filtered_pid", "cascade", "linear"
 CONTROLLERS: dict[str, type] = {FILTERED_PID: Controller, CASCADE: Cascade}
-"""Controllers that a file can describe, by their key `kind`."""
+"""Controllers that a file can describe, by their key `kind`; linear laws beside them (`control.linear_law_file`)."""
 
 
 def law_of(controller: AnyController) -> Law:
     """The law that runs, its gains in its matrices."""
     return controller if isinstance(controller, Controller) else controller.linear()
+
+
+def kind_of(controller: AnyController) -> str:
+    """The key `kind` of a controller in a file."""
+    if isinstance(controller, LinearLaw):
+        return LINEAR_LAW
+    return CASCADE if isinstance(controller, Cascade) else FILTERED_PID
 
 
 def kind_of_stored(values: dict[str, Any]) -> type:

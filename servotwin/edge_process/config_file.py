@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-from servotwin.config.keys import key
+from servotwin.config.keys import Maker, key
 from servotwin.config.table import Table, named, read_toml
 from servotwin.config.toml import Values, attribute, dumps, kind_of, part, read, values_of
-from servotwin.control.cascade import Cascade
+from servotwin.control.controller import Controller
 from servotwin.control.gains import has_gains, read_gains, written_gains
-from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, AnyController
+from servotwin.control.laws import CONTROLLERS, FILTERED_PID, LINEAR_LAW, AnyController
+from servotwin.control.laws import kind_of as kind_of_law
+from servotwin.control.linear_law_file import matrices_law
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.settings_file import (
     gains_stay_table,
@@ -27,6 +29,8 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltySettings
 
+LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: matrices_law}
+"""Controllers of an edge's file, by their key `kind`."""
 _BEGIN, _END = "# complete with the line: # end", "# end"
 """First and last line of a written file: half of one could be read, and would leave out what protects the machine."""
 
@@ -79,7 +83,7 @@ def _controller(table: Table) -> AnyController:
     """Read the controller, a filtered PID or what its `kind` says; its sample rate is the recording's by default."""
     inner = table.table("controller")
     inner.known("kind")
-    controller: AnyController = read(inner, CONTROLLERS[kind_of(inner, CONTROLLERS, FILTERED_PID)])
+    controller: AnyController = read(inner, LAWS[kind_of(inner, LAWS, FILTERED_PID)])
     inner.done()
     if controller.sample_rate is not None:
         return controller
@@ -136,8 +140,9 @@ def edge_toml(config: EdgeConfig) -> str:
         "supervision": supervision_values(agent.supervision, agent.controller),
     }
     if config.controller is not None:
-        kind = {"kind": CASCADE} if isinstance(config.controller, Cascade) else {}
-        values["controller"] = {**kind, **values_of(config.controller)}
+        kind = kind_of_law(config.controller)
+        named: Values = {} if isinstance(config.controller, Controller) else {"kind": kind}
+        values["controller"] = {**named, **values_of(config.controller, LAWS[kind])}
     if agent.own is not None:
         values["own"] = written_gains(agent.own, agent.controller)
     if isinstance(agent.window_filter, NoveltySettings):

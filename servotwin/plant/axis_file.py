@@ -11,9 +11,9 @@ from servotwin.config.keys import Maker, items_of, key
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
 from servotwin.config.units import unit_of
-from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, AnyController
+from servotwin.control.laws import CONTROLLERS, FILTERED_PID, LINEAR_LAW, AnyController
+from servotwin.control.laws import kind_of as kind_of_law
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import ACTUATORS, Actuator
@@ -136,7 +136,6 @@ def rotary_load(
 
 TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
 LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
-LINEAR_LAW = "linear"
 LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: linear_law}
 """Controllers that the file of an axis can describe, by their key `kind`."""
 _MASSES = {LINEAR: "mass_kg", ROTARY: "inertia_kg_m2"}
@@ -234,8 +233,7 @@ def described_law(controller: AnyController, unit: str, motion: str) -> str:
         return repr(controller)
     names = [item.name for item in items_of(type(controller)) if getattr(controller, item.name) != item.default]
     values = file_values(controller, unit, motion, names)
-    kind = CASCADE if isinstance(controller, Cascade) else FILTERED_PID
-    return f"{kind} ({', '.join(f'{key} = {value!r}' for key, value in values.items())})"
+    return f"{kind_of_law(controller)} ({', '.join(f'{key} = {value!r}' for key, value in values.items())})"
 
 
 def _keys_with_units(described: Maker) -> list[str]:
@@ -257,7 +255,7 @@ def values_of_parts(axis: Parts) -> Values:
     motion = axis.load.motion
     kind = next(kind for kind, moves in _MOTIONS.items() if moves == motion)
     actuator = next(name for name, maker in ACTUATORS.items() if isinstance(axis.actuator, maker))
-    named: Values = {} if isinstance(axis.controller, Controller) else {"kind": _kind_of_law(axis.controller)}
+    named: Values = {} if isinstance(axis.controller, Controller) else {"kind": kind_of_law(axis.controller)}
     controller = named | file_values(axis.controller, axis.actuator.unit, motion)
     return {
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
@@ -266,10 +264,6 @@ def values_of_parts(axis: Parts) -> Values:
         "sensors": {sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
         "controller": controller,
     }
-
-
-def _kind_of_law(controller: AnyController) -> str:
-    return LINEAR_LAW if isinstance(controller, LinearLaw) else CASCADE
 
 
 SENSOR_KEYS = ("position_resolution_m",)

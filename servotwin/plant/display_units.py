@@ -32,6 +32,10 @@ class DisplayUnit(NamedTuple):
         """The thousandth of this unit, for what is small beside a step."""
         return DisplayUnit("um" if self.name == "mm" else f"m{self.name}", 1e3 * self.factor, self.si)
 
+    def text(self, value: float, form: str = ".1f") -> str:
+        """A value in m or rad, with the unit."""
+        return f"{value * self.factor:{form}} {self.name}"
+
     def si_of(self, value: float) -> float:
         """The value in m or rad."""
         return value / self.factor

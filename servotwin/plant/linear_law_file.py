@@ -9,10 +9,10 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from servotwin.config.keys import Form, key
-from servotwin.config.table import Table, did_you_mean
-from servotwin.control.linear_law import LOAD, MOTOR, LinearLaw
-from servotwin.control.matrices import Rows
+from servotwin.config.keys import key
+from servotwin.config.table import did_you_mean
+from servotwin.control import linear_law_file as keys
+from servotwin.control.linear_law import LOAD, LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import Array
 
@@ -30,22 +30,6 @@ class _System(NamedTuple):
     dt: float | None
 
 
-def _rows(table: Table, name: str, given: Any, _folder: Path) -> Rows:
-    """A matrix, row by row."""
-    if not (isinstance(given, list) and all(isinstance(row, list) for row in given)):
-        raise table.invalid(name, "a list of rows, each a list of numbers")
-    numbers = [value for row in given for value in row]
-    if any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
-        raise table.invalid(name, "a list of rows, each a list of numbers")
-    return tuple(tuple(float(value) for value in row) for row in given)
-
-
-def _names(table: Table, name: str, given: Any, _folder: Path) -> tuple[str, ...]:
-    if not (isinstance(given, list) and all(isinstance(each, str) for each in given)):
-        raise table.invalid(name, "a list of texts")
-    return tuple(given)
-
-
 def linear_law(
     system: Annotated[
         Path | None,
@@ -54,61 +38,28 @@ def linear_law(
             "one input (the error), two (reference and the measurement that `on` names) or three."
         ),
     ] = None,
-    A: Annotated[
-        Rows, key(form=Form.OTHER, parse=_rows, help="States to their derivatives, n rows of n; discrete: to the next.")
-    ] = (),
-    B: Annotated[
-        Rows, key(form=Form.OTHER, parse=_rows, help="Reference, y_motor (rad) and y_load to the same: n rows of 3.")
-    ] = (),
-    C: Annotated[tuple[float, ...], key(help="States to the command, n numbers.")] = (),
-    D: Annotated[tuple[float, ...], key(help="Reference, y_motor (rad) and y_load to the command: 3 numbers.")] = (),
-    sample_rate: Annotated[
-        float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
-    ] = None,
-    discrete: Annotated[bool, key(help="The matrices belong to that rate.")] = False,
-    names: Annotated[
-        tuple[str, ...], key(form=Form.OTHER, parse=_names, help="Names of the states; x1, x2 and so on where absent.")
-    ] = (),
-    on: Annotated[str, key(choices=(LOAD, MOTOR), help="Measurement of the error that the dead zone looks at.")] = LOAD,
-    ratio: Annotated[
-        float | None,
-        key("travel_m_per_rad", above=0.0, help="Travel of the load per angle of the motor; the transmission's."),
-    ] = None,
-    enter: Annotated[
-        float, key("enter_tolerances", minimum=0.0, help="Error at or below which the dead zone is entered.")
-    ] = 1.0,
-    leave: Annotated[
-        float, key("leave_tolerances", minimum=0.0, help="Error above which it is left; at least enter_tolerances.")
-    ] = 1.0,
-    holds: Annotated[tuple[str, ...], key(form=Form.OTHER, parse=_names, help="States that the dead zone stops.")] = (),
-    integral_only: Annotated[
-        bool, key(help="Inside the dead zone nothing else stops; otherwise the loop opens there.")
-    ] = True,
-    voltage_limit: Annotated[
-        float | None, key("voltage_limit_v", above=0.0, help="Largest command, either sign; no limit where absent.")
-    ] = None,
-    rate_limit: Annotated[
-        float | None,
-        key("rate_limit_v_per_s", above=0.0, help="Largest rate of change of the command; no limit where absent."),
-    ] = None,
-    windup: Annotated[
-        tuple[float, ...],
-        key(help="Back-calculation: added to the states' derivatives per command that the limits cut off; n numbers."),
-    ] = (),
-    feedforward: Annotated[float, key("feedforward_v", help="Command added at all times.")] = 0.0,
-    release_time: Annotated[
-        float,
-        key("release_time_s", above=0.0, help="Time constant with which the offset after a change of law fades."),
-    ] = 0.5,
-    gain: Annotated[float, key(above=0.0, unit="1", help="Factor on the whole law.")] = 1.0,
-    integral_share: Annotated[
-        float, key(minimum=0.0, unit="1", help="Factor on what the states in `holds` take in.")
-    ] = 1.0,
-    B_inside: Annotated[
-        Rows,
-        key(form=Form.OTHER, parse=_rows, help="B inside the dead zone without integral_only; nothing where absent."),
-    ] = (),
-    D_inside: Annotated[tuple[float, ...], key(help="D inside the dead zone without integral_only, likewise.")] = (),
+    A: keys.StateRows = (),
+    B: keys.InputRows = (),
+    C: keys.StateGains = (),
+    D: keys.InputGains = (),
+    sample_rate: keys.LawRate = None,
+    discrete: keys.Discrete = False,
+    names: keys.StateNames = (),
+    on: keys.Measured = LOAD,
+    ratio: keys.Travel = None,
+    enter: keys.Enter = 1.0,
+    leave: keys.Leave = 1.0,
+    holds: keys.Holds = (),
+    integral_only: keys.IntegralOnly = True,
+    voltage_limit: keys.CommandLimit = None,
+    rate_limit: keys.RateLimit = None,
+    windup: keys.Windup = (),
+    feedforward: keys.Feedforward = 0.0,
+    release_time: keys.ReleaseTime = 0.5,
+    gain: keys.Gain = 1.0,
+    integral_share: keys.IntegralShare = 1.0,
+    B_inside: keys.InsideRows = (),
+    D_inside: keys.InsideGains = (),
 ) -> LinearLaw:
     """Any linear law of reference, y_motor and y_load."""
     rest: dict[str, Any] = {

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from servotwin.cli.audit_report import HEAD, _sent_update, lines_of, servo_lines
+from servotwin.cli.audit_report import Units, _sent_update, lines_of, servo_lines
 from servotwin.messages import Cause
 
 SERVO = {
@@ -21,6 +21,9 @@ SERVO = {
 }
 UPDATE = {"tolerance": 61.25e-6, "controller": {"Kp": 1377.7, "Ki": 0.0, "Kd": -135.1, "Tf": 0.1, "feedforward": -0.02},
           "proof": {"members": 256}}  # fmt: skip
+
+
+HEAD = Units().head
 
 
 def found(kind: str, status: str = "", **values: Any) -> dict[str, Any]:
@@ -44,7 +47,7 @@ def step(effect: Any = None, *answers: dict[str, Any]) -> dict[str, Any]:
 
 
 def report_of(*links: dict[str, Any], events: Any = (), changes: bool = False, **servo: Any) -> list[str]:
-    lines = list(lines_of({**SERVO, **servo}, links[::-1], events, changes))
+    lines = list(lines_of({**SERVO, **servo}, links[::-1], events, Units(), changes))
     assert lines[lines.index(HEAD) - 1] == ""
     return lines
 
@@ -187,4 +190,24 @@ def test_an_invalid_body_does_not_fail_the_report() -> None:
 def test_an_update_of_a_cascade_shows_its_numbers() -> None:
     law = {"type": "cascade", "position_gain": 20.0, "integral_time": 0.0, "integral_only": True}
     update = {"version": 4, "body": {"setting": {"tolerance": 2e-5, "law": law}}}
-    assert _sent_update(update) == "version 4 sent: dead zone 20 um, position_gain 20"
+    assert _sent_update(update, Units()) == "version 4 sent: dead zone 20 um, position_gain 20"
+
+
+def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
+    """Its position is in rad, its command in N m; a servo of which nothing is known is a linear one on volts."""
+    units = Units.of({"travel_unit": "rad", "command_unit": "N m"})
+    effect = {"window": {"sequence": 4}, "before": {"tail": 2e-4, "version": 2}, "after": {"tail": 1e-4, "version": 3}}
+    disturbed = found("disturbance", body={"bias": 0.02, "noise": 2e-6})
+    fallen = found("fallback", "too large", version=3, body={"cause": Cause.EFFORT, "measured": 9.0, "allowed": 8.0})
+    one = link(1, estimate(tail=2e-4), disturbed, steps=[step(effect)])
+    lines = list(lines_of(SERVO, [one], [fallen], units))
+    assert "input bias 0.02 N m, noise 0.1 mdeg" in lines[2]
+    assert "error, mdeg" in lines[4]
+    text = "\n".join(lines)
+    assert "dead zone 3.509 mdeg" in text
+    assert "feedforward -0.02 N m" in text
+    assert "error 11.5 -> 5.7 mdeg" in text
+    assert ", 9 N m where 8 N m are allowed" in text
+    window = next(line for line in lines if "version 3 sent" in line)
+    assert window[: lines[4].index("what followed")].split()[-2:] == ["11.5", "2"]
+    assert Units.of({}) == Units()

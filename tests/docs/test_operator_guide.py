@@ -20,7 +20,7 @@ import typer.main
 from service_system import twin_file
 
 from servotwin.cli.app import app
-from servotwin.cli.audit_report import HEAD
+from servotwin.cli.audit_report import Units
 from servotwin.dashboard.machine_metrics import machine_metrics
 from servotwin.edge import outlet
 from servotwin.edge_process import outlet as pipe_outlet
@@ -278,8 +278,8 @@ def test_the_first_five_minutes(tmp_path: Path) -> None:
                 time.sleep(0.1)  # the command takes a second of the processor
                 continue
             _, said = run_line(see_one, tmp_path)
-        assert HEAD in said
-        assert HEAD in GUIDE
+        assert Units().head in said
+        assert Units().head in GUIDE
         assert "expired" not in said
         # The bias at rest may be worth an update before a window shows the gap.
         while not re.search(r"^ax-1 +\d+\.\d+ ± \d+\.\d+ +ok", run_line(see_all, tmp_path)[1], re.MULTILINE):

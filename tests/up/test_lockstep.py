@@ -61,23 +61,24 @@ TWIN = """
 store = "sqlite:///twin.db"
 lockstep = true
 workers = 1
-[models.paper]
-servo = "paper"
-[models.paper.controller]
-sample_rate_hz = 5000.0
-[models.paper.twin]
+[models.own]
+servo = "{servo}"
+{controller}
+[models.own.twin]
 {twin}
 [servos]
-axis = "paper"
+axis = "own"
 """
+PAPER = "[models.own.controller]\nsample_rate_hz = 5000.0\n"
 
 
-def deployed(folder: Path, scenario: Scenario, twin: str, *, thread: bool = False) -> LockStep:
+def deployed(folder: Path, scenario: Scenario, twin: str, *, servo: str = "paper", thread: bool = False) -> LockStep:
     """The scenario on a machine and a twin in processes of their own, or on a machine in a `thread` of this one."""
     (folder / "machine.toml").write_text(
         'scenario = "scenario.toml"\nrole = "supervise"\nlisten = "127.0.0.1:0"\nspeed = 0.0\nendless = false\n'
     )
-    (folder / "twin.toml").write_text(TWIN.format(twin=twin))
+    controller = PAPER if servo == "paper" else ""
+    (folder / "twin.toml").write_text(TWIN.format(twin=twin, servo=servo, controller=controller))
     with ExitStack() as stack:
         path = folder / "machine.toml"
         address = stack.enter_context(served(path)) if thread else stack.enter_context(machine(path))[0]
@@ -135,6 +136,47 @@ def test_deployed_is_simulated_under_the_certified_policy(tmp_path: Path) -> Non
     (tmp_path / "scenario.toml").write_text(text)
     scenario = Scenario.load(tmp_path / "scenario.toml")
     loop, result = cosimulate(scenario), deployed(tmp_path, scenario, CERTIFIED)
+    assert loop.updates
+    check_deployed_is_simulated(loop, result, tmp_path)
+
+
+AXIS = """
+servo = "{axis}"
+name = "axis"
+duration_s = {duration}
+[reference]
+kind = "square"
+{amplitude}
+period_s = {period}
+[gap]
+from_deg = {gap[0]}
+to_deg = {gap[1]}
+over_s = {duration}
+[link]
+delay_s = 0.05
+loss = 0.15
+reorder = 0.2
+[twin]
+{twin}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("axis", "amplitude", "period", "gap"),
+    [
+        pytest.param("ball-screw", "amplitude_mm = 0.3", 0.8, (0.5, 2.0), id="filtered PID"),
+        pytest.param("two-mass-drive", "amplitude_deg = 6.0", 8.0, (0.4, 0.6), id="cascade, rotary"),
+    ],
+)
+def test_a_deployed_axis_is_the_simulated_one(
+    tmp_path: Path, axis: str, amplitude: str, period: float, gap: tuple[float, float]
+) -> None:
+    twin, duration = 'policy = "paper"\nk_dz = 0.5\n', 4.0 * period
+    text = AXIS.format(axis=axis, amplitude=amplitude, period=period, gap=gap, duration=duration, twin=twin)
+    (tmp_path / "scenario.toml").write_text(text)
+    scenario = Scenario.load(tmp_path / "scenario.toml")
+    loop, result = cosimulate(scenario), deployed(tmp_path, scenario, twin, servo=axis)
     assert loop.updates
     check_deployed_is_simulated(loop, result, tmp_path)
 

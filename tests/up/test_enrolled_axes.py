@@ -1,0 +1,67 @@
+"""Enrolling servos with controllers of their own: the edge's file has the one that runs, at its own rate."""
+
+from pathlib import Path
+
+import pytest
+
+from servotwin.control.linear_law import LinearLaw
+from servotwin.edge_process.config import EdgeConfig
+from servotwin.edge_process.config_file import load
+from servotwin.errors import InvalidInput
+from servotwin.plant.axis import AXES, Axis
+from servotwin.up.enrolment import Enrolment, enroll
+
+TWIN = """
+[service]
+tokens = "tokens.toml"
+[models.own]
+servo = "{servo}"
+[models.own.twin]
+policy = "paper"
+k_dz = 0.0
+[servos]
+"ax-*" = "own"
+"""
+
+
+def enrolled(folder: Path, servo: str, **request: object) -> EdgeConfig:
+    (folder / "twin.toml").write_text(TWIN.format(servo=servo))
+    enroll(folder / "twin.toml", Enrolment("ax-1", folder / "edge", **request))
+    return load(folder / "edge" / "edge.toml")
+
+
+@pytest.mark.parametrize("role", ["supervise", "control"])
+@pytest.mark.parametrize("name", AXES)
+def test_the_edge_has_the_axis_s_own_controller_and_rate(tmp_path: Path, name: str, role: str) -> None:
+    axis = Axis.preset(name)
+    config = enrolled(tmp_path, name, role=role)
+    assert config.controller == axis.controller
+    assert config.agent.sample_rate == axis.controller.sample_rate
+
+
+def test_a_drive_s_controller_keeps_its_rate_where_the_edge_samples_at_another(tmp_path: Path) -> None:
+    config = enrolled(tmp_path, "two-mass-drive", sample_rate=1000.0)
+    assert config.agent.sample_rate == 1000.0
+    assert config.controller == Axis.preset("two-mass-drive").controller
+
+
+def test_the_edge_ticks_a_cascade_at_the_rate_of_its_samples(tmp_path: Path) -> None:
+    config = enrolled(tmp_path, "two-mass-drive", role="control", sample_rate=1000.0)
+    assert config.controller == Axis.preset("two-mass-drive").controller.replace(sample_rate=1000.0)
+
+
+@pytest.mark.parametrize(("rate", "role"), [(2000.0, "control"), (500.0, "supervise"), (None, "control")])
+def test_a_law_with_discrete_matrices_runs_at_their_rate(tmp_path: Path, rate: float | None, role: str) -> None:
+    drive = Axis.preset("two-mass-drive")
+    law = LinearLaw(
+        A=((-50.0,),), B=((1.0, 0.0, -1.0),), C=(-47000.0,), D=(1060.0, 0.0, -1060.0), sample_rate=1000.0
+    ).held()
+    (tmp_path / "own.toml").write_text(drive.replace(controller=law).dumps())
+    if rate == 2000.0:
+        with pytest.raises(InvalidInput, match=r"sample_rate_hz = 2000.0 Hz: .* matrices for 1000.0 Hz; give that"):
+            enrolled(tmp_path, "own.toml", role=role, sample_rate=rate)
+        assert not (tmp_path / "edge").exists()
+        return
+    config = enrolled(tmp_path, "own.toml", role=role, sample_rate=rate)
+    assert config.controller is not None
+    assert config.controller.sample_rate == 1000.0
