@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from servotwin.config.keys import Form, key
 from servotwin.config.table import Table
+from servotwin.control.law_keys import RateLimit, ReleaseTime, SampleRate, VoltageLimit
 from servotwin.control.linear_law import LOAD, MOTOR, LinearLaw
 from servotwin.control.matrices import Rows
 from servotwin.errors import InvalidInput
@@ -36,9 +37,6 @@ InputRows = Annotated[
 ]
 StateGains = Annotated[tuple[float, ...], key(help="States to the command, n numbers.")]
 InputGains = Annotated[tuple[float, ...], key(help="Reference, y_motor (rad) and y_load to the command: 3 numbers.")]
-LawRate = Annotated[
-    float | None, key("sample_rate_hz", above=0.0, help="Rate of the law; it runs in continuous time where absent.")
-]
 Discrete = Annotated[bool, key(help="The matrices belong to that rate.")]
 StateNames = Annotated[
     tuple[str, ...], key(form=Form.OTHER, parse=_names, help="Names of the states; x1, x2 and so on where absent.")
@@ -54,22 +52,11 @@ Leave = Annotated[
 ]
 Holds = Annotated[tuple[str, ...], key(form=Form.OTHER, parse=_names, help="States that the dead zone stops.")]
 IntegralOnly = Annotated[bool, key(help="Inside the dead zone nothing else stops; otherwise the loop opens there.")]
-CommandLimit = Annotated[
-    float | None, key("voltage_limit_v", above=0.0, help="Largest command, either sign; no limit where absent.")
-]
-RateLimit = Annotated[
-    float | None,
-    key("rate_limit_v_per_s", above=0.0, help="Largest rate of change of the command; no limit where absent."),
-]
 Windup = Annotated[
     tuple[float, ...],
     key(help="Back-calculation: added to the states' derivatives per command that the limits cut off; n numbers."),
 ]
 Feedforward = Annotated[float, key("feedforward_v", help="Command added at all times.")]
-ReleaseTime = Annotated[
-    float,
-    key("release_time_s", above=0.0, help="Time constant with which the offset after a change of law fades."),
-]
 Gain = Annotated[float, key(above=0.0, unit="1", help="Factor on the whole law.")]
 IntegralShare = Annotated[float, key(minimum=0.0, unit="1", help="Factor on what the states in `holds` take in.")]
 InsideRows = Annotated[
@@ -84,7 +71,7 @@ def matrices_law(
     B: InputRows = (),
     C: StateGains = (),
     D: InputGains = (),
-    sample_rate: LawRate = None,
+    sample_rate: SampleRate = None,
     discrete: Discrete = False,
     names: StateNames = (),
     on: Measured = LOAD,
@@ -93,7 +80,7 @@ def matrices_law(
     leave: Leave = 1.0,
     holds: Holds = (),
     integral_only: IntegralOnly = True,
-    voltage_limit: CommandLimit = None,
+    voltage_limit: VoltageLimit = None,
     rate_limit: RateLimit = None,
     windup: Windup = (),
     feedforward: Feedforward = 0.0,

@@ -11,6 +11,7 @@ import numpy as np
 
 from servotwin.config.keys import key
 from servotwin.config.table import did_you_mean
+from servotwin.control import law_keys
 from servotwin.control import linear_law_file as keys
 from servotwin.control.linear_law import LOAD, LinearLaw
 from servotwin.errors import InvalidInput
@@ -42,7 +43,7 @@ def linear_law(
     B: keys.InputRows = (),
     C: keys.StateGains = (),
     D: keys.InputGains = (),
-    sample_rate: keys.LawRate = None,
+    sample_rate: law_keys.SampleRate = None,
     discrete: keys.Discrete = False,
     names: keys.StateNames = (),
     on: keys.Measured = LOAD,
@@ -51,11 +52,11 @@ def linear_law(
     leave: keys.Leave = 1.0,
     holds: keys.Holds = (),
     integral_only: keys.IntegralOnly = True,
-    voltage_limit: keys.CommandLimit = None,
-    rate_limit: keys.RateLimit = None,
+    voltage_limit: law_keys.VoltageLimit = None,
+    rate_limit: law_keys.RateLimit = None,
     windup: keys.Windup = (),
     feedforward: keys.Feedforward = 0.0,
-    release_time: keys.ReleaseTime = 0.5,
+    release_time: law_keys.ReleaseTime = 0.5,
     gain: keys.Gain = 1.0,
     integral_share: keys.IntegralShare = 1.0,
     B_inside: keys.InsideRows = (),
