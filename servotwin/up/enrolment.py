@@ -172,13 +172,15 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     Raises
     ------
     InvalidInput
-        The servo has no model, or no setting is verified for its stated range.
+        The servo has no model, its loop is unstable at the rate of the edge, or no setting is verified for its stated
+        range.
     """
     model = twin.fleet.model_of(request.servo)
     own = model.servo.controller
     rate = request.sample_rate or own.sample_rate or _RATE
     law = _running_law(own, request, rate)
     servo = model.servo.replace(controller=law)
+    servo.check_loop(law)
     commissioning = Commissioning(servo, law, model.settings, Recording(rate), noise=request.noise)
     most = twin.service.samples_per_window
     commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S, most)

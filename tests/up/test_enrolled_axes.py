@@ -50,6 +50,12 @@ def test_the_edge_ticks_a_cascade_at_the_rate_of_its_samples(tmp_path: Path) -> 
     assert config.controller == Axis.preset("two-mass-drive").controller.replace(sample_rate=1000.0)
 
 
+def test_an_edge_whose_rate_makes_the_loop_unstable_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="at 100 Hz is unstable on this axis even without a gap"):
+        enrolled(tmp_path, "ball-screw", role="control", sample_rate=100.0)
+    assert not (tmp_path / "edge").exists()
+
+
 @pytest.mark.parametrize(("rate", "role"), [(2000.0, "control"), (500.0, "supervise"), (None, "control")])
 def test_a_law_with_discrete_matrices_runs_at_their_rate(tmp_path: Path, rate: float | None, role: str) -> None:
     drive = Axis.preset("two-mass-drive")
