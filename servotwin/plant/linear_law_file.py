@@ -69,16 +69,15 @@ def linear_law(
         "release_time": release_time, "gain": gain, "integral_share": integral_share,
         "B_inside": B_inside, "D_inside": D_inside,
     }  # fmt: skip
-    travel = 1.0 if ratio is None else ratio
     if system is None:
         if not D:
             raise InvalidInput("law D: is missing; give A, B, C and D, or system with the path of a .npz or .mat")
-        return LinearLaw(A, B, C, D, sample_rate, discrete, on=on, ratio=travel, **rest)
+        return keys.matrices_law(A, B, C, D, sample_rate, discrete, on=on, ratio=ratio, **rest)
     if A or B or C or D or discrete:
         raise InvalidInput(f"law system = {system}: brings A, B, C, D and dt; leave A, B, C, D and discrete out")
     if sample_rate is not None:
         rest["sample_rate"] = sample_rate
-    return LinearLaw.from_system(_read_system(system), on, travel, **rest)
+    return LinearLaw.from_system(_read_system(system), on, 1.0 if ratio is None else ratio, **rest)
 
 
 def _read_system(path: Path) -> _System:

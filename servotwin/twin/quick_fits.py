@@ -21,7 +21,7 @@ from servotwin.plant.servo import Servo
 
 
 class Known(NamedTuple):
-    """What a window is fitted beside.
+    """Knowledge beside which a window is fitted.
 
     Attributes
     ----------

@@ -177,7 +177,7 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     """
     model = twin.fleet.model_of(request.servo)
     own = model.servo.controller
-    rate = request.sample_rate or own.sample_rate or _RATE
+    rate = (own.sample_rate or _RATE) if request.sample_rate is None else request.sample_rate
     law = _running_law(own, request, rate)
     servo = model.servo.replace(controller=law)
     servo.check_loop(law)

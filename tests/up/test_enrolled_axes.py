@@ -56,6 +56,12 @@ def test_an_edge_whose_rate_makes_the_loop_unstable_is_refused(tmp_path: Path) -
     assert not (tmp_path / "edge").exists()
 
 
+@pytest.mark.parametrize("rate", [0.0, -5.0])
+def test_a_rate_that_is_none_is_refused(tmp_path: Path, rate: float) -> None:
+    with pytest.raises(InvalidInput, match=f"sample_rate = {rate!r} Hz: must be a positive number"):
+        enrolled(tmp_path, "ball-screw", role="control", sample_rate=rate)
+
+
 @pytest.mark.parametrize(("rate", "role"), [(2000.0, "control"), (500.0, "supervise"), (None, "control")])
 def test_a_law_with_discrete_matrices_runs_at_their_rate(tmp_path: Path, rate: float | None, role: str) -> None:
     drive = Axis.preset("two-mass-drive")

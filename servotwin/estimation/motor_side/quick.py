@@ -9,6 +9,7 @@ import numpy as np
 
 from servotwin.estimation.motor_side.estimator import problem_of
 from servotwin.estimation.motor_side.settings import MotorSideSettings
+from servotwin.estimation.motor_side.verdict import DOUBT
 from servotwin.estimation.output_error.quick import SpreadParts, fit_beside, unknowns_in
 from servotwin.estimation.whitened.quick import QuickFit
 from servotwin.estimation.window import Window
@@ -16,7 +17,7 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
 
 _OWN = MotorSideSettings()
-_SPREAD = SpreadParts(3.0, _OWN.model_share, 0.25)  # as the estimator's own
+_SPREAD = SpreadParts(DOUBT, _OWN.model_share, 0.25)  # as the estimator's own
 
 
 def quick_fit(window: Window, axis: Axis, unknowns: Array) -> QuickFit:

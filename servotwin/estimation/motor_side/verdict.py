@@ -15,7 +15,7 @@ from servotwin.estimation.output_error.verdict import JudgedFit, differing_halve
 _BELIEVED = 60.0  # rise of the cost without the gap, or without the second flank, over the noise's variance
 _RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of a friction or damping beforehand
-_DOUBT = 3.0  # interval over the computed one: friction is not as modelled
+DOUBT = 3.0  # interval over the computed one: friction is not as modelled
 _MISLED = 0.2  # of what the gap does not explain: error of the gap that a wrong model makes
 _ROUNDED = 0.5  # of a count: standard deviation of an error that does not average out
 _AROUND = (0.01, 0.03, 0.08, 0.2)  # of a gap, either way: where the cost is looked at
@@ -43,14 +43,14 @@ def judge(found: Search, settings: MotorSideSettings, unit: float) -> JudgedFit:
     rivals = _rivals(found, half) / NORMAL_95
     model = math.hypot(settings.model_share, _MISLED * left) * half
     total = math.hypot(
-        _DOUBT * std, rivals, model, 0.5 * _ROUNDED * problem.count, grown(found, settings.gap_rate / unit)
+        DOUBT * std, rivals, model, 0.5 * _ROUNDED * problem.count, grown(found, settings.gap_rate / unit)
     )
     allowed = max(settings.largest_share * half, 0.5 * settings.counts * problem.count)
-    if math.hypot(_DOUBT * std, rivals) > allowed:
-        known, limit = math.degrees(unit * math.hypot(_DOUBT * std, rivals)), math.degrees(unit * allowed)
+    if math.hypot(DOUBT * std, rivals) > allowed:
+        known, limit = math.degrees(unit * math.hypot(DOUBT * std, rivals)), math.degrees(unit * allowed)
         words = f"the gap is known to {known:.3g} deg only, and {limit:.3g} deg are allowed"
         return JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(words,))
-    return JudgedFit(GapStatus.OK, half, math.hypot(_DOUBT * std, rivals), total)
+    return JudgedFit(GapStatus.OK, half, math.hypot(DOUBT * std, rivals), total)
 
 
 def _unusual_friction(found: Search) -> tuple[str, ...]:

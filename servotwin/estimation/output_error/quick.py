@@ -1,8 +1,8 @@
 """Quick fit of a window beside another window of the same machine, a tenth to a hundredth of the whole estimate's time.
 
 It tells whether the gap has moved; the estimator tells where to. What a window has in common with the one that was
-estimated last (delay, ratio, numbers of shaft and load) is taken from there; only gap and offset are fitted. A load
-with dynamics begins as the first samples show, and an observer forgets what is wrong with that.
+estimated last (delay, ratio, numbers of shaft and load) is taken from there; gap and offset are fitted, and then the
+load's first motion too, which begins as the first samples show.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class QuickProblem(FitProblem, Protocol):
 
 
 class SpreadParts(NamedTuple):
-    """What the spread of a quick fit contains.
+    """Parts of the spread of a quick fit.
 
     Attributes
     ----------
@@ -154,7 +154,7 @@ def _answer(found: Search, unit: float, spread: SpreadParts) -> QuickFit:
 
 
 def _step(fit: Fit, free: Flags) -> float:
-    """What the half gap would still move by, m or rad at the load."""
+    """Change of the half gap in one more step, m or rad at the load."""
     size = np.linalg.norm(fit.rows, axis=1)
     use = np.flatnonzero(free & (size > 0.0))
     if HALF not in use:
