@@ -15,6 +15,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import start, tick
 from servotwin.control.retuning import law_for_margins
 from servotwin.errors import InvalidInput
+from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess, joined, nearness, stillness
@@ -301,3 +302,53 @@ def test_an_attempt_is_given_up_only_where_its_certificate_fails() -> None:
     assert not refused[0]
     assert any(refused)
     assert replace(Attempt(question, found.setting).certificate(), looked_at=found.looked_at) == found
+
+
+def test_a_setting_whose_run_has_no_end_settles_on_no_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Others beside it are judged as before."""
+    from servotwin.redesign.certified import assess as module
+
+    endless, figures = Design(OWN.replace(Ki=0.0), 1e-5), module._figures
+
+    def stuck(laws: object, plants: object, tolerances: np.ndarray, *rest: object) -> object:
+        if 1e-5 in tolerances:
+            raise ZenoError("member 0 changes mode without end")
+        return figures(laws, plants, tolerances, *rest)  # type: ignore[arg-type]
+
+    members = draw(SERVO, Uncertainty(gap=gaps(5.0, 10.0)), 2, 2, 1)
+    (alone,) = assess([CALM], members, SHORT)
+    monkeypatch.setattr(module, "_figures", stuck)
+    beside, never = assess([CALM, endless], members, SHORT)
+    assert np.array_equal(beside.cost, alone.cost)
+    assert not never.settled.any()
+    assert np.isinf(never.cost).all()
+
+
+def test_a_ramp_that_has_no_end_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+    from servotwin.redesign.certified import tracking
+
+    def stuck(*_: object) -> np.ndarray:
+        raise ZenoError("member 0 changes mode without end")
+
+    monkeypatch.setattr(tracking, "_errors", stuck)
+    result = tracking.follow_ramp(SERVO, Uncertainty(gap=gaps(5.0, 10.0)), CALM, SHORT, 1)
+    assert result.settled == 0.0
+
+
+def test_a_zone_over_the_lost_motion_is_no_wider_than_the_error_that_may_be_left() -> None:
+    """Wider ones would be in vain: of a gantry whose gap is a tenth of its steps all candidates would be."""
+    gantry = Axis.preset("gantry")
+    known = Uncertainty(gap=(0.1, 0.2), step=(1.5e-3, 1e-2))
+    demands = Demands(tail=2e-4, tolerance=1e-3)
+    limited, free = (
+        {
+            (each.tolerance, each.controller.leave)
+            for each in candidates_of(gantry, known, few, True, False)
+            if each.controller.integral_only and each.tolerance
+        }
+        for few in (demands, replace(demands, tail=math.inf))
+    )
+    lost = gantry.tolerance_for(0.2)
+    assert {(0.5 * lost, 2.0), (lost, 1.0)} <= free
+    assert {(0.95e-4, 2.0), (1.9e-4, 1.0)} <= limited
+    assert all(tolerance * leave <= 2e-4 or tolerance < 0.5 * lost for tolerance, leave in limited)

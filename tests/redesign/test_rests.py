@@ -14,6 +14,7 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.window import Window
 from servotwin.messages import Setting
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.policy import CertifiedPolicy
@@ -171,3 +172,51 @@ def test_a_window_that_tells_friction_shows_more_than_integral_action_answers_to
     assert POLICY.ranges.shows_more(seen)
     apart = [rest, replace(rest, bias=0.06)]
     assert not POLICY.ranges.shows_more(replace(seen, motor=None, disturbance=apart[1], rests=(apart[0].bias,)))
+
+
+GANTRY = Axis.preset("gantry")
+"""Its friction holds the motor at up to 1.25 N m of command: 0.5 of its own, and 0.0025 m/rad of the load's 300 N."""
+OWN, HELD = 1.25, 1.25 * 1.25
+
+
+def _axis_ranges(law: object, *found: float, stated: Range = (0.0, 0.0)) -> tuple[Range, Range]:
+    """Bias and friction beyond the model's, from these rests of a gantry."""
+    axis = GANTRY if law is None else GANTRY.replace(controller=law)
+    policy = CertifiedPolicy(axis, Uncertainty(gap=(0.0, 0.3), step=(1.5e-3, 1e-2), input_bias=stated))
+    last = Disturbance(found[-1], 1e-4, 0.0, 0.3, 0.0)
+    seen = Evidence(ESTIMATE, last, None, Setting(0.0, gains_of(axis.controller)), 0.01, rests=found[:-1])
+    return policy.ranges.input_bias(seen)[1], policy.ranges.friction(seen)
+
+
+def test_rests_that_the_models_friction_explains_show_neither_bias_nor_more_friction() -> None:
+    assert GANTRY.command_of(GANTRY.own_friction) == pytest.approx(OWN)
+    calm = GANTRY.controller.replace(Ki=0.0)
+    for found in [(-1.2, -1.23, -1.21), (-1.2, 1.2), (1.5,), (0.0, 0.0)]:
+        (low, high), friction = _axis_ranges(calm, *found)
+        assert -0.01 < low < 0.0 < high < 0.01
+        assert friction == (0.0, 0.0)
+
+
+def test_an_integral_may_hold_what_the_models_friction_does() -> None:
+    """The next move begins with it, as if the bias changed by as much."""
+    (low, high), friction = _axis_ranges(None, -0.4, 0.2)
+    assert (low, high) == pytest.approx((-0.5, 0.5))
+    assert friction == (0.0, 0.0)
+    assert _axis_ranges(None, -1.2, 1.2)[0] == pytest.approx((-OWN, OWN))
+
+
+def test_a_stated_bias_counts_as_far_as_the_rests_allow_it() -> None:
+    calm = GANTRY.controller.replace(Ki=0.0)
+    (low, high), _ = _axis_ranges(calm, 1.0, -1.0, stated=(-3.0, 0.2))
+    assert (low, high) == pytest.approx((1.0 - HELD, 0.2))
+
+
+def test_rests_that_no_bias_explains_show_friction_beyond_the_models() -> None:
+    calm = GANTRY.controller.replace(Ki=0.0)
+    (low, high), friction = _axis_ranges(calm, -2.0, 2.4)
+    assert low < 0.2 < high
+    assert friction == pytest.approx((0.0, (1.25 * 2.2 - OWN) * GANTRY.torque_of(1.0)))
+    # One bias explains these.
+    (low, high), friction = _axis_ranges(calm, -3.0, -4.0)
+    assert (low, high) == pytest.approx((-3.0 - HELD, -4.0 + HELD))
+    assert friction == (0.0, 0.0)

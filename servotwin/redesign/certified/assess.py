@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from servotwin.control.retuning import friction_feedforward, rest_gain
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
+from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
@@ -105,7 +106,23 @@ def assess(
     trial : Trial
     largest : float, optional
         m, the step whose `nearness` counts for settling; that of these machines by default.
+
+    Notes
+    -----
+    A setting with a run that changes modes without end has settled on no machine: what cannot be followed is not
+    verified.
     """
+    try:
+        return _assessed(settings, members, trial, largest)
+    except ZenoError:
+        if len(settings) == 1:
+            return [_unsettled(members)]
+        return [assess([setting], members, trial, largest)[0] for setting in settings]
+
+
+def _assessed(
+    settings: Sequence[Design], members: SimulatedMachines, trial: Trial, largest: float | None
+) -> list[MachineMeasures]:
     laws, plants = _columns(settings, members)
     largest = float(members.step.max()) if largest is None else largest
     near = np.stack([nearness(setting, members, largest) for setting in settings])
@@ -128,6 +145,17 @@ def assess(
     ]
 
 
+def _unsettled(members: SimulatedMachines) -> MachineMeasures:
+    """Measures of machines whose runs have no end."""
+    endless = np.full(members.gap.shape, math.inf)
+    return MachineMeasures(
+        **dict.fromkeys(("ripple", "tail", "error_rms", "effort", "overshoot", "settling", "cost"), endless),
+        saturated=np.zeros(members.gap.shape, dtype=bool),
+        still=stillness(members),
+        near=np.zeros(members.gap.shape),
+    )
+
+
 def costs_to_and_fro(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[Array]:
     """(P, C) s for every setting: integral of abs(error) per step of machines that move to and fro.
 
@@ -141,6 +169,15 @@ def costs_to_and_fro(settings: Sequence[Design], members: SimulatedMachines, tri
     trial : Trial
         Its duration is that of each move.
     """
+    try:
+        return _costs(settings, members, trial)
+    except ZenoError:
+        if len(settings) == 1:
+            return [np.full(members.gap.shape, math.inf)]
+        return [costs_to_and_fro([setting], members, trial)[0] for setting in settings]
+
+
+def _costs(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[Array]:
     laws, plants = _columns(settings, members)
     tolerance = np.array([setting.tolerance for setting in settings])[:, None, None]
     cases = Cases(members.step, members.gap, tolerance, 0.0, members.input_bias, members.friction)

@@ -47,6 +47,8 @@ _LEFT_OUT = 64
 _LEAVES = 2.0
 # Zones that stop the integral of a filtered PID, in lost motions, and where it begins again.
 _GAP_ZONES = ((0.5, 2.0), (1.0, 1.0))
+# Of the error that may be left in the end: where the integral of such a zone begins again, at most.
+_WITHIN = 0.95
 # Candidates that are compared on a machine that was observed.
 _MOVED = 12
 # The same where each law with integral action has six zones.
@@ -300,7 +302,9 @@ def _stopped_in_gap(servo: Plant, plain: list[Design], zone: float, demands: Dem
     if not isinstance(servo.controller, Controller) or not has_slow_integral(servo):
         return []
     laws = [each.controller for each in plain if integrates(each.controller) and not each.tolerance]
-    zones = [(share * zone, leave) for share, leave in _GAP_ZONES if 0.0 < share * zone <= demands.tolerance]
+    # A zone that is wider than the error that may be left in the end would be in vain.
+    sizes = [(min(share * zone, _WITHIN * demands.tail / leave), leave) for share, leave in _GAP_ZONES]
+    zones = [(tolerance, leave) for tolerance, leave in sizes if 0.0 < tolerance <= demands.tolerance]
     return [
         Design(law.replace(integral_only=True, enter=1.0, leave=leave), tolerance)
         for law in laws

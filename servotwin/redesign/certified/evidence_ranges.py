@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from servotwin.control.gains import with_gains
 from servotwin.control.retuning import integrates
@@ -24,10 +25,27 @@ SAME_FEEDFORWARD = 7e-3
 # voltage at rest that differs by so much from the feedforward indicates friction, which stops the motor short of its
 # reference.
 _BIAS_FLOOR, _BIAS_MOVED = 1.5e-3, 0.035
-# Friction holds the motor at up to so much more than half the difference of two rests.
+# Friction holds the motor at up to so much more than half the difference of two rests, and than the model states.
 _HOLDS = 1.25
 # Share of the voltage at rest, up to which friction and bias of the turning motor must be known to tell it apart.
 _TELLS = 0.25
+
+
+class _Rest(NamedTuple):
+    """What the rests of a machine tell, in volts.
+
+    Attributes
+    ----------
+    bias : float
+    spread : float
+        By which the bias may be off either way; inf: nothing is known.
+    friction : float
+        Of a friction beyond the model's that only the rests show; 0: none.
+    """
+
+    bias: float
+    spread: float
+    friction: float
 
 
 @dataclass(frozen=True)
@@ -90,12 +108,12 @@ class EvidenceRanges:
     def input_bias(self, evidence: Evidence) -> tuple[float, Range]:
         """Feedforward (V), and the range of input biases; a bias that is not significantly off the feedforward in force
         leaves it as it is."""
-        bias, std, friction_voltage = self._rest(evidence)
+        bias, spread, _ = self._rest(evidence)
         gains = evidence.gains
         fed = gains.feedforward if gains is not None else 0.0
-        if not math.isfinite(std):
+        if not math.isfinite(spread):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(NORMAL_95 * std, self.bias_floor, 0.5 * friction_voltage)
+        limit, spread = self.feedforward_limit, max(spread, self.bias_floor, self._wound(evidence, bias))
         if self._may_be_friction(evidence):
             return fed, (min(bias, -fed) - spread, max(bias, -fed) + spread)
         # Only a significant change: every new feedforward is an update at the edge.
@@ -111,8 +129,8 @@ class EvidenceRanges:
         low, high = (min(max(size, least), most) for size in (min(evidence.steps), max(evidence.steps)))
         return low, high
 
-    def _rest(self, evidence: Evidence) -> tuple[float, float, float]:
-        """Input bias, its standard deviation, and the voltage of a friction that only the rests show (V); 0: none.
+    def _rest(self, evidence: Evidence) -> _Rest:
+        """Tell input bias and friction by the rests.
 
         A bias is the same at every rest. Friction stops the motor at one end of what it can hold or at the other.
         """
@@ -120,14 +138,51 @@ class EvidenceRanges:
         motor = self._motor(evidence)
         if motor is not None and motor.friction[0] > 0.0:
             # Friction holds a motor at rest against any voltage up to its own; only a turning one shows the bias.
-            return float(motor.mean[BIAS]), motor.std(BIAS), 0.0
+            return _Rest(float(motor.mean[BIAS]), NORMAL_95 * motor.std(BIAS), 0.0)
         if motor is not None or not math.isfinite(std):
-            return bias, std, 0.0
+            return _Rest(bias, NORMAL_95 * std, 0.0)
         rests = (*evidence.rests, bias)
+        if self._held > 0.0:
+            return self._beside_own_friction(rests, std)
         half = 0.5 * (max(rests) - min(rests))
         if half <= 0.5 * _BIAS_MOVED * self.smallest_answer:
-            return bias, std, 0.0
-        return 0.5 * (max(rests) + min(rests)), std, half
+            return _Rest(bias, NORMAL_95 * std, 0.0)
+        return _Rest(0.5 * (max(rests) + min(rests)), max(NORMAL_95 * std, 0.5 * half), _HOLDS * half)
+
+    def _beside_own_friction(self, rests: tuple[float, ...], std: float) -> _Rest:
+        """The same where the model states friction, that may hold the motor at either end of `_held`.
+
+        The bias is as stated as far as this friction explains the rests, otherwise any with which it does. Rests that
+        differ by more show more friction.
+        """
+        low, high = max(rests) - self._held, min(rests) + self._held
+        if low > high:
+            half = 0.5 * (max(rests) - min(rests))
+            return _Rest(0.5 * (low + high), max(NORMAL_95 * std, 0.5 * half), _HOLDS * half - self._own)
+        least, most = self.uncertainty.input_bias
+        if least <= high and most >= low:
+            low, high = max(low, least), min(high, most)
+        return _Rest(0.5 * (low + high), max(NORMAL_95 * std, 0.5 * (high - low)), 0.0)
+
+    def _wound(self, evidence: Evidence, bias: float) -> float:
+        """V that an integral may hold at rest against the model's friction.
+
+        The next move begins with it, as if the bias changed by as much: a simulation begins with an integral of zero.
+        """
+        if not integrates(self.servo.controller):
+            return 0.0
+        rests = (*evidence.rests, evidence.disturbance.bias)
+        return min(_HOLDS * max(abs(rest - bias) for rest in rests), self._own)
+
+    @property
+    def _own(self) -> float:
+        """V that the model's friction holds at rest."""
+        return float(self.servo.command_of(self.servo.own_friction))
+
+    @property
+    def _held(self) -> float:
+        """V: a rest up to this far from the bias shows nothing beyond the model's friction."""
+        return _HOLDS * self._own
 
     def _may_be_friction(self, evidence: Evidence) -> bool:
         """True at the first rest, unless the motor's motion told friction: the voltage there is of bias or friction.
@@ -135,7 +190,8 @@ class EvidenceRanges:
         Fed forward, a friction would push the wrong way after the next reversal.
         """
         alone = not evidence.rests and self._motor(evidence) is None
-        return alone and self.uncertainty.friction[1] == 0.0 and self._moved(evidence.disturbance.bias)
+        beyond = max(0.0, abs(evidence.disturbance.bias) - self._held)
+        return alone and self.uncertainty.friction[1] == 0.0 and self._moved(beyond)
 
     def _moved(self, voltage: float) -> bool:
         """True where a voltage at rest is no small change."""
@@ -170,7 +226,7 @@ class EvidenceRanges:
         return motor if known else None
 
     def friction(self, evidence: Evidence) -> Range:
-        """Range of friction torques (N m): as learnt, otherwise as stated or as the rests show.
+        """Range of friction torques beyond the model's (N m): as learnt, otherwise as stated or as the rests show.
 
         A voltage at rest is that of the bias, less at most the friction's either way. So rests that are alike show no
         friction, and those that differ show at least half of their difference, unless the bias moved. A feedforward
@@ -185,15 +241,15 @@ class EvidenceRanges:
         torque = (servo if learnt is None else learnt[0]).torque_of(1.0)
         if motor is not None:
             # What the model states itself is simulated anyway.
-            least, most = (max(0.0, each - servo.command_of(servo.own_friction)) for each in motor.friction)
+            least, most = (max(0.0, each - self._own) for each in motor.friction)
             # Friction that is not significant counts at most as stated.
             return (least * torque, most * torque) if least > 0.0 else (0.0, min(high, most * torque))
-        high = max(high, _HOLDS * self._rest(evidence)[2] * torque)
+        high = max(high, self._rest(evidence).friction * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
         if not 0.0 < abs(now.feedforward) < self.feedforward_limit:
             return low, high
-        left = abs(disturbance.bias + now.feedforward)
+        left = max(0.0, abs(disturbance.bias + now.feedforward) - self._held)
         return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high
 
 

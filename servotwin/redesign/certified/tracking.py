@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array, PiecewiseCubic
 from servotwin.redesign.certified.assess import nearness, stillness
@@ -33,7 +36,11 @@ def follow_ramp(servo: Plant, uncertainty: Uncertainty, setting: Design, trial: 
     """
     members, size = draw(servo, uncertainty, _PLANTS, 2, seed), uncertainty.step[1]
     still, near = stillness(members), nearness(setting, members, members.step)
-    errors = _errors(setting, members, trial, triangle(size, _RAMP * trial.unit))
+    try:
+        errors = _errors(setting, members, trial, triangle(size, _RAMP * trial.unit))
+    except ZenoError:
+        # What cannot be followed is not verified.
+        return RampResult(members.count, 0.0, math.inf)
     last = errors[..., -max(1, round(trial.last * trial.rate)) :]
     settled = (0.5 * np.ptp(last, axis=-1) <= still) & (np.abs(last).max(axis=-1) <= near)
     return RampResult(members.count, float(np.mean(settled)), float(np.abs(errors).max()) / size)
