@@ -18,7 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.assess import assess, joined, nearness, stillness
+from servotwin.redesign.certified.assess import assess, costs_to_and_fro, joined, nearness, stillness
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import candidates_of, certify
@@ -322,6 +322,24 @@ def test_a_setting_whose_run_has_no_end_settles_on_no_machine(monkeypatch: pytes
     assert np.array_equal(beside.cost, alone.cost)
     assert not never.settled.any()
     assert np.isinf(never.cost).all()
+
+
+def test_moves_that_have_no_end_cost_more_than_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    from servotwin.redesign.certified import assess as module
+
+    endless, costs = Design(OWN.replace(Ki=0.0), 1e-5), module._costs
+
+    def stuck(settings: list[Design], *rest: object) -> object:
+        if endless in settings:
+            raise ZenoError("member 0 changes mode without end")
+        return costs(settings, *rest)  # type: ignore[arg-type]
+
+    members = draw(SERVO, Uncertainty(gap=gaps(5.0, 10.0)), 2, 2, 1)
+    (alone,) = costs_to_and_fro([CALM], members, SHORT)
+    monkeypatch.setattr(module, "_costs", stuck)
+    never, beside = costs_to_and_fro([endless, CALM], members, SHORT)
+    assert np.array_equal(beside, alone)
+    assert np.isinf(never).all()
 
 
 def test_a_ramp_that_has_no_end_is_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:

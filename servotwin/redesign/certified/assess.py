@@ -7,8 +7,9 @@ the sensor, limits; exact between samples. A continuous one is simulated in cont
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +27,8 @@ from servotwin.redesign.design import Design
 from servotwin.simulation.ensemble import Cases, summarise_members
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 from servotwin.simulation.to_and_fro import errors_to_and_fro
+
+_Result = TypeVar("_Result")
 
 NEAR = 0.02
 """Share of the step within which the loop has arrived."""
@@ -112,12 +115,19 @@ def assess(
     A setting with a run that changes modes without end has settled on no machine: what cannot be followed is not
     verified.
     """
+    return _of_each(settings, lambda few: _assessed(few, members, trial, largest), lambda: _unsettled(members))
+
+
+def _of_each(
+    settings: Sequence[Design], run: Callable[[Sequence[Design]], list[_Result]], endless: Callable[[], _Result]
+) -> list[_Result]:
+    """Results of all settings at once; one by one where a run has no end, and `endless` for those with such a run."""
     try:
-        return _assessed(settings, members, trial, largest)
+        return run(settings)
     except ZenoError:
         if len(settings) == 1:
-            return [_unsettled(members)]
-        return [assess([setting], members, trial, largest)[0] for setting in settings]
+            return [endless()]
+        return [result for setting in settings for result in _of_each([setting], run, endless)]
 
 
 def _assessed(
@@ -169,12 +179,7 @@ def costs_to_and_fro(settings: Sequence[Design], members: SimulatedMachines, tri
     trial : Trial
         Its duration is that of each move.
     """
-    try:
-        return _costs(settings, members, trial)
-    except ZenoError:
-        if len(settings) == 1:
-            return [np.full(members.gap.shape, math.inf)]
-        return [costs_to_and_fro([setting], members, trial)[0] for setting in settings]
+    return _of_each(settings, lambda few: _costs(few, members, trial), lambda: np.full(members.gap.shape, math.inf))
 
 
 def _costs(settings: Sequence[Design], members: SimulatedMachines, trial: Trial) -> list[Array]:

@@ -32,7 +32,7 @@ _TELLS = 0.25
 
 
 class _Rest(NamedTuple):
-    """What the rests of a machine tell, in volts.
+    """Input bias and friction as the rests of a machine tell them, in volts.
 
     Attributes
     ----------
