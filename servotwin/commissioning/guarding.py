@@ -124,7 +124,7 @@ def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, AnyGains]:
         maximum=demands.tolerance,
         gain_factor=factor,
         integral_factor=max(integral_shares(policy.servo, demands), default=0.0) * _ROUNDING,
-        feedforward=policy.feedforward_limit * _ROUNDING,
+        feedforward=max(policy.feedforward_limit, policy.friction_feedforward_limit) * _ROUNDING,
         # The centre follows the learnt machine.
         notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,
         notch_max_hz=min(max(notches, default=0.0) * _NOTCH_MOVES, _highest_notch(own)),

@@ -276,8 +276,9 @@ class Axis:
         ----------
         factors : mapping of str to float
             Positive, by the names of a servo: k (stiffnesses of load and transmission), c (dampings of both), m
-            (masses), p (ratio), k_T (torque per command), k_B (back EMF, or viscous friction of a torque drive). A
-            drive that follows its command has neither of the last two.
+            (masses), p (ratio), k_T (torque per command), k_B (back EMF, or viscous friction of a torque drive),
+            motor_friction and load_friction (Coulomb and static). A drive that follows its command has none of k_T, k_B
+            and motor_friction.
 
         Raises
         ------

@@ -47,7 +47,11 @@ def test_nothing_is_unseen_where_the_controller_reads_the_load() -> None:
     design = Design(GANTRY.pidf, 0.0)
     more = nearness(design, behind, behind.step) - nearness(design, members, members.step)
     counts = 2.0 * (GANTRY.position_resolution - load.position_resolution)
-    assert more == pytest.approx(counts + unseen_error(behind.model, members.gap))
+    unseen = [unseen_error(plant, gap) for plant, gap in zip(behind.plants, members.gap, strict=True)]
+    assert more == pytest.approx(counts + np.stack(unseen))
+    # A quarter more of the load's friction winds the shaft up by a quarter more.
+    wind_up = GANTRY.load.friction / GANTRY.transmission.k_d
+    assert unseen_error(GANTRY, 0.1, 1.25) - unseen_error(GANTRY, 0.1) == pytest.approx(0.25 * wind_up)
 
 
 def test_the_motors_error_has_no_zone_of_the_lost_motion_and_its_integral_acts_before_the_gap() -> None:

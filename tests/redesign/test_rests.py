@@ -198,11 +198,12 @@ def test_rests_that_the_models_friction_explains_show_neither_bias_nor_more_fric
 
 
 def test_an_integral_may_hold_what_the_models_friction_does() -> None:
-    """The next move begins with it, as if the bias changed by as much."""
+    """The next move begins with it, as if the bias changed by as much: that friction may be a quarter more."""
     (low, high), friction = _axis_ranges(None, -0.4, 0.2)
     assert (low, high) == pytest.approx((-0.5, 0.5))
     assert friction == (0.0, 0.0)
-    assert _axis_ranges(None, -1.2, 1.2)[0] == pytest.approx((-OWN, OWN))
+    assert _axis_ranges(None, -1.2, 1.2)[0] == pytest.approx((-1.5, 1.5))
+    assert _axis_ranges(None, -1.3, 1.3)[0] == pytest.approx((-1.25 * OWN, 1.25 * OWN))
 
 
 def test_a_stated_bias_counts_as_far_as_the_rests_allow_it() -> None:

@@ -243,29 +243,33 @@ def nearness(setting: Design, members: SimulatedMachines, step: Array | float) -
     zone and two counts of the sensor, plus what the controller does not see of the load.
     """
     model = members.model
-    seen = arrival_error(setting, model, members.input_bias, members.friction, step)
-    return np.asarray(seen + unseen_error(model, members.gap))
+    seen = arrival_error(setting, model, members.input_bias, members.friction + members.own_friction, step)
+    if not model.at_motor:
+        return seen
+    unseen = [unseen_error(plant, gap) for plant, gap in zip(members.plants, members.gap, strict=True)]
+    return np.asarray(seen + np.stack(unseen))
 
 
-def unseen_error(model: Plant, gap: Array | float) -> Array:
+def unseen_error(plant: Plant, gap: Array | float, factor: float = 1.0) -> Array:
     """m, largest distance at rest of the load from where the motor would have it, for gaps (rad); 0 where the
     controller reads the load.
 
-    It is half the lost motion, and the wind-up of the shaft by what the load's friction and a constant force may hold.
+    It is half the lost motion, and the wind-up of the shaft by what the load's friction, times a factor, and a constant
+    force may hold.
     """
-    if not isinstance(model, Axis) or not model.at_motor:
+    if not isinstance(plant, Axis) or not plant.at_motor:
         return np.zeros_like(gap, dtype=float)
-    load = model.load
-    held = max(load.friction, load.static or 0.0) + abs(load.force)
-    return np.asarray(0.5 * model.p * np.asarray(gap) + held / model.transmission.k_d)
+    load = plant.load
+    held = factor * max(load.friction, load.static or 0.0) + abs(load.force)
+    return np.asarray(0.5 * plant.p * np.asarray(gap) + held / plant.transmission.k_d)
 
 
 def arrival_error(setting: Design, model: Plant, input_bias: Array, friction: Array, step: Array | float) -> Array:
-    """`nearness` for input biases (V) and frictions (N m)."""
+    """`nearness` for input biases (V) and frictions (N m), the model's own included."""
     law = setting.controller
     # In the steady state the proportional term must supply what the feedforward leaves of the bias; friction holds the
     # motor against what it answers to the error; what is fed forward for it pushes to one side.
-    held = model.command_of(friction + model.own_friction) + abs(friction_feedforward(law))
+    held = model.command_of(friction) + abs(friction_feedforward(law))
     steady = (np.abs(input_bias + law.feedforward) + held) / rest_gain(law)
     return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
 

@@ -98,8 +98,9 @@ class Question:
     def largest_error(self, setting: Design) -> float:
         """m, that may be left in the end."""
         sensor = setting.controller.leave * setting.tolerance + COUNTS * self.servo.position_resolution
-        unseen = float(unseen_error(self.servo, self.uncertainty.gap[1]))
-        return min(self.demands.tail, self.demands.error * self.uncertainty.step[1] + sensor + unseen)
+        known = self.uncertainty
+        unseen = float(unseen_error(self.servo, known.gap[1], 1.0 + known.own_friction))
+        return min(self.demands.tail, self.demands.error * known.step[1] + sensor + unseen)
 
     def margins(self, setting: Design) -> LoopMargins:
         """Margins of a setting on the plants of the stated ranges and beyond."""
@@ -184,7 +185,8 @@ class Attempt:
         )
         measures = self._measured(members.count)
         settled = int(measures.settled.sum())
-        ends = (np.array(known.input_bias), np.array(known.friction), known.step[1])
+        friction = np.array(known.friction) + np.array(known.own_friction_of(question.servo))
+        ends = (np.array(known.input_bias), friction, known.step[1])
         return Certificate(
             setting=setting,
             gap=known.gap,
@@ -218,6 +220,7 @@ class Attempt:
             delay=0 if law.sample_rate is None else known.delay,
             error_per_volt=0.0 if integrates(law) else 1.0 / rest_gain(law),
             lag=_lag(question.servo, setting.controller),
+            own_friction=known.own_friction if question.servo.own_friction else 0.0,
         )
 
     @cached_property

@@ -325,6 +325,8 @@ class Certificate:
         m/V: error that a constant input bias leaves; 0 with integral action.
     lag : float
         s: steady lag behind a ramp of the reference, on the model; 0 with integral action.
+    own_friction : float
+        Half-width of the friction that the model states, relative to it; 0 where it states none.
     """
 
     setting: Design
@@ -359,6 +361,7 @@ class Certificate:
     delay: int = 0
     error_per_volt: float = 0.0
     lag: float = 0.0
+    own_friction: float = 0.0
 
     def __repr__(self) -> str:
         """Setting, and what it was verified on, in one line."""
@@ -373,6 +376,8 @@ class Certificate:
             f"verified on {self.members} simulated machines {law}: {in_words(self, servo)}; "
             f"{100.0 * self.settled_least:.4g} % settle at least, with {100.0 * self.confidence:g} % confidence"
         )
+        if self.own_friction:
+            text += f"; motor and load with friction up to {100.0 * self.own_friction:.3g} % off the model's"
         if self.loop is not None:
             text += f"; Ms at most {self.loop.Ms_worst:.3g} on {self.loop.plants} plants without a gap"
         if self.setting.controller.integral_only:

@@ -226,7 +226,8 @@ def candidates_of(
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]
-    plain += [Design(law) for law in _with_friction(servo, fed, uncertainty.friction[0] + servo.own_friction, demands)]
+    friction = uncertainty.friction[0] + uncertainty.own_friction_of(servo)[0]
+    plain += [Design(law) for law in _with_friction(servo, fed, friction, demands)]
     # The lost motion is no part of an error of the motor.
     zone = 0.0 if servo.at_motor else servo.tolerance_for(uncertainty.gap[1])
     plain += _zones_in_gap(servo, within, zone, demands)

@@ -172,7 +172,8 @@ class EvidenceRanges:
         if not integrates(self.servo.controller):
             return 0.0
         rests = (*evidence.rests, evidence.disturbance.bias)
-        return min(_HOLDS * max(abs(rest - bias) for rest in rests), self._own)
+        most = self.uncertainty.own_friction_of(self.servo)[1]
+        return min(_HOLDS * max(abs(rest - bias) for rest in rests), float(self.servo.command_of(most)))
 
     @property
     def _own(self) -> float:
@@ -182,7 +183,7 @@ class EvidenceRanges:
     @property
     def _held(self) -> float:
         """V: a rest up to this far from the bias shows nothing beyond the model's friction."""
-        return _HOLDS * self._own
+        return max(_HOLDS, 1.0 + self.uncertainty.own_friction) * self._own
 
     def _may_be_friction(self, evidence: Evidence) -> bool:
         """True at the first rest, unless the motor's motion told friction: the voltage there is of bias or friction.

@@ -211,9 +211,16 @@ class CertifiedPolicy:
         return fallback_certificate(self.servo, self.uncertainty, self._limited_demands, self.simulations)
 
     @property
+    def friction_feedforward_limit(self) -> float:
+        """V, largest friction feedforward of this policy: the model's own friction may be fed forward, whatever bias is
+        stated."""
+        own = float(self.servo.command_of(self.servo.own_friction))
+        return min(self.demands.friction_limit, max(self.feedforward_limit, own))
+
+    @property
     def _limited_demands(self) -> Demands:
         """Demands with the largest friction feedforward that an edge of this policy takes."""
-        return replace(self.demands, friction_limit=min(self.demands.friction_limit, self.feedforward_limit))
+        return replace(self.demands, friction_limit=self.friction_feedforward_limit)
 
 
 @dataclass(frozen=True)

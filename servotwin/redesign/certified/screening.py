@@ -56,7 +56,8 @@ def exceeds_error_limit(question: Question, setting: Design) -> bool:
     """
     known, servo, law = question.uncertainty, question.servo, setting.controller
     bias = max(abs(end + law.feedforward) for end in known.input_bias)
-    held = max(0.0, servo.command_of(known.friction[1] + servo.own_friction) - abs(friction_feedforward(law)))
+    most = known.friction[1] + known.own_friction_of(servo)[1]
+    held = max(0.0, servo.command_of(most) - abs(friction_feedforward(law)))
     left = (bias + held) / rest_gain(law)
     return not integrates(law) and left > ROUNDED * question.largest_error(setting)
 

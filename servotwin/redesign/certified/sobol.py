@@ -16,7 +16,15 @@ _BITS = 30
 _PLACES = np.arange(_BITS - 1, -1, -1)
 # Of each dimension after the first: a primitive polynomial over {0, 1}, one bit for each coefficient, and the first
 # direction numbers.
-_DIRECTIONS = ((3, (1,)), (7, (1, 3)), (11, (1, 3, 1)), (13, (1, 1, 1)), (19, (1, 1, 3, 3)))
+_DIRECTIONS = (
+    (3, (1,)),
+    (7, (1, 3)),
+    (11, (1, 3, 1)),
+    (13, (1, 1, 1)),
+    (19, (1, 1, 3, 3)),
+    (25, (1, 3, 5, 13)),
+    (37, (1, 1, 5, 5, 17)),
+)
 DIMENSIONS = len(_DIRECTIONS) + 1
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from dataclasses import dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Annotated, Protocol
 
 import numpy as np
@@ -26,6 +26,8 @@ LARGEST_DELAY = 64
 """Longest delay that is simulated, samples."""
 PARAMETERS = ("k", "c", "k_B", "m", "k_T", "p")
 """Numbers of the plant that are uncertain, in the order of the drawn factors."""
+# Drawn after these, where a model states friction.
+_FRICTIONS = ("motor_friction", "load_friction")
 # Standard deviations beyond which a learnt factor is not drawn.
 _TAILS = 3.0
 _LEAST_GAP = 1e-6  # of the smallest step
@@ -172,7 +174,18 @@ class Uncertainty:
         ),
     ] = 0
     learnt: LearntFactors | None = None
-    # Not in the representation, which seeds the verification: its machines do not depend on this.
+    # Not in the representation, which seeds the verification: a servo has no friction of its own, and its machines are
+    # always the same ones.
+    own_friction: Annotated[
+        float,
+        key(
+            "own_friction_percent",
+            minimum=0.0,
+            below=1.0,
+            help="Half-width of the friction that an axis states, of its motor and of its load, relative to it.",
+        ),
+    ] = field(default=0.25, repr=False)
+    # Likewise: its machines do not depend on this.
     usual_step: Range | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
@@ -182,6 +195,11 @@ class Uncertainty:
             if not low <= high:
                 raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be in order")
         check_gap(self.gap[1], "uncertainty gap")
+
+    def own_friction_of(self, plant: Plant) -> Range:
+        """Range of the friction at standstill that a model states, as a torque on the motor, N m."""
+        least, most = 1.0 - self.own_friction, 1.0 + self.own_friction
+        return least * plant.own_friction, most * plant.own_friction
 
     def replace(self, **changes: object) -> Uncertainty:
         """A copy with some values changed, validated again."""
@@ -255,6 +273,11 @@ class SimulatedMachines:
         """The servo in whose units errors are judged: the first of all machines."""
         return self.plants[0] if self.whole is None else self.whole.model
 
+    @cached_property
+    def own_friction(self) -> Array:
+        """(P, 1) N m, friction at standstill that the plants have beside `friction`."""
+        return np.array([[plant.own_friction] for plant in self.plants])
+
     @property
     def count(self) -> int:
         """Number of machines."""
@@ -290,7 +313,7 @@ def draw_independently(servo: Plant, uncertainty: Uncertainty, count: int, seed:
     Shares of such machines are binomial, which those of an even spread are not.
     """
     rng = np.random.default_rng(seed)
-    factors = _factors(uncertainty, rng.random((count, len(PARAMETERS))))
+    factors = _factors(uncertainty, rng.random((count, len(_drawn(servo)))))
     return _machines(_scaled_plants(servo, factors), uncertainty, rng.random((count, 1, _CONDITIONS)))
 
 
@@ -302,7 +325,9 @@ def drawn_plants(servo: Plant, uncertainty: Uncertainty, count: int, seed: int) 
 def parameters_of(uncertainty: Uncertainty) -> Uncertainty:
     """Uncertainty of the plant alone, equal for all conditions."""
     return Uncertainty(
-        **{name: getattr(uncertainty, name) for name in PARAMETERS}, delay=uncertainty.delay, learnt=uncertainty.learnt
+        **{name: getattr(uncertainty, name) for name in (*PARAMETERS, "own_friction")},
+        delay=uncertainty.delay,
+        learnt=uncertainty.learnt,
     )
 
 
@@ -323,15 +348,20 @@ def extreme_plants(servo: Plant, uncertainty: Uncertainty, more: int, seed: int)
 
 @lru_cache(maxsize=16)
 def _plants(servo: Plant, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Plant, ...]:
-    factors = _factors(uncertainty, _sobol(len(PARAMETERS), count, seed))
+    factors = _factors(uncertainty, _sobol(len(_drawn(servo)), count, seed))
     factors[0] = 1.0
     return _scaled_plants(servo, factors)
 
 
+def _drawn(plant: Plant) -> tuple[str, ...]:
+    """Names of the factors of a plant's machines."""
+    return (*PARAMETERS, *_FRICTIONS) if plant.own_friction else PARAMETERS
+
+
 def _factors(uncertainty: Uncertainty, places: Array) -> Array:
-    """(count, parameters) factors on the model's values for places in 0 .. 1."""
-    widths = np.array([getattr(uncertainty, name) for name in PARAMETERS])
-    factors = 1.0 + (2.0 * places - 1.0) * widths
+    """(count, N) factors on the model's values for places in 0 .. 1, of the parameters or of all that is drawn."""
+    names = (*PARAMETERS, *("own_friction" for _ in _FRICTIONS))[: places.shape[1]]
+    factors = 1.0 + (2.0 * places - 1.0) * np.array([getattr(uncertainty, name) for name in names])
     learnt = uncertainty.learnt
     if learnt is not None and learnt.names:
         which = [PARAMETERS.index(name) for name in learnt.names]
@@ -362,7 +392,8 @@ def _machines(plants: tuple[Plant, ...], uncertainty: Uncertainty, places: Array
 
 
 def _scaled_plants(servo: Plant, factors: Array) -> tuple[Plant, ...]:
-    return tuple(servo.scaled(dict(zip(PARAMETERS, row, strict=True))) for row in factors.tolist())
+    names = (*PARAMETERS, *_FRICTIONS)[: factors.shape[1]]
+    return tuple(servo.scaled(dict(zip(names, row, strict=True))) for row in factors.tolist())
 
 
 def _sobol(dimensions: int, count: int, seed: int) -> Array:
