@@ -19,6 +19,7 @@ from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently, extreme_plants
 from servotwin.redesign.design import Design
+from servotwin.simulation import simulate
 
 GANTRY, SERVO, POSITIONER = Axis.preset("gantry"), Servo.preset("paper"), Axis.preset("micro-positioner")
 KNOWN = Uncertainty(gap=(2e-4 / GANTRY.p, 3e-4 / GANTRY.p), step=(1.5e-3, 1e-2))
@@ -102,3 +103,16 @@ def test_a_feedforward_of_all_the_friction_costs_more_than_said_where_it_is_less
         for known in (SMALL.replace(own_friction=0.0), SMALL)
     )
     assert np.percentile(off.cost, 95.0) > 2.0 * np.percentile(exact.cost, 95.0)
+
+
+def test_each_machine_is_simulated_with_its_own_friction() -> None:
+    known = KNOWN.replace(own_friction=0.5)
+    machines, trial = draw_independently(GANTRY, known, 3, 7), trial_for(GANTRY, known, FEW)
+    (together,) = assess([Design(GANTRY.controller)], machines, trial)
+    rate = GANTRY.controller.sample_rate
+    assert rate is not None
+    for place, plant in enumerate(machines.plants):
+        gap, step, screw = (float(getattr(machines, name)[place, 0]) for name in ("gap", "step", "theta_d0"))
+        run = simulate(plant, trial.duration, reference=step, gap=gap, theta_d0=screw, sample_rate=rate)
+        last = np.abs(run.reference - run.position)[:: round(rate / trial.rate)][-round(trial.last * trial.rate) :]
+        assert last.max() == pytest.approx(together.tail[place, 0], abs=1e-9 * step)

@@ -165,6 +165,11 @@ class Attempt:
             return True
         return bool(few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot)
 
+    def reached(self) -> tuple[int, float]:
+        """Machines on which the setting was simulated, and the share of these that settled."""
+        measures = self._measures
+        return (0, 0.0) if measures is None else (len(measures.cost), float(np.mean(measures.settled)))
+
     def missed(self) -> list[SimulatedMachines]:
         """Machines on which the setting was simulated so far and missed a demand: the first few; none where the demands
         allow that one does."""

@@ -113,9 +113,9 @@ def certify(
             if not question.shortcoming(tried):
                 return tried
         hard += attempt.missed()
-    # Only where all fail do the figures of each count: the rest of their machines are simulated now.
-    failed = [attempt.certificate() for attempt in attempts or [Attempt(question, candidates[0])]]
-    best = replace(max(failed, key=lambda each: each.settled), looked_at=len(candidates), seconds=clock() - begin)
+    # Only where all fail do the figures of one count: the rest of its machines are simulated now.
+    furthest = max(attempts or [Attempt(question, candidates[0])], key=Attempt.reached)
+    best = replace(furthest.certificate(), looked_at=len(candidates), seconds=clock() - begin)
     return NotVerified(f"none of {len(candidates)} candidates is verified: the best {question.shortcoming(best)}", best)
 
 
