@@ -15,28 +15,28 @@ NEGLIGIBLE = 1e-18
 
 
 @inlined
-def series(t: Tables, mode: int, guard: int, x: Array, c: Array) -> int:
-    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is not
-    rounding, `TERMS` where all are.
+def series(t: Tables, mode: int, guard: int, x: Array, margin: float, c: Array) -> int:
+    """Fill `c` with the Taylor coefficients of a guard over a step; return the order of the first that is more than
+    `margin` times its rounding, `TERMS` where none is.
 
     Where as many as there are states are zero, all are (Cayley and Hamilton): a later one is rounding, whatever its
     size. Taken for motion it made a machine at rest on a flank leave it and come back without end.
     """
     product(t.taylor, (mode * t.guards + guard) * t.states * TERMS, TERMS, TERMS, x, c)
     for order in range(min(TERMS, t.states)):
-        if abs(c[order]) > rounding(t, mode, guard, order, x):
+        if abs(c[order]) > margin * rounding(t, mode, guard, order, x):
             return order
     return TERMS
 
 
 @inlined
-def is_leaving(t: Tables, mode: int, guard: int, x: Array, c: Array) -> bool:
+def is_leaving(t: Tables, mode: int, guard: int, x: Array, margin: float, c: Array) -> bool:
     """True when the guard is positive now or at once: the sign of its first Taylor coefficient that is not rounding."""
     base = (mode * t.guards + guard) * t.states
     value = dot(t.rows, base, x)
-    if abs(value) > rounding(t, mode, guard, 0, x):
+    if abs(value) > margin * rounding(t, mode, guard, 0, x):
         return value > 0.0
-    first = series(t, mode, guard, x, c)
+    first = series(t, mode, guard, x, margin, c)
     return first < TERMS and c[first] > 0.0
 
 
@@ -69,7 +69,9 @@ def _search_unit(t: Tables, scratch: Scratch) -> float:
 
 
 @inlined
-def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scratch: Scratch) -> float:
+def next_crossing(
+    t: Tables, mode: int, guard: int, x: Array, length: float, margin: float, scratch: Scratch
+) -> float:
     """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
     not."""
     base = (mode * t.guards + guard) * t.states
@@ -77,7 +79,7 @@ def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, scr
         # Not even with every term of the series at its worst.
         return np.inf
     c = scratch.series
-    first = series(t, mode, guard, x, c)
+    first = series(t, mode, guard, x, margin, c)
     # The guard is zero on the whole step but for rounding: a mode may last on its own boundary.
     if first == TERMS:
         return np.inf

@@ -24,6 +24,10 @@ DONE, FULL, ZENO = 0, 1, 2
 # More events than this inside one search step, or mode changes at one instant, is Zeno behaviour or sliding.
 EVENTS_PER_STEP = 1000
 CHANGES_AT_ONCE = 64
+# After so many changes at one instant two modes take turns: each calls its guard's first derivative beyond rounding,
+# and not the same one, because its coefficients, sums of terms that cancel, differ a little from the other's. They
+# agree once a derivative must exceed its rounding by this factor.
+_TURNS, _BEYOND = 8, 2.0
 
 
 class RunRecord(NamedTuple):
@@ -102,23 +106,34 @@ def fire(
 
 @merged
 def follow_guards(
-    t: Tables, mode: int, x: Array, step: int, fraction: float, forced: bool, record: RunRecord, scratch: Scratch
-) -> int:
-    """Follow guards that are leaving at this very instant to a mode that admits flow; -1 when there is none.
+    t: Tables,
+    mode: int,
+    x: Array,
+    step: int,
+    fraction: float,
+    forced: bool,
+    margin: float,
+    record: RunRecord,
+    scratch: Scratch,
+) -> tuple[int, float]:
+    """Follow guards that are leaving at this very instant to a mode that admits flow; return it, -1 when there is none,
+    and the margin over rounding that was needed.
 
     A jump or a reset may make several guards positive at once; each change is an event of its own.
     """
-    for _ in range(CHANGES_AT_ONCE):
+    for change in range(CHANGES_AT_ONCE):
+        if change == _TURNS:
+            margin = max(margin, _BEYOND)
         # A literal is a type of its own to numba: `fire` would be compiled once more for it.
         leaving: Any = np.int64(-1)
         for g in range(t.guard_count[mode]):
-            if is_leaving(t, mode, g, x, scratch.series):
+            if is_leaving(t, mode, g, x, margin, scratch.series):
                 leaving = g
                 break
         if leaving < 0:
-            return mode
+            return mode, margin
         mode = fire(t, mode, leaving, x, step, fraction, forced, record, scratch)
-    return -1
+    return -1, margin
 
 
 @merged
@@ -127,14 +142,14 @@ def cross(
 ) -> tuple[int, int]:
     """Advance from fraction `start` to `end` of one step through every event; return the mode (-1: Zeno) and the number
     of events."""
-    place, before = start, record.size[1]
+    place, before, margin = start, record.size[1], 1.0
     forced: Any = np.bool_(False)
     while record.size[1] - before < EVENTS_PER_STEP:
         # Every guard, because several may be crossed within the step: the earliest crossing is the event.
         first = np.inf
         which: Any = np.int64(-1)
         for g in range(t.guard_count[mode]):
-            time = next_crossing(t, mode, g, x, end - place, scratch)
+            time = next_crossing(t, mode, g, x, end - place, margin, scratch)
             if time < first:
                 first, which = time, g
         if which < 0:
@@ -144,7 +159,7 @@ def cross(
         # Rounding of the sum must not put the event behind the end of this part of the step.
         place = min(place + first, end)
         mode = fire(t, mode, which, x, step, place, forced, record, scratch)
-        mode = follow_guards(t, mode, x, step, place, forced, record, scratch)
+        mode, margin = follow_guards(t, mode, x, step, place, forced, margin, record, scratch)
         if mode < 0:
             break
         note_segment(record, step, place, mode, x)
@@ -247,7 +262,7 @@ def follow_schedule(
         # A start or a jump may have made guards positive: they are followed before anything flows.
         if at[3] == 1:
             forced: Any = np.bool_(True)
-            mode = follow_guards(t, at[1], x, at[0], place[0], forced, record, scratch)
+            mode, _ = follow_guards(t, at[1], x, at[0], place[0], forced, 1.0, record, scratch)
             if mode < 0:
                 return ZENO
             at[1], at[3] = mode, 0

@@ -191,7 +191,7 @@ def run_members(
         record.size[0] = record.size[1] = 0
         if memory.scratch.pending.filled[starts.mode[k]] == 0:
             fill_entered(t, starts.mode[k], memory.scratch.pending)
-        mode = follow_guards(t, starts.mode[k], memory.state, begin, 0.0, forced, record, memory.scratch)
+        mode, _ = follow_guards(t, starts.mode[k], memory.state, begin, 0.0, forced, 1.0, record, memory.scratch)
         if mode < 0:
             return ZENO, place
         status, _, _, mode = flow_until(t, memory.state, mode, begin, 0.0, steps, 0.0, record, memory.scratch)
