@@ -19,6 +19,7 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.gap import shortest_window
+from servotwin.estimation.output_error import too_slow
 from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.messages import Setting
 from servotwin.novelty.score import model_of
@@ -198,13 +199,17 @@ class Commissioning:
         return shortest_window(twin.method, model, self.recording.sample_rate, twin.estimator)
 
     def check_window(self) -> None:
-        """Refuse a window that does not fit into memory or is too short for the estimator.
+        """Refuse a window that does not fit into memory or is too short for the estimator, or has too few samples of a
+        swing.
 
         Raises
         ------
         InvalidInput
-            Names the allowed length.
+            Names the allowed length, or the sample rate that is needed.
         """
+        slow = "" if self.servo.at_motor else too_slow(self.servo, self.recording.sample_rate)
+        if slow:
+            raise InvalidInput(f"recording sample_rate_hz: {slow}")
         rate = max(self.recording.sample_rate, self.law.sample_rate or 0.0)
         check_samples("window", self.recording.longest_window or self.window, rate)
         needed, why = self._shortest_window

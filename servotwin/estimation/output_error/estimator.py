@@ -22,6 +22,7 @@ from servotwin.estimation.output_error.motor_angle import MotorAngle, without_no
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.problem import Problem
+from servotwin.estimation.output_error.sampling import too_slow
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.taught import taught
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
@@ -39,6 +40,7 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
+_SAME = 1e-12  # of the motion: rounding
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -78,9 +80,14 @@ def estimate(
     assert isinstance(axis, Axis)
     axis, settings = _known(axis, settings, machine)
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
+    if slow := too_slow(axis, window.sample_rate):
+        return replace(blank, reasons=(slow,))
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
+    if np.ptp(window.position - axis.p * theta_m) <= _SAME * np.ptp(window.position):
+        words = "position is the motor's angle times the ratio, exactly: there is no gap, or it is not the load's own"
+        return replace(blank, reasons=(words,))
     found, noise = _fit(window, theta_m, axis, prior, settings, machine)
     unit, possible = 2.0 / axis.p, possible_half(found)
     stated = _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)

@@ -1,6 +1,6 @@
 """Motion of a load behind an elastic shaft with backlash, under a given motion of the motor; compiled.
 
-Between two samples the motor's angle is linear. In contact the load is a linear system driven by the motor, in the gap
+Between two samples the motor's angle is a cubic, straight in each part of a sample. In contact the load is a linear system driven by the motor, in the gap
 a free one: both advance by matrix exponentials. Where a flank is touched or left within a sample, the instant is the
 root of a polynomial, the Taylor series of the flow. In the gap the stretch that is left in the shaft fades on its own,
 often far faster than anything else moves: it has its own exponential beside the series.
@@ -228,6 +228,18 @@ def slow_down(state: Array, place: float, speed: float, friction: float) -> None
         state[2 * n - 1] = slowed(state[2 * n - 1], friction)
 
 
+@inlined
+def between(drive: Array, i: int, share: float) -> float:
+    """Motor's position at a share of the way from sample `i` to the next, by a cubic with the slopes that the samples
+    on either side give it (Catmull and Rom)."""
+    here, there = drive[i], drive[i + 1]
+    first = 0.5 * (there - drive[i - 1]) if i > 0 else there - here
+    last = 0.5 * (drive[i + 2] - here) if i + 2 < drive.size else there - here
+    moved = there - here
+    bend, twist = 3.0 * moved - 2.0 * first - last, first + last - 2.0 * moved
+    return here + share * (first + share * (bend + share * twist))
+
+
 @bare
 def run_shaft(
     drive: Array,
@@ -251,9 +263,9 @@ def run_shaft(
     Parameters
     ----------
     drive : (N,) array
-        Motor's position seen at the load, m or rad; straight from one sample to the next.
+        Motor's position seen at the load, m or rad.
     parts : int
-        Of a sample, one after the other.
+        Of a sample, one after the other; in each the motor moves evenly.
     interval, half : float
         s, of a part; and half of the gap at the load.
     flows, steps : (2, size, size) arrays
@@ -284,8 +296,8 @@ def run_shaft(
     lead = drive[0] - state[kept]
     side = 0 if abs(lead) <= half else (1 if lead > 0.0 else -1)
     for i in range(drive.size):
-        rate = (drive[i + 1] - drive[i]) / (parts * interval) if i + 1 < drive.size else 0.0
-        drive_to(state, side, drive[i], rate, half, kept)
+        end = between(drive, i, 1.0 / parts) if i + 1 < drive.size else drive[i]
+        drive_to(state, side, drive[i], (end - drive[i]) / interval, half, kept)
         error = measured[i] - state[n - 1]
         motion[0, i], motion[1, i], motion[2, i] = state[n - 1], state[2 * n - 1], state[kept]
         sides[i] = side
@@ -293,10 +305,12 @@ def run_shaft(
         state[2 * n - 1] += gains[1] * error
         if i + 1 == drive.size:
             break
+        begin = drive[i]
         for k in range(parts):
-            begin, end = drive[i] + k * interval * rate, drive[i] + (k + 1) * interval * rate
-            drive_to(state, side, begin, rate, half, kept)
+            end = between(drive, i, (k + 1.0) / parts)
+            drive_to(state, side, begin, (end - begin) / interval, half, kept)
             place, speed = state[n - 1], slowed(state[2 * n - 1], friction)
             state[2 * n - 1] = speed
             side = through_sample(side, begin, end, interval, half, flows, steps, push, fading, work, state)
             slow_down(state, place, speed, friction)
+            begin = end

@@ -31,6 +31,9 @@ _DOUBT = 2.0  # interval over the computed one
 _RATCHET = 4.0  # of the noise left in the motor's angle: its extremes push the load, so that the gap seems wider
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
+# The motor's motion between two samples is a cubic: error in the middle over the fourth difference, and that difference
+# which rounding makes at most (counts); the error that counts, of half the gap, and the samples that may have it.
+_CUBIC, _FOURTH, _HIDDEN, _FEW = 3.0 / 128.0, 8.0, 0.25, 10
 
 
 @dataclass(frozen=True)
@@ -99,7 +102,7 @@ def judge(
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
         return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
     allowed = _allowed(found, half, settings)
-    doubts = tuple(filter(None, (_wide(std, allowed, unit), _rival(found, half, total, unit))))
+    doubts = tuple(filter(None, (_wide(std, allowed, unit), _rival(found, half, total, unit), _hidden(found, half))))
     if not doubts:
         return JudgedFit(GapStatus.OK, half, std, total)
     ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
@@ -119,6 +122,21 @@ def _wide(std: float, allowed: float, unit: float) -> str:
     if std <= allowed:
         return ""
     return f"the gap is known to {_deg(unit * std)} only, and {_deg(unit * allowed)} are allowed"
+
+
+def _hidden(found: Search, half: float) -> str:
+    """Sentence for a motor that moves by a share of the gap between two samples, and the samples do not show how."""
+    problem = found.problem
+    if problem.model.speed == 0.0:
+        return ""
+    errors = _CUBIC * np.maximum(np.abs(np.diff(problem.drive, 4)) - _FOURTH * problem.count, 0.0)
+    error = float(np.sort(errors)[-_FEW])
+    if error <= _HIDDEN * half:
+        return ""
+    return (
+        f"the motor turns so sharply between two samples that they leave its place open by "
+        f"{100.0 * error / half:.0f} % of half the gap: a higher sample rate is needed"
+    )
 
 
 def _unknown_ratio(
