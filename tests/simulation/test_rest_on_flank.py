@@ -1,4 +1,4 @@
-"""A motor that comes to rest on a flank of the gap: two modes must agree whether it leaves, at the limit of rounding."""
+"""A motor at rest on a flank of the gap: two modes must agree whether it leaves, at the limit of rounding."""
 
 from __future__ import annotations
 

@@ -1,9 +1,10 @@
 """Motion of a load behind an elastic shaft with backlash, under a given motion of the motor; compiled.
 
-Between two samples the motor's angle is a cubic, straight in each part of a sample. In contact the load is a linear system driven by the motor, in the gap
-a free one: both advance by matrix exponentials. Where a flank is touched or left within a sample, the instant is the
-root of a polynomial, the Taylor series of the flow. In the gap the stretch that is left in the shaft fades on its own,
-often far faster than anything else moves: it has its own exponential beside the series.
+Between two samples the motor's angle is a cubic, straight in each part of a sample. In contact the load is a linear
+system driven by the motor, in the gap a free one: both advance by matrix exponentials. Where a flank is touched or left
+within a sample, the instant is the root of a polynomial, the Taylor series of the flow. In the gap the stretch that is
+left in the shaft fades on its own, often far faster than anything else moves: it has its own exponential beside the
+series.
 """
 
 from __future__ import annotations
