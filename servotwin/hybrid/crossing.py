@@ -69,9 +69,7 @@ def _search_unit(t: Tables, scratch: Scratch) -> float:
 
 
 @inlined
-def next_crossing(
-    t: Tables, mode: int, guard: int, x: Array, length: float, margin: float, scratch: Scratch
-) -> float:
+def next_crossing(t: Tables, mode: int, guard: int, x: Array, length: float, margin: float, scratch: Scratch) -> float:
     """First time in (0, length] steps at which the guard becomes positive, 0 when it is leaving now, inf when it does
     not."""
     base = (mode * t.guards + guard) * t.states
