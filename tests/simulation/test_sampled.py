@@ -315,7 +315,7 @@ def test_a_machine_at_rest_on_a_flank_stays_there() -> None:
         0.4537856055185257, 0.05, 0.0,
     ]  # fmt: skip
     leaving = {
-        (mode.name, guard.side): is_leaving(engine.tables, m, g, np.array(at_rest), engine.scratch.series)
+        (mode.name, guard.side): is_leaving(engine.tables, m, g, np.array(at_rest), 1.0, engine.scratch.series)
         for m, mode in enumerate(engine.plant.automaton.modes)
         for g, guard in enumerate(mode.guards)
     }

@@ -212,7 +212,9 @@ def starts(problem: FitProblem, gap: float) -> list[Array]:
 
 def _plain(problem: FitProblem, values: Array, rate: float = 0.0) -> float:
     raw = problem.misfit(values, rate)
-    return float(raw @ raw)
+    with np.errstate(over="ignore"):
+        # A load that runs away from its motor costs more than any number.
+        return float(raw @ raw)
 
 
 def _distinct(fits: list[Fit]) -> list[Fit]:
