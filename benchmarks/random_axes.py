@@ -1,0 +1,172 @@
+"""Random axes whose shafts are free in the gap, and the estimates of their twins: no preset, but what a stranger has.
+
+``python -m benchmarks.batch axes-random --seed 5 --count 40 FILE``: torque drives, DC motors and velocity drives, one
+to three masses, with and without friction, encoders of any fineness, a controller by `tune`, 7.5 to 30 samples in a
+period of the motor against its load; stiffness 5 %, damping 30 %, motor 10 %, friction 40 % off the model. Axes for
+which no controller is found are drawn anew. The blocks are the actuators.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.axis_presets import judged
+from benchmarks.batch import Batch
+from servotwin.commissioning.edge_settings import Recording
+from servotwin.control.controller import Controller
+from servotwin.cosim import Cosimulation, SimulatedMachine
+from servotwin.cosim.machine import simulation_of
+from servotwin.cosim.scenario import Scenario
+from servotwin.design import tune
+from servotwin.errors import InvalidInput
+from servotwin.plant.actuator import Actuator, DcMotor, TorqueDrive, VelocityDrive
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
+from servotwin.plant.sensors import Sensors
+from servotwin.plant.signals import SquareWave
+from servotwin.plant.transmission import Transmission
+from servotwin.twin.settings import TwinSettings
+
+NAME = "axes-random"
+_BLOCKS = ("torque", "dc motor", "velocity")
+_ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1, "motor_friction": 0.4, "load_friction": 0.4}
+_STEPS, _KINDS = 8, ("PD", "PIDF", "P", "PI")
+
+
+class RandomAxis(NamedTuple):
+    """An axis, its machine, amplitude (m or rad), time of a step (s) and total gap (rad)."""
+
+    model: Axis
+    plant: Axis
+    amplitude: float
+    half_period: float
+    gap: float
+
+
+class _Task(NamedTuple):
+    block: str
+    seed: int
+    place: int
+
+
+def random_axis(block: str, seed: int, place: int) -> RandomAxis:
+    """Draw an axis for which there is a controller."""
+    random = np.random.default_rng([seed, _BLOCKS.index(block), place])
+    while True:
+        try:
+            return _drawn(block, random)
+        except InvalidInput:
+            continue
+
+
+def _drawn(block: str, random: np.random.Generator) -> RandomAxis:
+    def log(low: float, high: float) -> float:
+        return float(10.0 ** random.uniform(low, high))
+
+    mass, pitch, shaft = log(-3, 3), log(-4, 0), 2.0 * math.pi * log(0.3, 2.2)
+    crossover, inertia = shaft * log(-1.6, -0.9), mass * pitch**2 / log(-0.7, 1)
+    amplitude, damped = pitch * log(0.3, 1.2), log(-2.3, -0.9)
+    torque = (inertia + mass * pitch**2) * crossover**2 * amplitude / pitch
+    rubs = [torque * log(-2.5, -1) if random.random() < 0.45 else 0.0 for _ in range(2)]
+    motor = _motor(block, inertia, crossover, rubs[0] if block != "velocity" else 0.0, log)
+    masses, stiffness = int(random.choice([1, 1, 1, 2, 3])), mass * shaft**2
+    load = Load(
+        (mass / masses,) * masses,
+        (0.0, *(stiffness * random.uniform(0.5, 2.0) for _ in range(masses - 1))),
+        (mass * crossover * random.uniform(0.5, 3.0) * 2.0 * damped, *[2.0 * damped * mass * shaft] * (masses - 1)),
+        friction=rubs[1] / pitch,
+    )
+    screw = Transmission(pitch, stiffness, 2.0 * damped * mass * shaft if random.random() < 0.8 else 0.0, "free")
+    sensors = Sensors(log(-4.5, -2.5), amplitude * log(-5.5, -3.5))
+    axis = Axis(motor, screw, load, Controller(1.0, 0.0, 0.0, 1.0 / crossover), sensors)
+    kind, margin = str(random.choice(_KINDS)), math.radians(random.uniform(45.0, 65.0))
+    law = tune(axis, crossover, margin, kind=kind).controller
+    yields = 0.0 if block == "velocity" else mass * pitch**2 / inertia
+    rate = shaft / (2.0 * math.pi) * math.sqrt(1.0 + yields) * log(math.log10(7.5), math.log10(30.0))
+    axis = axis.replace(controller=law.replace(sample_rate=rate, Tf=max(law.Tf, 0.05 / crossover)))
+    errors = {name: 1.0 + width * random.uniform(-1.0, 1.0) for name, width in _ERRORS.items()}
+    half_period = round(max(24.0 * math.pi / crossover * random.uniform(0.5, 1.2), 1000.0 / rate) * rate) / rate
+    gap = min(log(-1.7, -0.3), 0.25 * amplitude / pitch)
+    return RandomAxis(axis, axis.scaled(errors), amplitude, half_period, gap)
+
+
+def _motor(block: str, inertia: float, crossover: float, friction: float, log: Any) -> Actuator:
+    if block == "velocity":
+        return VelocityDrive(log(-1.5, -0.7) / crossover)
+    if block == "torque":
+        return TorqueDrive(inertia, friction=inertia * crossover * log(-1, 0.5), coulomb=friction)
+    resistance = log(-1, 1)
+    gain = math.sqrt(resistance * inertia * crossover * log(-1, 1.5))
+    return DcMotor(inertia, resistance, gain, gain, friction=0.1 * inertia * crossover, coulomb=friction)
+
+
+def measured(task: _Task) -> dict[str, Any]:
+    """Estimates of an axis under its own controller."""
+    drawn = random_axis(*task)
+    rate = drawn.model.controller.sample_rate
+    assert rate is not None
+    try:
+        scenario = Scenario(
+            servo=drawn.model,
+            duration=_STEPS * drawn.half_period,
+            reference=SquareWave(drawn.amplitude, 2.0 * drawn.half_period),
+            gap=drawn.gap,
+            recording=Recording(
+                sample_rate=rate,
+                window=round(0.5 * drawn.half_period * rate) / rate,
+                pre_trigger=round(0.05 * drawn.half_period * rate) / rate,
+            ),
+            twin=TwinSettings(policy="paper", k_dz=0.0),
+        )
+        simulation = simulation_of(scenario, drawn.plant)
+        cosimulation = Cosimulation(scenario, SimulatedMachine(scenario, simulation))
+        while not cosimulation.done:
+            cosimulation.advance()
+        loop = cosimulation.loop(simulation.run())
+    except InvalidInput as error:
+        return {"refused": str(error)}
+    sensors = drawn.model.sensors
+    count = max(sensors.encoder_resolution, sensors.position_resolution / drawn.model.p)
+    gaps = (drawn.gap,) * 3
+    return {
+        "windows": len(loop.estimates),
+        "estimates": [judged(each, gaps, count) for each in loop.estimates if each.ok],
+    }
+
+
+def _units(blocks: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, _Task]]:
+    for place in range(count):
+        yield from ((f"{seed}/{block}/{place}", _Task(block, seed, place)) for block in blocks)
+
+
+def _show(found: Mapping[str, Any], console: Console) -> None:
+    """A line for each actuator, and the axes with false estimates."""
+    table = Table(title="random axes: estimates of a gap that stands still", title_justify="left", box=None)
+    table.add_column("actuator")
+    for heading in ("axes", "refused", "windows", "accepted", "inside", "near", "false"):
+        table.add_column(heading, justify="right")
+    for block in _BLOCKS:
+        axes = [numbers for key, numbers in found.items() if key.split("/")[1] == block]
+        ran = [each for each in axes if "refused" not in each]
+        estimates = [estimate for each in ran for estimate in each["estimates"]]
+        counts = [len(axes), len(axes) - len(ran), sum(each["windows"] for each in ran), len(estimates)]
+        counts += [int(sum(each[name] for each in estimates)) for name in ("inside", "near")]
+        table.add_row(block, *map(str, counts), str(sum(map(_is_false, estimates))))
+    console.print(table)
+    for key, numbers in found.items():
+        if wrong := sum(map(_is_false, numbers.get("estimates", ()))):
+            console.print(f"{key}: {wrong} false", highlight=False)
+
+
+def _is_false(estimate: Mapping[str, float]) -> bool:
+    return not estimate["near"] and not estimate["inside"]
+
+
+BATCH = Batch(_units, measured, _show, _BLOCKS)
+"""For `benchmarks.batch`."""

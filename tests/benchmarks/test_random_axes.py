@@ -1,0 +1,35 @@
+"""Random axes: each is drawn from its place alone, can be simulated, and its estimates are judged."""
+
+from __future__ import annotations
+
+import math
+
+from rich.console import Console
+
+from benchmarks.random_axes import BATCH, random_axis
+from servotwin.estimation.output_error import least_rate
+
+
+def test_an_axis_depends_on_its_place_alone_and_has_enough_samples_of_a_swing() -> None:
+    for block in BATCH.blocks:
+        one, other = random_axis(block, 5, 0), random_axis(block, 5, 1)
+        assert one == random_axis(block, 5, 0)
+        assert one.model != other.model
+        for each in (one, other):
+            assert (each.model.controller.sample_rate or 0.0) > least_rate(each.model)
+            assert 0.0 < each.gap * each.model.p <= 0.25 * each.amplitude * (1.0 + 1e-12)
+            assert each.plant != each.model
+
+
+def test_estimates_are_judged_and_shown() -> None:
+    (key, task), *_ = BATCH.units(("torque",), 1, 5)
+    numbers = BATCH.measure(task)
+    assert numbers["windows"] == 8
+    assert 0 < len(numbers["estimates"]) <= 8
+    assert all(math.isfinite(each["error"]) for each in numbers["estimates"])
+    wrong = {"windows": 8, "estimates": [{"near": 0.0, "inside": 0.0, "error": 0.1, "gap": 0.1, "steady": 1.0}]}
+    console = Console(width=120, record=True)
+    BATCH.show({key: numbers, "5/torque/1": wrong, "5/velocity/0": {"refused": "no"}}, console)
+    text = console.export_text()
+    assert "5/torque/1: 1 false" in text
+    assert text.count("5/") == 1
