@@ -125,4 +125,6 @@ class UnauthenticatedConnection:
 
     def _check(self) -> None:
         if self._limit.exceeded(self._address):
+            # It counts no longer at once: others that are checked in the same moment would go too.
+            self._leave()
             self._close()
