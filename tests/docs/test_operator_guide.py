@@ -251,6 +251,12 @@ def run_line(line: str, folder: Path) -> tuple[int, str]:
     return done.returncode, done.stdout + done.stderr
 
 
+def state(looks: list[str], folder: Path) -> str:
+    """What the commands that look say, and the end of what each process said."""
+    said = [run_line(line, folder)[1] for line in looks]
+    return "\n".join([*said, *(f"{file.name}: {file.read_text()[-2000:]}" for file in sorted(folder.glob("said-*")))])
+
+
 @pytest.mark.slow
 def test_the_first_five_minutes(tmp_path: Path) -> None:
     """Every file and every command as printed, but for the port, which somebody else may have, and the number of
@@ -272,8 +278,8 @@ def test_the_first_five_minutes(tmp_path: Path) -> None:
     with running(services, tmp_path) as processes:
         (see_all, see_one), deadline, said = looks, time.monotonic() + PATIENCE, ""
         while " applied at sample " not in said:
-            assert time.monotonic() < deadline, said
-            assert all(each.poll() is None for each in processes), [p.read_text() for p in tmp_path.glob("said-*")]
+            assert time.monotonic() < deadline, state(looks, tmp_path)
+            assert all(each.poll() is None for each in processes), state(looks, tmp_path)
             if (read_status(tmp_path / "ax-1/status.json") or {}).get("version", 0) == 0:
                 time.sleep(0.1)  # the command takes a second of the processor
                 continue
@@ -283,7 +289,8 @@ def test_the_first_five_minutes(tmp_path: Path) -> None:
         assert "expired" not in said
         # The bias at rest may be worth an update before a window shows the gap.
         while not re.search(r"^ax-1 +\d+\.\d+ ± \d+\.\d+ +ok", run_line(see_all, tmp_path)[1], re.MULTILINE):
-            assert time.monotonic() < deadline
+            assert time.monotonic() < deadline, state(looks, tmp_path)
+            assert all(each.poll() is None for each in processes), state(looks, tmp_path)
             time.sleep(3.0)  # the command takes a second of the processor, and a window comes every ten seconds
         for each in processes[::-1]:
             each.send_signal(signal.SIGINT)
