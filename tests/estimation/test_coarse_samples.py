@@ -15,6 +15,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import least_rate
+from servotwin.estimation.output_error.models import gains
 from servotwin.estimation.output_error.shaft import between
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import DcMotor, TorqueDrive
@@ -117,3 +118,13 @@ def test_a_position_that_is_the_motors_own_is_refused_in_a_sentence() -> None:
         found = estimate_gap(window, axis)
         assert found.status is GapStatus.UNIDENTIFIABLE
         assert "not the load's own" in found.reasons[0]
+
+
+@pytest.mark.parametrize("turn", [0.01, 0.3, 1.0, 4.0])
+def test_the_errors_of_the_observer_fade_at_its_rate_however_few_the_samples(turn: float) -> None:
+    """Gains of continuous time make it unstable from two thirds of a radian of the shaft's own frequency a sample."""
+    interval = 0.02
+    places, speeds = gains(turn / interval, interval)
+    moved = np.array([[1.0, interval], [0.0, 1.0]]) @ np.array([[1.0 - places, 0.0], [-speeds, 1.0]])
+    assert np.trace(moved) == pytest.approx(2.0 * math.exp(-turn), rel=1e-12)
+    assert np.linalg.det(moved) == pytest.approx(math.exp(-2.0 * turn), rel=1e-9)

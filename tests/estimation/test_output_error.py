@@ -15,10 +15,10 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.estimator import _problem
-from servotwin.estimation.output_error.fit import search
 from servotwin.estimation.output_error.learnt_shaft import adapted_shaft
 from servotwin.estimation.output_error.models import Priors, ShaftModel
 from servotwin.estimation.output_error.possible import possible_half
+from servotwin.estimation.output_error.search import search
 from servotwin.estimation.output_error.verdict import _slow, grown
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.window import Window

@@ -15,7 +15,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
-from servotwin.estimation.output_error.fit import Search, search
+from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
@@ -23,6 +23,7 @@ from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.sampling import too_slow
+from servotwin.estimation.output_error.search import search
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.taught import taught
 from servotwin.estimation.output_error.verdict import JudgedFit, judge

@@ -1,4 +1,4 @@
-"""Fit of a model's unknowns to a window: search over gap and offset, then Levenberg-Marquardt in whitened noise."""
+"""Fit of a model's unknowns to a window: Levenberg-Marquardt in whitened noise. `search` says where it begins."""
 
 from __future__ import annotations
 
@@ -13,13 +13,9 @@ from servotwin.estimation.output_error.models import HALF, FittedModel, Flags
 from servotwin.plant.signals import Array
 
 _ORDER = 24  # of the noise's autoregression
-_PASSES = 3
 _STEP = 1e-6  # of an unknown's size: difference that makes a derivative
-_FIRST, _SECOND = 4, 2  # minima that are followed in white noise, and in the window's own
 _SINGLE_STEPS = 8
-_ROUNDED_STEPS = 20
-_AGAIN = ((3, 3), (10, 2))  # steps in the noise that was learnt, from each start of the grid, and minima kept
-_SAME = 0.02  # of a gap: minima that are one
+_HARDLY = 1e-3  # of the whole residual: what an unknown of usual size shows that is held back first
 _GAIN = 1e-3  # of the residual's variance: what a step must promise
 _ROUNDING = 0.6  # of a count: what is left where rounding is all of the noise
 _FLOOR = 1e-3  # of half the gap: the model's own error, which is no noise to learn
@@ -122,16 +118,17 @@ def descend(
     problem: FitProblem, start: Array, noise: Autoregression, free: Flags, steps: int, rate: float = 0.0
 ) -> Fit:
     """Levenberg-Marquardt from a start; only `free` (u,) unknowns move."""
-    most = problem.limits()
+    most, usual = problem.limits(), problem.sizes()
     least = np.where([unknown.positive for unknown in problem.model.unknowns], 0.0, -most)
     values, damping = np.clip(start, least, most), 1e-3
     residual, rows, raw = whitened_rows(problem, values, noise, free, rate)
     cost, count = float(residual @ residual), 1
     for _ in range(steps):
-        size = np.linalg.norm(rows, axis=1)
-        uphill = rows @ residual
+        size, uphill = np.linalg.norm(rows, axis=1), rows @ residual
         held = ((values <= least) & (uphill > 0.0)) | ((values >= most) & (uphill < 0.0))
         use = np.flatnonzero(free & (size > 0.0) & ~held)
+        # Without this an unknown that hardly shows would go far beyond what its derivative says of it.
+        size = np.maximum(size, _HARDLY * math.sqrt(cost) / usual)
         scaled = rows[use] / size[use, None]
         matrix, downhill = scaled @ scaled.T, scaled @ residual
         better = False
@@ -194,90 +191,12 @@ class Search:
     free: Flags
 
 
-def starts(problem: FitProblem, gap: float) -> list[Array]:
-    """Unknowns (u,) of a grid of gaps and offsets, the best ones of different gaps first.
-
-    Parameters
-    ----------
-    problem : FitProblem
-    gap : float
-        Half gap at the load that is expected; 0: none.
-    """
-    best = []
-    for tried in problem.grid(gap):
-        costs = [_plain(problem, values, problem.model.speed) for values in tried]
-        best.append((min(costs), tried[int(np.argmin(costs))]))
-    return [values for _, values in sorted(best, key=lambda pair: pair[0])]
-
-
-def _plain(problem: FitProblem, values: Array, rate: float = 0.0) -> float:
+def plain_cost(problem: FitProblem, values: Array, rate: float = 0.0) -> float:
+    """Sum of squares of the misfit."""
     raw = problem.misfit(values, rate)
     with np.errstate(over="ignore"):
         # A load that runs away from its motor costs more than any number.
         return float(raw @ raw)
-
-
-def _distinct(fits: list[Fit]) -> list[Fit]:
-    """Fits in different gaps, the best of each."""
-    chosen: list[Fit] = []
-    for fit in fits:
-        if all(abs(fit.values[HALF] - one.values[HALF]) > _SAME * one.values[HALF] for one in chosen):
-            chosen.append(fit)
-    return chosen
-
-
-def search(problem: FitProblem, gap: float) -> Search:
-    """Fit a window: `gap` as in `starts`."""
-    free, speed = problem.free, problem.model.speed
-    rounded = _in_rounding(problem, gap)
-    if rounded is not None:
-        return rounded
-    tried = starts(problem, gap)[:_FIRST]
-    rough = math.sqrt(_plain(problem, tried[0], speed) / problem.position.size)
-    noise = Autoregression.white(max(0.3 * rough, 1e-9 * problem.range))
-    fits = [descend(problem, values, noise, free, 10, speed) for values in tried]
-    fits = _distinct(sorted(fits, key=lambda fit: fit.cost))[:_SECOND]
-    noise = noise_in(problem, fits[0])
-    fits = [descend(problem, fit.values, noise, free, 8, problem.model.slowing[0] * speed) for fit in fits]
-    fits.sort(key=lambda fit: fit.cost)
-    rate = problem.model.slowing[1] * speed
-    for _ in range(_PASSES):
-        best = fits[0]
-        noise = noise_in(problem, best)
-        fits = [descend(problem, fit.values, noise, free, 10, rate) for fit in _distinct(fits)[:_SECOND]]
-        fits.sort(key=lambda fit: fit.cost)
-    again = _from_anew(problem, noise, free, gap)
-    if again[0].cost < fits[0].cost:
-        # The noise was learnt from what a worse minimum had left.
-        noise = noise_in(problem, again[0])
-        again = [descend(problem, fit.values, noise, free, 10, rate) for fit in _distinct(again)[:_SECOND]]
-        fits = [descend(problem, fit.values, noise, free, 10, rate) for fit in fits]
-    fits = _distinct(sorted([*fits, *again], key=lambda fit: fit.cost))
-    return Search(problem, noise, fits[0], tuple(fits[1:]), free)
-
-
-def _in_rounding(problem: FitProblem, gap: float) -> Search | None:
-    """Fit of a window in errors of rounding; None where they do not explain it, and other noise is to be learnt."""
-    if problem.model.speed > 0.0 or problem.count == 0.0:
-        return None
-    noise = Autoregression.white(problem.count / math.sqrt(12.0))
-    fits = [descend(problem, values, noise, problem.free, _ROUNDED_STEPS) for values in starts(problem, gap)]
-    fits = _distinct(sorted(fits, key=lambda fit: fit.cost))
-    return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free) if only_rounding(problem, fits[0]) else None
-
-
-def _from_anew(problem: FitProblem, noise: Autoregression, free: Flags, gap: float) -> list[Fit]:
-    """Minima from the grid of starts in the noise that was learnt, the best first.
-
-    Minima that were followed from white noise on can have led the model's numbers astray: these begin at its own.
-    """
-    rate = problem.model.slowing[1] * problem.model.speed
-    tried = starts(problem, gap)
-    for steps, kept in _AGAIN:
-        fits = [descend(problem, values, noise, free, steps, rate) for values in tried]
-        fits = _distinct(sorted(fits, key=lambda fit: fit.cost))[:kept]
-        tried = [fit.values for fit in fits]
-    return fits
 
 
 def one_flank(found: Search) -> Fit:
@@ -289,7 +208,7 @@ def one_flank(found: Search) -> Fit:
     free[HALF] = False
     best, rate = [], problem.model.slowing[1] * problem.model.speed
     for tried in problem.on_one_flank(found.best.values):
-        costs = [_plain(problem, values, rate) for values in tried]
+        costs = [plain_cost(problem, values, rate) for values in tried]
         start = tried[int(np.argmin(costs))]
         best.append(descend(problem, start, found.noise, free, _SINGLE_STEPS, rate))
     return min(best, key=lambda fit: fit.cost)

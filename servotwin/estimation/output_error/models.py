@@ -262,7 +262,6 @@ class ShaftModel:
         """
         made = self.prepared(drive, interval, values)
         out, sides = np.empty((3, made.drive.size)), np.empty(made.drive.size, dtype=np.int8)
-        gains = 2.0 * rate * interval, rate * rate * interval
         run_shaft(
             made.drive,
             made.parts,
@@ -270,7 +269,7 @@ class ShaftModel:
             made.half,
             *made.matrices,
             measured - made.zero,
-            gains,
+            gains(rate, interval),
             made.friction,
             made.scratch(),
             made.state,
@@ -283,6 +282,12 @@ class ShaftModel:
     def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
         """Position (N,) of the last mass in `simulate`."""
         return self.simulate(drive, measured, interval, values, rate).position
+
+
+def gains(rate: float, interval: float) -> tuple[float, float]:
+    """Of an observer of a free mass that is measured at intervals (s): both errors fade at the rate (1/s)."""
+    faded = -math.expm1(-rate * interval)
+    return -math.expm1(-2.0 * rate * interval), faded * faded / interval
 
 
 @lru_cache(maxsize=64)

@@ -1,0 +1,142 @@
+"""Search for the best fit of a window: a grid of gaps and offsets, then minima beside the best, then in its noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from servotwin.estimation.core.whitening import Autoregression
+from servotwin.estimation.output_error.fit import (
+    Fit,
+    FitProblem,
+    Search,
+    descend,
+    noise_in,
+    only_rounding,
+    plain_cost,
+)
+from servotwin.estimation.output_error.models import HALF, OFFSET
+from servotwin.plant.signals import Array
+
+_STEPS, _KEPT = (10, 10, 20), (6, 3, 2)  # in white noise at each rate of the observer, and minima that are kept
+_LOW = (0.3, 0.3, 0.1)  # the white noise, of what the best minimum before has left
+_ROUNDED_STEPS, _LEARNT_STEPS, _PASSES = 20, 20, 3
+_SAME = 0.02  # of a gap: minima that are one
+_NEIGHBOURS, _NEAR = 16, (0.01, 0.5)  # places beside the best minimum that are tried, and how far of the half gap
+_LEFT, _LEFT_COUNTS, _WHITE = 0.001, 0.5, 1.2  # of half the gap, a count, white noise: what a good fit leaves
+
+
+def starts(problem: FitProblem, gap: float) -> list[Array]:
+    """Unknowns (u,) of a grid of gaps and offsets, the best ones of different gaps first.
+
+    Parameters
+    ----------
+    problem : FitProblem
+    gap : float
+        Half gap at the load that is expected; 0: none.
+    """
+    best = []
+    for tried in problem.grid(gap):
+        costs = [plain_cost(problem, values, problem.model.speed) for values in tried]
+        best.append((min(costs), tried[int(np.argmin(costs))]))
+    return [values for _, values in sorted(best, key=lambda pair: pair[0])]
+
+
+def search(problem: FitProblem, gap: float) -> Search:
+    """Fit a window: `gap` as in `starts`.
+
+    Minima are compared by all that they leave. Noise that was learnt at a wrong minimum makes what that leaves look
+    likely, and hides the others: it is learnt at the one that leaves least.
+    """
+    rounded = _in_rounding(problem, gap)
+    if rounded is not None:
+        return rounded
+    fits = _in_white_noise(problem, starts(problem, gap))
+    fits = [_beside(problem, fits[0]), *fits]
+    for _ in range(_PASSES):
+        noise = noise_in(problem, fits[0])
+        fits = [descend(problem, fit.values, noise, problem.free, _LEARNT_STEPS, _last_rate(problem)) for fit in fits]
+        fits = _distinct(sorted(fits, key=lambda fit: fit.cost))
+    return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free)
+
+
+def _last_rate(problem: FitProblem) -> float:
+    """Of the observer, 1/s."""
+    return problem.model.slowing[-1] * problem.model.speed
+
+
+def _left(fit: Fit) -> float:
+    """Sum of squares of what a fit leaves; inf where the load ran away."""
+    with np.errstate(over="ignore"):
+        left = float(fit.raw @ fit.raw)
+    return left if math.isfinite(left) else math.inf
+
+
+def _distinct(fits: list[Fit]) -> list[Fit]:
+    """Fits in different gaps, the best of each."""
+    chosen: list[Fit] = []
+    for fit in fits:
+        if all(abs(fit.values[HALF] - one.values[HALF]) > _SAME * one.values[HALF] for one in chosen):
+            chosen.append(fit)
+    return chosen
+
+
+def _white(problem: FitProblem, left: float, share: float) -> Autoregression:
+    """White noise that is a share of what a fit has left, a sum of squares."""
+    rms = math.sqrt(left / problem.position.size)
+    return Autoregression.white(max(share * rms, 1e-9 * problem.range) if math.isfinite(rms) else problem.range)
+
+
+def _in_white_noise(problem: FitProblem, tried: list[Array]) -> list[Fit]:
+    """Minima from starts in white noise, under an observer that slows down; the one that leaves least first."""
+    left = plain_cost(problem, tried[0], problem.model.speed)
+    fits: list[Fit] = []
+    for share, low, steps, kept in zip((1.0, *problem.model.slowing), _LOW, _STEPS, _KEPT, strict=True):
+        noise, rate = _white(problem, left, low), share * problem.model.speed
+        fits = [descend(problem, values, noise, problem.free, steps, rate) for values in tried]
+        fits = _distinct(sorted(fits, key=_left))[:kept]
+        tried, left = [fit.values for fit in fits], _left(fits[0])
+    return fits
+
+
+def _beside(problem: FitProblem, best: Fit) -> Fit:
+    """The best of a minimum and of some beside it.
+
+    Every contact that comes earlier or later makes minima of its own: where a fit leaves more than rounding, gaps and
+    offsets near it are tried.
+    """
+    random = np.random.default_rng(0)
+    for _ in range(_NEIGHBOURS):
+        if _explains(problem, best):
+            break
+        far = math.exp(random.uniform(math.log(_NEAR[0]), math.log(_NEAR[1])))
+        values, noise = best.values.copy(), _white(problem, _left(best), _LOW[-1])
+        values[HALF] *= math.exp(far * random.normal())
+        values[OFFSET] += far * values[HALF] * random.normal()
+        for share in problem.model.slowing:
+            fit = descend(problem, values, noise, problem.free, _LEARNT_STEPS, share * problem.model.speed)
+            values = fit.values
+        best = min(best, fit, key=_left)
+    return best
+
+
+def _explains(problem: FitProblem, fit: Fit) -> bool:
+    """Tell whether a fit leaves next to nothing, or white noise."""
+    white = _WHITE * math.sqrt(0.5) * _rms(np.diff(fit.raw))
+    return _rms(fit.raw) <= max(_LEFT * float(fit.values[HALF]), _LEFT_COUNTS * problem.count, white)
+
+
+def _rms(raw: Array) -> float:
+    with np.errstate(over="ignore"):
+        return float(np.sqrt(np.mean(raw**2)))
+
+
+def _in_rounding(problem: FitProblem, gap: float) -> Search | None:
+    """Fit of a window in errors of rounding; None where they do not explain it, and other noise is to be learnt."""
+    if problem.model.speed > 0.0 or problem.count == 0.0:
+        return None
+    noise = Autoregression.white(problem.count / math.sqrt(12.0))
+    fits = [descend(problem, values, noise, problem.free, _ROUNDED_STEPS) for values in starts(problem, gap)]
+    fits = _distinct(sorted(fits, key=lambda fit: fit.cost))
+    return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free) if only_rounding(problem, fits[0]) else None
