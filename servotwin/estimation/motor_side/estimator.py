@@ -14,11 +14,11 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
 from servotwin.estimation.motor_side.problem import MotorModel, MotorProblem
+from servotwin.estimation.motor_side.search import search
 from servotwin.estimation.motor_side.settings import MotorSideSettings
 from servotwin.estimation.motor_side.verdict import judge
 from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.models import Priors, ShaftModel
-from servotwin.estimation.output_error.search import search
 from servotwin.estimation.output_error.verdict import JudgedFit
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis

@@ -57,7 +57,7 @@ def search(problem: FitProblem, gap: float) -> Search:
     for _ in range(_PASSES):
         noise = noise_in(problem, fits[0])
         fits = [descend(problem, fit.values, noise, problem.free, _LEARNT_STEPS, _last_rate(problem)) for fit in fits]
-        fits = _distinct(sorted(fits, key=lambda fit: fit.cost))
+        fits = distinct(sorted(fits, key=lambda fit: fit.cost))
     return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free)
 
 
@@ -73,7 +73,7 @@ def _left(fit: Fit) -> float:
     return left if math.isfinite(left) else math.inf
 
 
-def _distinct(fits: list[Fit]) -> list[Fit]:
+def distinct(fits: list[Fit]) -> list[Fit]:
     """Fits in different gaps, the best of each."""
     chosen: list[Fit] = []
     for fit in fits:
@@ -95,7 +95,7 @@ def _in_white_noise(problem: FitProblem, tried: list[Array]) -> list[Fit]:
     for share, low, steps, kept in zip((1.0, *problem.model.slowing), _LOW, _STEPS, _KEPT, strict=True):
         noise, rate = _white(problem, left, low), share * problem.model.speed
         fits = [descend(problem, values, noise, problem.free, steps, rate) for values in tried]
-        fits = _distinct(sorted(fits, key=_left))[:kept]
+        fits = distinct(sorted(fits, key=_left))[:kept]
         tried, left = [fit.values for fit in fits], _left(fits[0])
     return fits
 
@@ -138,5 +138,5 @@ def _in_rounding(problem: FitProblem, gap: float) -> Search | None:
         return None
     noise = Autoregression.white(problem.count / math.sqrt(12.0))
     fits = [descend(problem, values, noise, problem.free, _ROUNDED_STEPS) for values in starts(problem, gap)]
-    fits = _distinct(sorted(fits, key=lambda fit: fit.cost))
+    fits = distinct(sorted(fits, key=lambda fit: fit.cost))
     return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free) if only_rounding(problem, fits[0]) else None
