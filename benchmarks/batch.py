@@ -116,8 +116,8 @@ def _batches() -> dict[str, Batch]:
     from benchmarks import axis_certificates, axis_glances, axis_presets, logs, random_axes
     from benchmarks.policies import loops
 
-    single = {each.NAME: each.BATCH for each in (loops, logs, axis_certificates, axis_glances, random_axes)}
-    return single | axis_presets.BATCHES
+    single = {each.NAME: each.BATCH for each in (loops, logs, axis_certificates, axis_glances)}
+    return single | axis_presets.BATCHES | random_axes.BATCHES
 
 
 def main(arguments: Sequence[str]) -> None:

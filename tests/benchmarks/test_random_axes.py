@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import math
 
+import pytest
 from rich.console import Console
 
-from benchmarks.random_axes import BATCH, random_axis
+from benchmarks.random_axes import BATCHES, NAME, WINDOWS, random_axis, step_window
 from servotwin.estimation.output_error import least_rate
+
+BATCH = BATCHES[NAME]
 
 
 def test_an_axis_depends_on_its_place_alone_and_has_enough_samples_of_a_swing() -> None:
@@ -33,3 +36,11 @@ def test_estimates_are_judged_and_shown() -> None:
     text = console.export_text()
     assert "5/torque/1: 1 false" in text
     assert text.count("5/") == 1
+
+
+def test_windows_without_a_twin_are_estimated() -> None:
+    numbers = BATCHES[WINDOWS].measure(next(task for _, task in BATCH.units(("velocity",), 1, 5151)))
+    assert numbers["windows"] == 3
+    assert all(estimate["near"] for estimate in numbers["estimates"])
+    drawn = random_axis("velocity", 5151, 0)
+    assert step_window(drawn, 2).start == pytest.approx(1.95 * drawn.half_period, rel=1e-3)

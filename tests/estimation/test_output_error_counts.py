@@ -161,16 +161,14 @@ def _angle(window: Window) -> Array:
     return window.theta_m
 
 
-def test_a_motor_that_creeps_in_noise_tells_its_gap_no_better_than_ratio_and_delay_are_known() -> None:
+@pytest.mark.parametrize("seed", [286, 288, 293, 304])
+def test_a_motor_that_creeps_in_noise_tells_its_gap_no_better_than_ratio_and_delay_are_known(seed: int) -> None:
     """One rate of creeping makes the same motion with another gap, ratio and delay: three of these were 2 to 4 % off,
-    by 2 to 4 standard deviations. In the first another gap explains the window nearly as well."""
-    accepted = []
-    for seed in (286, 288, 293, 304):
-        window, gap = _counted(_creep, seed, noise=2.0, off=True)
-        estimate = estimate_gap(window, Axis.preset("stepper-stage"))
-        assert estimate.interval[0] <= gap <= estimate.interval[1]
-        accepted.append(estimate.ok)
-    assert accepted == [False, True, True, True]
+    by 2 to 4 standard deviations."""
+    window, gap = _counted(_creep, seed, noise=2.0, off=True)
+    estimate = estimate_gap(window, Axis.preset("stepper-stage"))
+    assert estimate.ok, estimate.reasons
+    assert estimate.interval[0] <= gap <= estimate.interval[1]
 
 
 def test_the_best_fit_in_noise_is_one_of_many_gaps() -> None:

@@ -115,9 +115,18 @@ def whitened_rows(
 
 
 def descend(
-    problem: FitProblem, start: Array, noise: Autoregression, free: Flags, steps: int, rate: float = 0.0
+    problem: FitProblem,
+    start: Array,
+    noise: Autoregression,
+    free: Flags,
+    steps: int,
+    rate: float = 0.0,
+    least_gain: float = 0.0,
 ) -> Fit:
-    """Levenberg-Marquardt from a start; only `free` (u,) unknowns move."""
+    """Levenberg-Marquardt from a start; only `free` (u,) unknowns move.
+
+    It ends where a step promises less than a share `least_gain` of the cost, or a small one of the noise's variance.
+    """
     most, usual = problem.limits(), problem.sizes()
     least = np.where([unknown.positive for unknown in problem.model.unknowns], 0.0, -most)
     values, damping = np.clip(start, least, most), 1e-3
@@ -138,7 +147,7 @@ def descend(
             ahead = np.clip(values + step, least, most)
             ahead[HALF] = abs(ahead[HALF])
             move = (ahead - values) @ rows
-            if -float(move @ (2.0 * residual + move)) <= _GAIN * cost / residual.size:
+            if -float(move @ (2.0 * residual + move)) <= max(_GAIN / residual.size, least_gain) * cost:
                 return Fit(values, residual, rows, cost, raw, count)
             white = noise.whiten(problem.misfit(ahead, rate)[None])[0]
             prior = problem.model.root @ ahead

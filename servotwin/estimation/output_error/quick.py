@@ -15,8 +15,9 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.output_error.estimator import problem_of
-from servotwin.estimation.output_error.fit import Fit, FitProblem, Search, descend, noise_in
+from servotwin.estimation.output_error.fit import Fit, Search, descend, noise_in
 from servotwin.estimation.output_error.models import HALF, Flags
+from servotwin.estimation.output_error.search import SearchProblem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.verdict import rounded
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -32,11 +33,10 @@ _ROUNDED = 1.0 / 3.0  # of a count: what rounding leaves is no less
 _LAST_STEP = 0.3  # standard deviations: largest last step of a gap that has converged
 
 
-class QuickProblem(FitProblem, Protocol):
-    """A window and a model of it, with starts (u,) at a half gap, and beside the unknowns (u,) of another window."""
+class QuickProblem(SearchProblem, Protocol):
+    """A window and a model of it, with starts (u,) at a half gap."""
 
     def places(self, half: float) -> list[Array]: ...
-    def beside(self, values: Array) -> list[Array]: ...
 
 
 class SpreadParts(NamedTuple):

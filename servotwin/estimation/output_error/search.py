@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 
@@ -19,12 +20,21 @@ from servotwin.estimation.output_error.fit import (
 from servotwin.estimation.output_error.models import HALF, OFFSET
 from servotwin.plant.signals import Array
 
-_STEPS, _KEPT = (10, 10, 20), (6, 3, 2)  # in white noise at each rate of the observer, and minima that are kept
-_LOW = (0.3, 0.3, 0.1)  # the white noise, of what the best minimum before has left
+_GENTLY = 0.7  # of a rate of the observer: the next one, at least
+_STEPS, _LAST_STEPS = 10, 20  # in white noise, at each rate
+_ROUGH = 1e-3  # of the cost: what a step in white noise must promise
+_FIRST, _KEPT = 6, 3  # minima that are followed from the first rate on, and from the second
+_LOW = 0.1  # the white noise, of what the best minimum before has left
 _ROUNDED_STEPS, _LEARNT_STEPS, _PASSES = 20, 20, 3
 _SAME = 0.02  # of a gap: minima that are one
 _NEIGHBOURS, _NEAR = 16, (0.01, 0.5)  # places beside the best minimum that are tried, and how far of the half gap
-_LEFT, _LEFT_COUNTS, _WHITE = 0.001, 0.5, 1.2  # of half the gap, a count, white noise: what a good fit leaves
+_LEFT, _LEFT_COUNTS, _WHITE = 0.001, 0.33, 1.2  # of half the gap, a count, white noise: what a good fit leaves
+
+
+class SearchProblem(FitProblem, Protocol):
+    """A window and a model of it, with starts beside the unknowns (u,) of another fit: another first state."""
+
+    def beside(self, values: Array) -> list[Array]: ...
 
 
 def starts(problem: FitProblem, gap: float) -> list[Array]:
@@ -43,7 +53,7 @@ def starts(problem: FitProblem, gap: float) -> list[Array]:
     return [values for _, values in sorted(best, key=lambda pair: pair[0])]
 
 
-def search(problem: FitProblem, gap: float) -> Search:
+def search(problem: SearchProblem, gap: float) -> Search:
     """Fit a window: `gap` as in `starts`.
 
     Minima are compared by all that they leave. Noise that was learnt at a wrong minimum makes what that leaves look
@@ -82,25 +92,44 @@ def distinct(fits: list[Fit]) -> list[Fit]:
     return chosen
 
 
-def _white(problem: FitProblem, left: float, share: float) -> Autoregression:
-    """White noise that is a share of what a fit has left, a sum of squares."""
+def _white(problem: FitProblem, left: float) -> Autoregression:
+    """White noise that is a small share of what a fit has left, a sum of squares."""
     rms = math.sqrt(left / problem.position.size)
-    return Autoregression.white(max(share * rms, 1e-9 * problem.range) if math.isfinite(rms) else problem.range)
+    return Autoregression.white(max(_LOW * rms, 1e-9 * problem.range) if math.isfinite(rms) else problem.range)
 
 
-def _in_white_noise(problem: FitProblem, tried: list[Array]) -> list[Fit]:
-    """Minima from starts in white noise, under an observer that slows down; the one that leaves least first."""
+def _in_white_noise(problem: SearchProblem, tried: list[Array]) -> list[Fit]:
+    """Minima from starts in white noise, under an observer that slows down; the one that leaves least first.
+
+    The slower the observer, the more the load's motion after many contacts tells, and the rougher is the cost.
+    """
     left = plain_cost(problem, tried[0], problem.model.speed)
-    fits: list[Fit] = []
-    for share, low, steps, kept in zip((1.0, *problem.model.slowing), _LOW, _STEPS, _KEPT, strict=True):
-        noise, rate = _white(problem, left, low), share * problem.model.speed
-        fits = [descend(problem, values, noise, problem.free, steps, rate) for values in tried]
-        fits = distinct(sorted(fits, key=_left))[:kept]
+    fits, rates = list[Fit](), _rates(problem)
+    for i, rate in enumerate(rates):
+        noise, steps = _white(problem, left), _LAST_STEPS if i + 1 == len(rates) else _STEPS
+        tried = [_nearest(problem, values, rate) for values in tried]
+        fits = [descend(problem, values, noise, problem.free, steps, rate, _ROUGH) for values in tried]
+        fits = distinct(sorted(fits, key=_left))[: _KEPT if i else _FIRST]
         tried, left = [fit.values for fit in fits], _left(fits[0])
     return fits
 
 
-def _beside(problem: FitProblem, best: Fit) -> Fit:
+def _rates(problem: FitProblem) -> list[float]:
+    """Of the observer as it slows down, 1/s, the last one twice if it does not."""
+    last = problem.model.slowing[-1]
+    count = max(1, math.ceil(math.log(last) / math.log(_GENTLY)))
+    return [problem.model.speed * last ** (i / count) for i in range(count + 1)]
+
+
+def _nearest(problem: SearchProblem, values: Array, rate: float) -> Array:
+    """Unknowns (u,), with a first state by the window's begin where that leaves less.
+
+    A fast observer forgets the first state, and its fit leaves it anywhere: a slower one would begin far off.
+    """
+    return min((values, *problem.beside(values)), key=lambda each: plain_cost(problem, each, rate))
+
+
+def _beside(problem: SearchProblem, best: Fit) -> Fit:
     """The best of a minimum and of some beside it.
 
     Every contact that comes earlier or later makes minima of its own: where a fit leaves more than rounding, gaps and
@@ -111,11 +140,12 @@ def _beside(problem: FitProblem, best: Fit) -> Fit:
         if _explains(problem, best):
             break
         far = math.exp(random.uniform(math.log(_NEAR[0]), math.log(_NEAR[1])))
-        values, noise = best.values.copy(), _white(problem, _left(best), _LOW[-1])
+        values, noise = best.values.copy(), _white(problem, _left(best))
         values[HALF] *= math.exp(far * random.normal())
         values[OFFSET] += far * values[HALF] * random.normal()
         for share in problem.model.slowing:
-            fit = descend(problem, values, noise, problem.free, _LEARNT_STEPS, share * problem.model.speed)
+            rate = share * problem.model.speed
+            fit = descend(problem, _nearest(problem, values, rate), noise, problem.free, _LEARNT_STEPS, rate, _ROUGH)
             values = fit.values
         best = min(best, fit, key=_left)
     return best
