@@ -116,13 +116,31 @@ def _relaxing(servo: PlantNumbers, basis: Basis) -> Array:
     q_1."""
     chain = servo.chain()
     states, half = basis.chain_states(chain), chain.A.shape[-1] // 2
-    rate = np.zeros((*np.shape(servo.p)[:-1], len(basis.names)))
-    rate[..., states.start + half] = np.squeeze(1.0 / np.asarray(servo.p), -1) if np.ndim(servo.p) else 1.0 / servo.p
+    rate = _at_screw(servo, basis, states.start + half)
     if not np.any(chain.reaction_velocity):
         return rate
     twist = scaled_row(servo.p, basis.row("theta_d"))
     twist[..., states.start] -= 1.0
     return np.asarray(rate - chain.reaction_position / chain.reaction_velocity / servo.p * twist)
+
+
+def _load_side(servo: PlantNumbers, basis: Basis) -> Array:
+    """Row of a screw's load-side end in the gap, rad.
+
+    Without a damper a free shaft's end is at q_1. Its state follows at the same speed, and comes off it by rounding:
+    a contact by that state would begin with a pull, which ends it, without end.
+    """
+    chain = servo.chain()
+    if servo.backlash_kind is not BacklashKind.FREE or np.any(chain.reaction_velocity):
+        return basis.row("theta_d")
+    return _at_screw(servo, basis, basis.chain_states(chain).start)
+
+
+def _at_screw(servo: PlantNumbers, basis: Basis, place: int) -> Array:
+    """Row of a state of the load as the screw sees it: over the ratio."""
+    row = np.zeros((*np.shape(servo.p)[:-1], len(basis.names)))
+    row[..., place] = np.squeeze(1.0 / np.asarray(servo.p))
+    return row
 
 
 def scaled_row(factor: float | Array, row: Array) -> Array:
@@ -159,7 +177,7 @@ def contact_guards(
     """
     side = contact.side
     if side == 0:
-        apart = basis.row("theta_m") - basis.row("theta_d")
+        apart = basis.row("theta_m") - _load_side(servo, basis)
         return [
             GuardRow(s * apart - 0.5 * basis.row("gap"), "+" if s > 0 else "-", resets[s], "contact", s)
             for s in (1, -1)
