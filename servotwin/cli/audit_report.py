@@ -240,7 +240,8 @@ def _sent_update(update: JsonObject, units: Units) -> str:
     if gains:
         parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {units.of_command(gains['feedforward'])}"] if gains.get("feedforward") else []
-        friction = gains.get("friction_feedforward")
+        moving, friction = gains.get("velocity_feedforward"), gains.get("friction_feedforward")
+        parts += [f"velocity feedforward {moving:.4g} {units.command} s/{units.position.si}"] if moving else []
         parts += [f"friction feedforward {units.of_command(friction)}"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     law = setting.get("law") or {}

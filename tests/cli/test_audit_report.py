@@ -19,7 +19,8 @@ SERVO = {
     "waiting": 1,
     "last_message": 0.0,
 }
-UPDATE = {"tolerance": 61.25e-6, "controller": {"Kp": 1377.7, "Ki": 0.0, "Kd": -135.1, "Tf": 0.1, "feedforward": -0.02},
+UPDATE = {"tolerance": 61.25e-6, "controller": {"Kp": 1377.7, "Ki": 0.0, "Kd": -135.1, "Tf": 0.1, "feedforward": -0.02,
+                                                 "velocity_feedforward": 94.248},
           "proof": {"members": 256}}  # fmt: skip
 
 
@@ -87,7 +88,8 @@ def test_a_version_from_its_window_to_its_effect() -> None:
     lines = chain(first, link(2, after, found("redesign", "what was verified is in force already")))
     assert lines[0] == "boot b1"
     assert [line[HEAD.index("what followed") :] for line in lines[1:]] == [
-        "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, verified on 256 "
+        "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, "
+        "velocity feedforward 94.25 V s/m, verified on 256 "
         "simulated machines",
         "version 3 applied at sample 5000",
         "version 3 in window 2: error 12.3 -> 5.0 um",
@@ -205,7 +207,7 @@ def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
     assert "error, mdeg" in lines[4]
     text = "\n".join(lines)
     assert "dead zone 3.509 mdeg" in text
-    assert "feedforward -0.02 N m" in text
+    assert "feedforward -0.02 N m, velocity feedforward 94.25 N m s/rad" in text
     assert "error 11.5 -> 5.7 mdeg" in text
     assert ", 9 N m where 8 N m are allowed" in text
     window = next(line for line in lines if "version 3 sent" in line)
