@@ -64,7 +64,7 @@ class FittedModel(Protocol):
     """Model of a window: its unknowns, of which the first is the half gap at the load, and its observer's rate, 1/s.
 
     `root` (u, u) times the unknowns has unit covariance by what is known of them beforehand, and 0 where nothing is.
-    `slowing`: rates of the observer in the second fits and in the last ones, over the first.
+    `slowing`: a slower rate of the observer and that of the last fits, over the first.
     """
 
     @property
