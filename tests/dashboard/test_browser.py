@@ -174,6 +174,18 @@ def test_an_engineer_tests_the_webhook_and_an_operator_is_not_offered_it(open_pa
     has_text(page, ".head [role=status]", "hook.example took the test (status 204)")
 
 
+def test_the_first_live_data_move_nothing(open_page, twin):
+    page = open_page()
+    open_machine(page, WEARING)
+    has_text(page, "[aria-label=Live] p", "The edge is not connected")  # no test before has streamed
+    plots = page.locator("[aria-label=Live] .u-over")
+    plots.first.wait_for()
+    before = [each.bounding_box() for each in plots.all()]
+    stream_live(twin, page)
+    page.wait_for_timeout(300)  # drawn in a later frame than the word
+    assert [each.bounding_box() for each in plots.all()] == before
+
+
 def test_pages_are_accessible_and_fit_every_width(open_page, twin):
     PICTURES.mkdir(parents=True, exist_ok=True)
     machine, fleet, login = open_page(), open_page(), open_page(login="")

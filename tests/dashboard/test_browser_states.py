@@ -98,6 +98,30 @@ def test_a_malformed_event_keeps_the_last_good_data(open_page):
     page.wait_for_selector("[data-live=live]", state="attached")
 
 
+SILENT_STREAM = """delete globalThis.SharedWorker;
+globalThis.EventSource = class extends EventTarget {
+    constructor() { super(); globalThis.stream = this; }
+    close() {}
+}"""
+"""A stream of events that says only what a test lets it say."""
+
+
+def test_trouble_is_said_when_the_twin_reports_it(open_page):
+    page = open_page()
+    page.add_init_script(SILENT_STREAM)
+    page.reload()
+    page.wait_for_selector(".rows .row")
+    for name, data, words in (
+        ("trouble", '"The store is read-only."', "The store is read-only. What is shown is of"),
+        ("rows", "{broken", "A message of the twin cannot be read. What is shown is of"),
+    ):
+        page.evaluate("([name, data]) => stream.dispatchEvent(new MessageEvent(name, { data }))", [name, data])
+        has_text(page, "#state", words)
+        page.locator(".table.stale").wait_for()
+        page.evaluate("stream.dispatchEvent(new Event('open'))")
+        page.locator(".table:not(.stale)").wait_for()
+
+
 def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):
     page = open_page(expected=("ERR_", "Failed to load"))
     page.evaluate("window.kept = 1")

@@ -77,10 +77,10 @@ export class TimePlot {
       width, height: this.place.clientHeight || 240,
       legend: { show: false },
       cursor: { sync: options.sync ? { key: options.sync } : undefined, drag: { x: true, y: false } },
-      scales: { x: { time: Boolean(options.time) }, y: { range: options.range && ((_, low, high) => options.range(low, high)) } },
+      scales: { x: { time: Boolean(options.time) }, y: { range: (_, low, high) => this.range(low, high) } },
       axes: [
         axis(options.xLabel, options.time ? 46 : 34, { space: (options.time ? 75 : 52) * rem(), values: options.time ? [...TIME_FORMATS] : undefined }),
-        axis(options.yLabel, 58, { space: 30 * rem(), values: (_, ticks) => ticks.map((tick) => (tick === null ? "" : label(tick, ticks))) }),
+        axis(options.yLabel, 58, { space: 30 * rem(), values: (_, ticks) => ticks.map((tick) => (tick === null || this.empty ? "" : label(tick, ticks))) }),
       ],
       series: [{}, ...options.series.map((each) => ({
         label: each.label, stroke: colour(each.color), width: each.width ?? 1.6, dash: each.dash, spanGaps: Boolean(each.spanGaps),
@@ -91,6 +91,13 @@ export class TimePlot {
       hooks: options.marks ? { drawClear: [marks(options.marks)] } : {},
     }, this.data, this.place);
     this.plot.root.setAttribute("aria-hidden", "true");
+  }
+
+  // Without a range uPlot leaves out the axis, and all would move when the first data come.
+  range(low, high) {
+    this.empty = low === null;
+    if (this.empty) return [0, 1];
+    return this.options.range ? this.options.range(low, high) : uPlot.rangeNum(low, high, 0.1, true);
   }
 
   // As dragging does with a mouse: + and - look closer and less close, arrows move, 0 and Escape show all.

@@ -73,7 +73,7 @@ export class Live {
       this.stop();
       this.timer = setTimeout(() => this.start(), Math.random() * SPREAD_MS);
     });
-    source.addEventListener("trouble", (event) => this.set("trouble", read(event) || "The twin reports trouble."));
+    source.addEventListener("trouble", (event) => this.trouble(read(event) || "The twin reports trouble."));
     source.addEventListener("ended", () => this.end("The session has ended, or its token was revoked."));
     source.addEventListener("error", () => this.lost());
     source.addEventListener("unloaded", () => this.retry("The twin cannot be reached."));
@@ -87,7 +87,7 @@ export class Live {
 
   take(event) {
     const rows = read(event);
-    if (!Array.isArray(rows)) return this.set("trouble", "A message of the twin cannot be read.");
+    if (!Array.isArray(rows)) return this.trouble("A message of the twin cannot be read.");
     this.position = event.lastEventId || this.position;
     for (const row of rows) if (row && typeof row.servo === "string") this.rows.set(row.servo, row);
     this.set("live");
@@ -104,6 +104,11 @@ export class Live {
       row.connected = now;
     }
     if (names.length) this.changed(names);
+  }
+
+  trouble(why) {
+    this.set("trouble", why);
+    this.changed([]);
   }
 
   // The browser tries again by itself, unless the twin refused: then the reason is asked for.
