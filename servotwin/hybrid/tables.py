@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array, Automaton, shared_flows
 
 NODES_COARSE = 16
@@ -29,6 +30,8 @@ SPECTRAL_STEP = 2.0
 # A motion that lasts into the coarse search must turn slowly enough for a cubic over 8 steps: of 100 random pairs of
 # undamped oscillators none lost an event at 0.2, 16 at 0.5 and 70 at 1.
 LASTING_STEP = 0.25
+# A slow law on a machine with a fast drive has a thousand steps a sample; with more than this something is not meant.
+MOST_STEPS = 1e5
 
 
 class Tables(NamedTuple):
@@ -137,10 +140,23 @@ def search_step(automaton: Automaton, sample_step: float) -> tuple[float, int]:
 
 
 def divisors(fastest: ArrayLike, fastest_lasting: ArrayLike, sample_step: ArrayLike) -> NDArray[np.int64]:
-    """The number k of search steps a sample, of each automaton."""
+    """The number k of search steps a sample, of each automaton.
+
+    Raises
+    ------
+    InvalidInput
+        A motion that is so much faster than the samples that a run would never end.
+    """
     turns = np.maximum(np.divide(fastest, SPECTRAL_STEP), np.divide(fastest_lasting, LASTING_STEP)) * np.asarray(
         sample_step
     )
+    if np.max(turns, initial=0.0) > MOST_STEPS:
+        shortest = 1.0 / np.max(fastest)
+        raise InvalidInput(
+            f"the fastest motion of the machine has a time constant of {shortest:.3g} s, too short for samples every "
+            f"{np.max(sample_step):.3g} s (at most {MOST_STEPS:.0e} steps each): write 0 for an inductance or a lag "
+            "that follows at once, and check the units of inertias, masses, stiffness and damping"
+        )
     return np.maximum(1, np.ceil(turns - 0.05)).astype(np.int64)
 
 

@@ -343,11 +343,16 @@ class SampledEngine:
         return self.controller.sample_rate
 
 
+def whole_ratio(tick_rate: float, sample_rate: float) -> int | None:
+    """The higher rate over the lower one, if that is a whole number."""
+    ratio = max(tick_rate, sample_rate) / min(tick_rate, sample_rate)
+    return round(ratio) if abs(ratio - round(ratio)) <= 1e-9 * ratio else None
+
+
 def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
     """Base steps per tick and per sample; one of them is 1."""
-    ratio = max(tick_rate, sample_rate) / min(tick_rate, sample_rate)
-    whole = round(ratio)
-    if abs(ratio - whole) > 1e-9 * ratio:
+    whole = whole_ratio(tick_rate, sample_rate)
+    if whole is None:
         raise InvalidInput(
             f"controller sample_rate = {tick_rate} Hz and sample_rate = {sample_rate} Hz: "
             "one must be a whole multiple of the other"

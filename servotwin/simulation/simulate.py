@@ -21,10 +21,11 @@ from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced
 from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.run import Run
-from servotwin.simulation.sampled import SampledEngine
+from servotwin.simulation.sampled import SampledEngine, whole_ratio
 from servotwin.simulation.sampled_law import SampledLawEngine
 
-SAMPLE_RATE = 5000.0
+# Hz, of what is recorded where nothing is said and the controller's rate is a multiple or a divisor of it.
+_RECORDED = 5000.0
 
 
 class Engine(Protocol):
@@ -58,8 +59,9 @@ class Simulation:
         m, half-width of the dead zone; None: no dead zone, and none can be set later. 0 is a dead zone of zero width.
     theta_d0 : float
         rad, start of the screw; clamped into the gap around the motor, which starts at 0. The structure starts at rest.
-    sample_rate : float
-        Hz, of what is recorded.
+    sample_rate : float, optional
+        Hz, of what is recorded. By default 5000 Hz, or the controller's own rate where the two do not divide one
+        another.
     noise : Noise, optional
         On the measured position; a continuous controller sees it constant between samples.
     seed : int
@@ -88,7 +90,7 @@ class Simulation:
         gap: SignalLike = 0.0,
         tolerance: SignalLike | None = None,
         theta_d0: float = 0.0,
-        sample_rate: float = SAMPLE_RATE,
+        sample_rate: float | None = None,
         noise: Noise | None = None,
         seed: int | np.random.Generator = 0,
         input_bias: float = 0.0,
@@ -96,10 +98,11 @@ class Simulation:
         keep: int | None = None,
         delay: int = 0,
     ) -> None:
-        _check_times(duration, sample_rate)
-        _check_disturbances(input_bias, friction)
         self.servo = servo
         self.controller: Law = law_of(servo.controller if controller is None else controller)
+        sample_rate = _recorded(self.controller.sample_rate) if sample_rate is None else sample_rate
+        _check_times(duration, sample_rate)
+        _check_disturbances(input_bias, friction)
         check_encoders(servo, self.controller)
         self.samples = round(duration * sample_rate) + 1
         self.inputs = RunInputs(
@@ -253,6 +256,10 @@ class Simulation:
         return Run(self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events)
 
 
+def _recorded(rate: float | None) -> float:
+    return _RECORDED if rate is None or whole_ratio(rate, _RECORDED) else rate
+
+
 def simulate(
     servo: Plant,
     duration: float,
@@ -262,7 +269,7 @@ def simulate(
     gap: SignalLike = 0.0,
     tolerance: SignalLike | None = None,
     theta_d0: float = 0.0,
-    sample_rate: float = SAMPLE_RATE,
+    sample_rate: float | None = None,
     noise: Noise | None = None,
     seed: int | np.random.Generator = 0,
     input_bias: float = 0.0,
@@ -285,8 +292,9 @@ def simulate(
         Half-width of the dead zone, m; None: no dead zone.
     theta_d0 : float
         Angle of the screw at the start, rad, clamped into the gap around the motor, which starts at 0.
-    sample_rate : float
-        Hz, of the samples that are returned.
+    sample_rate : float, optional
+        Hz, of the samples that are returned. By default 5000 Hz, or the controller's own rate where the two do not
+        divide one another.
     noise : Noise, optional
         Noise on the measured position.
     seed : int or numpy.random.Generator

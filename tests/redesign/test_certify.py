@@ -18,6 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified import certify as certify_module
 from servotwin.redesign.certified.assess import assess, costs_to_and_fro, joined, nearness, stillness
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
@@ -210,6 +211,25 @@ def test_a_decision_is_the_same_whenever_it_is_made() -> None:
     )
     assert first == second
     assert first.seconds == 1.0
+
+
+def test_of_laws_that_cost_alike_the_one_without_velocity_feedforward_is_chosen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def chosen(alike: float, usual: tuple[float, float] | None) -> Design:
+        monkeypatch.setattr(certify_module, "_ALIKE", alike)
+        found = certify(SERVO, Uncertainty(gap=gaps(9, 10), usual_step=usual), SMALL, SHORT)
+        assert isinstance(found, Certificate)
+        assert found.settled >= SMALL.settled
+        return found.setting
+
+    observed = (0.9e-3, 1.1e-3)
+    fed, plain, unseen = chosen(1.0, observed), chosen(10.0, observed), chosen(10.0, None)
+    without = fed.controller.replace(velocity_feedforward=0.0, velocity_time=OWN.velocity_time)
+    assert fed.controller != without
+    assert plain == Design(without)
+    # The costs of a machine that was not observed are too uncertain for that.
+    assert unseen.controller.velocity_feedforward > 0.0
 
 
 def test_no_candidate_is_one_sentence() -> None:

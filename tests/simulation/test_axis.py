@@ -274,3 +274,20 @@ def test_a_shaft_without_damping_closes_its_gap_without_a_pull() -> None:
     drawn = random_axis("dc motor", 9191, 24)
     assert drawn.plant.transmission.c_d == 0.0
     assert np.all(np.isfinite(step_window(drawn, 2).position))
+
+
+def test_without_a_rate_every_preset_is_recorded_at_one_that_its_controller_allows() -> None:
+    rates = {name: simulate(Axis.preset(name), 0.01).sample_rate for name in PRESETS}
+    assert rates["two-mass-drive"] == 2000.0
+    assert rates["micro-positioner"] == 5000.0
+    for rate in (400.0, 500.0, 12500.0, 20000.0):
+        run = simulate(PAPER.replace(controller=PAPER.controller.replace(sample_rate=rate)), 0.1)
+        assert run.sample_rate == (12500.0 if rate == 12500.0 else 400.0 if rate == 400.0 else 5000.0)
+
+
+@pytest.mark.parametrize("part", [DcMotor(J=1e-7, R=10.0, k_T=0.01, k_B=0.01, L=1e-11), TorqueDrive(J=1e-7, lag=1e-12)])
+@pytest.mark.parametrize("rate", [None, 5000.0])
+def test_a_motion_that_is_far_too_fast_for_the_samples_is_refused(part: DcMotor | TorqueDrive, rate: float) -> None:
+    axis = TWO_MASS.replace(actuator=part, controller=SOFT.replace(sample_rate=rate))
+    with pytest.raises(InvalidInput, match=r"a time constant of 1e-12 s, too short for samples every 0\.0002 s"):
+        simulate(axis, 0.01, reference=0.1)
