@@ -182,6 +182,8 @@ def test_everything_that_is_given_counts(folder: Path, monkeypatch: pytest.Monke
 def test_where_nothing_is_verified_the_reason_is_said_every_time(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fallback, "certify", lambda *_: NotVerified("none of 39 candidates is verified"))
     for _ in range(2):
-        with pytest.raises(InvalidInput, match="no fallback set for the servo's stated range: none of 39"):
+        with pytest.raises(InvalidInput, match=r"range: none of 39 .* state them \(gap_deg and step_mm\)$"):
             fallback_certificate(SERVO.replace(k=8e3), Uncertainty(), Demands(), Trial())
+    with pytest.raises(InvalidInput, match=r"state them \(gap_deg and step_deg\)$"):
+        fallback_certificate(Axis.preset("robot-joint"), Uncertainty(), Demands(), Trial())
     assert not folder.exists()

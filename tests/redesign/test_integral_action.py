@@ -13,12 +13,13 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
+from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import candidates_of, is_disturbed
 from servotwin.redesign.certified.margins import integral_shares, nominal_margins
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
 from servotwin.redesign.design import Design
 from servotwin.simulation import simulate
 
@@ -38,8 +39,7 @@ def with_law(servo: Axis, **changes: float) -> Axis:
         (Axis.preset("telescope"), (0.0, 0.1, 0.3, 1.0)),
         # Half the crossover: the paper's loop cycles in every gap with all of it.
         (Servo.preset("paper"), DEMANDS.integral),
-        # Nothing holds this load in its gap.
-        (Axis.preset("robot-joint"), DEMANDS.integral),
+        (Axis.preset("robot-joint"), (0.0, 0.1, 0.3, 1.0)),
         (Axis.preset("stepper-stage"), (1.0,)),
     ],
 )
@@ -99,6 +99,23 @@ def test_long_runs_are_for_an_integral_against_friction_only() -> None:
     free = Question(paper, known, DEMANDS, trial_for(paper, known, DEMANDS), 0.0)
     integral = Design(paper.controller.replace(Ki=0.01 * paper.controller.Ki), 0.0)
     assert Attempt(free, integral)._long is None
+
+
+@pytest.mark.slow
+def test_a_zone_lets_an_integral_work_against_friction_on_a_load_that_nothing_holds_in_its_gap() -> None:
+    """Without integral action the motor's friction leaves such a load far off; without a zone the integral hunts."""
+    joint = Axis.preset("robot-joint")
+    gap = 5.25 * np.pi / 180.0 * 5.0
+    known = Uncertainty(gap=(0.99 * gap, 1.01 * gap), step=(0.03, 0.17))
+    machines = draw_independently(joint, known, 60, 7)
+    own, zone = joint.pidf, 0.5 * gap * joint.p
+    gentle = own.replace(Kp=0.6 * own.Kp, Kd=0.6 * own.Kd)
+    stopped = Design(gentle.replace(integral_only=True, leave=2.0), zone)
+    none, hunting = Design(gentle.replace(Ki=0.0)), Design(gentle)
+    found = assess([none, hunting, stopped], machines, trial_for(joint, known, DEMANDS))
+    assert [each.settled.mean() > 0.95 for each in found] == [True, False, True]
+    assert np.percentile(found[2].tail, 95.0) < 0.5 * np.percentile(found[0].tail, 95.0)
+    assert np.percentile(found[2].cost, 95.0) < 0.7 * np.percentile(found[0].cost, 95.0)
 
 
 def test_where_a_candidate_failed_the_next_ones_are_tried_first() -> None:

@@ -23,6 +23,7 @@ import msgspec
 from msgspec import Struct
 
 from servotwin.errors import InvalidInput
+from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.certify import certify
@@ -72,7 +73,11 @@ def fallback_certificate(servo: Plant, uncertainty: Uncertainty, demands: Demand
         result = certify(servo, uncertainty, demands, trial)
         if isinstance(result, NotVerified):
             known = f"stated in [twin.uncertainty] or by default are {in_words(uncertainty, servo)}"
-            raise InvalidInput(f"no fallback set for the servo's stated range: {result.reason}; {known}")
+            keys = f"gap_deg and step_{position_unit(servo).name}"
+            raise InvalidInput(
+                f"no fallback set for the servo's stated range: {result.reason}; {known}; if gaps or steps of this "
+                f"machine are smaller, state them ({keys})"
+            )
         return result
 
     values = {"servo": servo, "uncertainty": uncertainty, "demands": demands, "trial": replace(trial, threads=None)}

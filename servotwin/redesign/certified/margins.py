@@ -30,7 +30,6 @@ from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Demands, LoopMargins
-from servotwin.redesign.certified.rest_in_gap import floats_in_gap
 from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
 
 # Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered
@@ -254,13 +253,9 @@ def integral_shares(servo: Plant, demands: Demands, disturbed: bool = True) -> t
 
 
 def has_slow_integral(servo: Plant) -> bool:
-    """True where a filtered PID's own integral acts well below the crossover, as a textbook has it.
-
-    That on a load that nothing holds in the gap does not count: it pushes the load to and fro there, for long. An
-    integral of the motor's error ends there.
-    """
+    """True where a filtered PID's own integral acts well below the crossover, as a textbook has it."""
     own = servo.controller
-    if not isinstance(own, Controller) or not own.Ki or not own.Kp or (floats_in_gap(servo) and not servo.at_motor):
+    if not isinstance(own, Controller) or not own.Ki or not own.Kp:
         return False
     crossovers = nominal_margins(servo, law_for_margins(own)).gain_crossovers
     return bool(crossovers) and own.Ki / own.Kp <= _SLOW_INTEGRAL * crossovers[-1].omega
