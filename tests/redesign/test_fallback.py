@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from servotwin import Servo
+from servotwin import Axis, Servo
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified import fallback
 from servotwin.redesign.certified.certificate import BeyondResult, Certificate, Demands, LoopMargins, NotVerified
