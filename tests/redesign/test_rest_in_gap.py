@@ -6,14 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks.random_axes import random_axis
 from benchmarks.workloads import knocking_drive
 from servotwin.control.cascade import Cascade
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.assess import assess
+from servotwin.redesign.certified.certificate import Certificate, Demands
+from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.rest_in_gap import coasting_time
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
+from servotwin.redesign.design import Design
 from servotwin.redesign.registry import policy_of
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled
 from servotwin.twin.settings import TwinSettings
@@ -70,3 +74,32 @@ def test_a_load_that_nothing_stops_is_refused_under_any_law() -> None:
     with pytest.raises(InvalidInput, match=r"load.damping_n_m_s_per_rad = 0.*give damping_n_m_s_per_rad or friction"):
         policy_of(bare, TwinSettings(uncertainty=RANGES))
     policy_of(replace(bare, load=replace(bare.load, friction=1.5)), TwinSettings(uncertainty=RANGES))
+
+
+FEW = Demands(machines=40, conditions=4, screened=2, settled=0.9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("block", "seed", "place"), [("velocity", 31, 0), ("dc motor", 31, 2), ("torque", 31, 3), ("velocity", 77, 0)]
+)
+def test_a_dead_zone_leaves_a_motor_alone_that_would_drive_to_and_fro(block: str, seed: int, place: int) -> None:
+    """No other setting is verified on these machines: two of them have loads with hardly any friction, or none."""
+    drawn = random_axis(block, seed, place)
+    axis, steps = drawn.model, (drawn.amplitude, 3.0 * drawn.amplitude)
+    known = Uncertainty(gap=(0.95 * drawn.gap, 1.05 * drawn.gap), step=steps)
+    found = certify(axis, known, FEW)
+    assert isinstance(found, Certificate)
+    assert found.setting.tolerance == axis.tolerance_for(known.gap[1])
+    assert not found.setting.controller.integral_only
+    machines = draw_independently(axis, known, 100, 3)
+    plain = Design(found.setting.controller.replace(enter=1.0, leave=1.0))
+    opened, shut = assess([found.setting, plain], machines, trial_for(axis, known, FEW))
+    assert opened.settled.mean() > 0.95
+    assert shut.settled.mean() < 0.5
+
+
+def test_a_motor_that_is_braked_is_no_reason_to_refuse_its_axis() -> None:
+    braked = replace(DRIVE, actuator=replace(DRIVE.actuator, friction=2.0))
+    policy_of(braked, TwinSettings(uncertainty=RANGES))
+    policy_of(random_axis("dc motor", 31, 1).model, TwinSettings(uncertainty=RANGES))

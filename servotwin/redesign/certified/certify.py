@@ -19,6 +19,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates, only_integrates, static_gain
+from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant, check_gap_in_loop
 from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
@@ -31,7 +32,8 @@ from servotwin.redesign.certified.margins import (
     widened,
     with_margins,
 )
-from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain
+from servotwin.redesign.certified.rest_in_gap import drives_to_and_fro
+from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain, opens_in_zone
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty
 from servotwin.redesign.design import Design
@@ -103,25 +105,39 @@ def certify(
     trial = trial or trial_for(servo, uncertainty, demands)
     disturbed = is_disturbed(servo, uncertainty, demands, feedforward)
     laws = candidates_of(servo, uncertainty, demands, disturbed, noise > 0.0)
-    candidates = [with_feedforward(setting, feedforward) for setting in laws]
-    in_force = None if running is None else with_feedforward(running, feedforward)
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
+    running = None if running is None else with_feedforward(running, feedforward)
     attempts: list[Attempt] = []
+    looked_at = 0
+    for group in (laws, _last_resort(servo, uncertainty, demands, laws)):
+        candidates = [with_feedforward(setting, feedforward) for setting in group]
+        looked_at += len(candidates)
+        found = _first_verified(question, candidates, running, attempts)
+        if found is not None:
+            return replace(found, looked_at=looked_at, seconds=clock() - begin)
+    # Only where all fail do the figures of one count: the rest of its machines are simulated now.
+    furthest = max(attempts or [Attempt(question, with_feedforward(laws[0], feedforward))], key=Attempt.reached)
+    best = replace(furthest.certificate(), looked_at=looked_at, seconds=clock() - begin)
+    return NotVerified(f"none of {looked_at} candidates is verified: the best {question.shortcoming(best)}", best)
+
+
+def _first_verified(
+    question: Question, candidates: list[Design], running: Design | None, attempts: list[Attempt]
+) -> Certificate | None:
+    """The cheapest of the candidates that is verified; `attempts` receives those that are tried."""
+    if not candidates:
+        return None
     screening = Screening(question)
     hard = list[SimulatedMachines]()
-    likely = _likely(question, hard, _ranked_in_stages(question, screening, candidates, in_force))
-    for attempt in _shortlist(screening, likely, has_widest_integral_zone(candidates), demands.attempts):
+    likely = _likely(question, hard, _ranked_in_stages(question, screening, candidates, running))
+    for attempt in _shortlist(screening, likely, has_widest_integral_zone(candidates), question.demands.attempts):
         attempts.append(attempt)
         if not attempt.cannot_pass():
-            tried = replace(attempt.certificate(), looked_at=len(candidates), seconds=clock() - begin)
+            tried = attempt.certificate()
             if not question.shortcoming(tried):
-                plainer = _plainer(question, screening, tried)
-                return replace(plainer, seconds=clock() - begin) if plainer else tried
+                return _plainer(question, screening, tried) or tried
         hard += attempt.missed()
-    # Only where all fail do the figures of one count: the rest of its machines are simulated now.
-    furthest = max(attempts or [Attempt(question, candidates[0])], key=Attempt.reached)
-    best = replace(furthest.certificate(), looked_at=len(candidates), seconds=clock() - begin)
-    return NotVerified(f"none of {len(candidates)} candidates is verified: the best {question.shortcoming(best)}", best)
+    return None
 
 
 def confirm(
@@ -165,7 +181,7 @@ def _plainer(question: Question, screening: Screening, found: Certificate) -> Ce
     costs = screening.expected_costs([found.setting, plain])
     if costs[plain] > _ALIKE * costs[found.setting]:
         return None
-    tried = replace(Attempt(question, plain).certificate(), looked_at=found.looked_at)
+    tried = Attempt(question, plain).certificate()
     return None if question.shortcoming(tried) else tried
 
 
@@ -187,9 +203,9 @@ def _shortlist(
     screening: Screening, likely: Iterator[Attempt], widest: Callable[[Design], bool], attempts: int
 ) -> Iterator[Attempt]:
     """The first candidates, then as many of each kind that settles most surely: those whose integral stops the furthest
-    from the reference, and those without integral action and dead zone."""
-    kinds = (widest, is_plain)
-    yielded = [0, 0]
+    from the reference, those without integral action and dead zone, and those whose dead zone opens the loop."""
+    kinds = (widest, is_plain, opens_in_zone)
+    yielded = [0] * len(kinds)
     for place, attempt in enumerate(likely):
         kind = next((k for k, of_kind in enumerate(kinds) if of_kind(attempt.setting)), None)
         if place < attempts or (kind is not None and yielded[kind] < attempts):
@@ -238,7 +254,8 @@ def candidates_of(
     The friction that acts on every machine is fed forward, all of it or none: more would push.
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
     candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
-    reference that stops the integral only.
+    reference that stops the integral only. A dead zone also leaves a motor alone that would drive to and fro in the gap
+    because nothing holds the load there.
 
     Raises
     ------
@@ -256,12 +273,29 @@ def candidates_of(
     plain += _zones_in_gap(servo, within, zone, demands)
     plain += _stopped_in_gap(servo, plain, zone, demands)
     opens = isinstance(servo.controller, Controller) and not only_integrates(servo.controller)
-    if not (0.0 < zone <= demands.tolerance and noisy and opens):
+    if not (0.0 < zone <= demands.tolerance and opens):
         return plain
     laws = [each.controller for each in plain if not each.tolerance]
-    return plain + [
-        Design(law.replace(enter=enter, leave=leave), zone) for law in laws for enter, leave in demands.hysteresis
-    ]
+    opened = [law.replace(enter=enter, leave=leave) for law in laws for enter, leave in demands.hysteresis if noisy]
+    plain += [Design(law, zone) for law in opened]
+    return plain + (_opened_in_gap(plain, zone) if drives_to_and_fro(servo, uncertainty) else [])
+
+
+def _last_resort(servo: Plant, uncertainty: Uncertainty, demands: Demands, candidates: list[Design]) -> list[Design]:
+    """On a shaft that is free in the gap, where hardly any friction may be enough to hold the load: dead zones, where
+    they are no candidates already."""
+    zone = servo.tolerance_for(uncertainty.gap[1])
+    law = servo.controller
+    opens = isinstance(law, Controller) and not only_integrates(law) and 0.0 < zone <= demands.tolerance
+    if not opens or servo.backlash_kind is not BacklashKind.FREE or drives_to_and_fro(servo, uncertainty):
+        return []
+    return [] if servo.at_motor else _opened_in_gap(candidates, zone)
+
+
+def _opened_in_gap(plain: list[Design], zone: float) -> list[Design]:
+    """Laws without integral action whose dead zone (m) of the lost motion leaves the motor alone in the gap."""
+    laws = [each.controller for each in plain if not each.tolerance and not integrates(each.controller)]
+    return [Design(law.replace(enter=1.0, leave=1.0), zone) for law in laws]
 
 
 @lru_cache(maxsize=16)

@@ -37,6 +37,11 @@ def is_plain(setting: Design) -> bool:
     return not integrates(setting.controller) and not setting.tolerance
 
 
+def opens_in_zone(setting: Design) -> bool:
+    """True where a dead zone opens the whole loop."""
+    return setting.tolerance > 0.0 and not setting.controller.integral_only
+
+
 def has_widest_integral_zone(candidates: Sequence[Design]) -> Callable[[Design], bool]:
     """Predicate of the settings whose integral stops the furthest from the reference: of those with integral action
     they settle most surely."""
