@@ -113,10 +113,10 @@ def _end_last_line(path: Path) -> None:
 
 
 def _batches() -> dict[str, Batch]:
-    from benchmarks import axis_certificates, axis_glances, axis_presets, logs, random_axes
+    from benchmarks import axis_certificates, axis_glances, axis_presets, logs, random_axes, random_settings
     from benchmarks.policies import loops
 
-    single = {each.NAME: each.BATCH for each in (loops, logs, axis_certificates, axis_glances)}
+    single = {each.NAME: each.BATCH for each in (loops, logs, axis_certificates, axis_glances, random_settings)}
     return single | axis_presets.BATCHES | random_axes.BATCHES
 
 

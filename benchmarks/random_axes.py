@@ -40,7 +40,8 @@ from servotwin.simulation import simulate
 from servotwin.twin.settings import TwinSettings
 
 NAME, WINDOWS = "axes-random", "windows-random"
-_BLOCKS = ("torque", "dc motor", "velocity")
+BLOCKS = ("torque", "dc motor", "velocity")
+"""Actuators."""
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1, "motor_friction": 0.4, "load_friction": 0.4}
 _STEPS, _KINDS = 8, ("PD", "PIDF", "P", "PI")
 _LATER, _MOST_SAMPLES = (1, 2, 3), 6000  # steps whose windows are estimated without a twin
@@ -57,7 +58,9 @@ class RandomAxis(NamedTuple):
     gap: float
 
 
-class _Task(NamedTuple):
+class AxisTask(NamedTuple):
+    """What `random_axis` draws from."""
+
     block: str
     seed: int
     place: int
@@ -65,7 +68,7 @@ class _Task(NamedTuple):
 
 def random_axis(block: str, seed: int, place: int) -> RandomAxis:
     """Draw an axis for which there is a controller."""
-    random = np.random.default_rng([seed, _BLOCKS.index(block), place])
+    random = np.random.default_rng([seed, BLOCKS.index(block), place])
     while True:
         try:
             return _drawn(block, random)
@@ -114,7 +117,7 @@ def _motor(block: str, inertia: float, crossover: float, friction: float, log: A
     return DcMotor(inertia, resistance, gain, gain, friction=0.1 * inertia * crossover, coulomb=friction)
 
 
-def measured(task: _Task) -> dict[str, Any]:
+def measured(task: AxisTask) -> dict[str, Any]:
     """Estimates of an axis under its own controller."""
     drawn = random_axis(*task)
     rate = drawn.model.controller.sample_rate
@@ -152,7 +155,7 @@ def step_window(drawn: RandomAxis, step: int) -> Window:
     return Window.from_run(run, begin / rate, round(_LENGTH * half_period * rate) / rate)
 
 
-def measured_windows(task: _Task) -> dict[str, Any]:
+def measured_windows(task: AxisTask) -> dict[str, Any]:
     """Estimates from windows of an axis under its own controller."""
     drawn = random_axis(*task)
     windows = [step_window(drawn, step) for step in _LATER]
@@ -167,9 +170,10 @@ def _judged(drawn: RandomAxis, estimates: Sequence[GapEstimate]) -> dict[str, An
     return {"windows": len(estimates), "estimates": accepted}
 
 
-def _units(blocks: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, _Task]]:
+def axis_tasks(blocks: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, AxisTask]]:
+    """Keys and tasks of so many axes of each block."""
     for place in range(count):
-        yield from ((f"{seed}/{block}/{place}", _Task(block, seed, place)) for block in blocks)
+        yield from ((f"{seed}/{block}/{place}", AxisTask(block, seed, place)) for block in blocks)
 
 
 def _show(found: Mapping[str, Any], console: Console) -> None:
@@ -178,7 +182,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     table.add_column("actuator")
     for heading in ("axes", "refused", "windows", "accepted", "inside", "near", "false"):
         table.add_column(heading, justify="right")
-    for block in _BLOCKS:
+    for block in BLOCKS:
         axes = [numbers for key, numbers in found.items() if key.split("/")[1] == block]
         ran = [each for each in axes if "refused" not in each]
         estimates = [estimate for each in ran for estimate in each["estimates"]]
@@ -195,5 +199,8 @@ def _is_false(estimate: Mapping[str, float]) -> bool:
     return not estimate["near"] and not estimate["inside"]
 
 
-BATCHES = {NAME: Batch(_units, measured, _show, _BLOCKS), WINDOWS: Batch(_units, measured_windows, _show, _BLOCKS)}
+BATCHES = {
+    NAME: Batch(axis_tasks, measured, _show, BLOCKS),
+    WINDOWS: Batch(axis_tasks, measured_windows, _show, BLOCKS),
+}
 """For `benchmarks.batch`."""

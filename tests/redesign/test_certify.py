@@ -342,6 +342,10 @@ def test_a_setting_whose_run_has_no_end_settles_on_no_machine(monkeypatch: pytes
     assert np.array_equal(beside.cost, alone.cost)
     assert not never.settled.any()
     assert np.isinf(never.cost).all()
+    question = Question(SERVO, Uncertainty(gap=gaps(5.0, 10.0)), SMALL, SHORT, 0.0)
+    assert question.cost(endless, never.cost) == np.inf
+    assert question.cost(endless, np.array([1.0] * 18 + [np.inf] * 2)) == np.inf
+    assert question.cost(CALM, np.array([1.0] * 39 + [np.inf])) == 1.0
 
 
 def test_moves_that_have_no_end_cost_more_than_any_other(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -113,7 +113,7 @@ class Question:
 
     def cost(self, setting: Design, costs: Array) -> float:
         """s: 95th percentile of the error's integral per step (s, of each machine), plus the price of the noise."""
-        return float(np.percentile(costs, 95.0)) + self.price(setting)
+        return _percentile_95(costs) + self.price(setting)
 
     def price(self, setting: Design) -> float:
         """s, price of the noise in the voltage."""
@@ -126,6 +126,13 @@ class Question:
         effort = setting.noise_effort(self.noise, (min(begin, 0.1 * end), end))
         authority = own_static_gain(self.servo) * self.uncertainty.step[1]
         return self.demands.effort_weight * self.trial.unit * effort / authority
+
+
+def _percentile_95(values: Array) -> float:
+    """95th percentile, inf where it lies among values without end: numpy's interpolation of these is no number."""
+    with np.errstate(invalid="ignore"):
+        found = float(np.percentile(values, 95.0))
+    return math.inf if math.isnan(found) else found
 
 
 class Attempt:
@@ -202,11 +209,11 @@ class Attempt:
             settled=settled / members.count,
             cost=question.cost(setting, measures.cost),
             tail=float(measures.tail.max()),
-            tail_p95=float(np.percentile(measures.tail, 95.0)),
+            tail_p95=_percentile_95(measures.tail),
             error_rms=float(measures.error_rms.max()),
             effort=float(measures.effort.max()),
             overshoot=float(measures.overshoot.max()),
-            settling=float(np.percentile(measures.settling, 95.0)),
+            settling=_percentile_95(measures.settling),
             settling_worst=float(measures.settling.max()),
             within=float(np.max(arrival_error(setting, question.servo, *ends))),
             Ms=loop.Ms,

@@ -255,7 +255,7 @@ def candidates_of(
     Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
     candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
     reference that stops the integral only. A dead zone also leaves a motor alone that would drive to and fro in the gap
-    because nothing holds the load there.
+    at any gain.
 
     Raises
     ------
@@ -278,16 +278,18 @@ def candidates_of(
     laws = [each.controller for each in plain if not each.tolerance]
     opened = [law.replace(enter=enter, leave=leave) for law in laws for enter, leave in demands.hysteresis if noisy]
     plain += [Design(law, zone) for law in opened]
-    return plain + (_opened_in_gap(plain, zone) if drives_to_and_fro(servo, uncertainty) else [])
+    return plain + (_opened_in_gap(plain, zone) if drives_to_and_fro(servo, uncertainty, demands) else [])
 
 
 def _last_resort(servo: Plant, uncertainty: Uncertainty, demands: Demands, candidates: list[Design]) -> list[Design]:
-    """On a shaft that is free in the gap, where hardly any friction may be enough to hold the load: dead zones, where
-    they are no candidates already."""
+    """On a shaft that is free in the gap: dead zones that leave the motor alone there, where none was a candidate.
+
+    They leave an error of up to the lost motion, which a law that comes to rest without one does not.
+    """
     zone = servo.tolerance_for(uncertainty.gap[1])
     law = servo.controller
     opens = isinstance(law, Controller) and not only_integrates(law) and 0.0 < zone <= demands.tolerance
-    if not opens or servo.backlash_kind is not BacklashKind.FREE or drives_to_and_fro(servo, uncertainty):
+    if not opens or servo.backlash_kind is not BacklashKind.FREE or drives_to_and_fro(servo, uncertainty, demands):
         return []
     return [] if servo.at_motor else _opened_in_gap(candidates, zone)
 

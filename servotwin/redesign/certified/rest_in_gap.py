@@ -56,10 +56,7 @@ def check_rests(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Non
             f"load.{damping} = 0: a load that floats in its gap without damping and friction never comes to rest, and "
             f'no setting is verified; give {damping} or {friction} above 0, or policy = "paper"'
         )
-    law = servo.controller
-    if not drives_to_and_fro(servo, uncertainty):
-        return
-    if isinstance(law, Controller) and not (_can_rest(servo, law, demands) or _is_braked(servo, law)):
+    if drives_to_and_fro(servo, uncertainty, demands) and not _is_braked(servo):
         motor = " or coulomb_friction_n_m of the actuator" if servo.takes_friction else ""
         raise InvalidInput(
             'controller.kind = "filtered_pid": this law reads the load alone and drives the motor to and fro in the '
@@ -70,10 +67,13 @@ def check_rests(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> Non
         )
 
 
-def drives_to_and_fro(servo: Plant, uncertainty: Uncertainty) -> bool:
-    """True where neither load nor motor has friction that stops it in the gap, so that a law drives them on and on."""
-    free = isinstance(servo, Axis) and floats_in_gap(servo) and not servo.at_motor
-    return free and not (servo.motor_friction > 0.0 or uncertainty.friction[0] > 0.0)
+def drives_to_and_fro(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> bool:
+    """True where a filtered PID drives the motor to and fro in the gap at any gain, and no friction stops it."""
+    law = servo.controller
+    if not isinstance(servo, Axis) or not isinstance(law, Controller) or not floats_in_gap(servo) or servo.at_motor:
+        return False
+    stopped = servo.motor_friction > 0.0 or uncertainty.friction[0] > 0.0
+    return not stopped and not _can_rest(servo, law, demands)
 
 
 def floats_in_gap(axis: Plant) -> bool:
@@ -92,8 +92,8 @@ def _can_rest(axis: Axis, own: Controller, demands: Demands) -> bool:
     return any(soft.closed_loop(law).poles().real.max() < 0.0 for law in laws)
 
 
-def _is_braked(axis: Axis, own: Controller) -> bool:
+def _is_braked(axis: Axis) -> bool:
     """True where drive and bearing stop a motor without command soon, seen by the loop."""
     alone = np.linalg.eigvals(np.asarray(axis.actuator.matrices().A)[:-1, :-1]).real.max()
-    crossovers = nominal_margins(axis, law_for_margins(own)).gain_crossovers
+    crossovers = nominal_margins(axis, law_for_margins(axis.pidf)).gain_crossovers
     return bool(crossovers) and -alone * _BRAKED >= crossovers[-1].omega
