@@ -14,6 +14,7 @@ from servotwin.plant.axis import Axis
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.certificate import Certificate, Demands
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.rest_in_gap import coasting_time
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
@@ -101,5 +102,5 @@ def test_a_dead_zone_leaves_a_motor_alone_that_would_drive_to_and_fro(block: str
 
 def test_a_motor_that_is_braked_is_no_reason_to_refuse_its_axis() -> None:
     braked = replace(DRIVE, actuator=replace(DRIVE.actuator, friction=2.0))
-    policy_of(braked, TwinSettings(uncertainty=RANGES))
-    policy_of(random_axis("dc motor", 31, 1).model, TwinSettings(uncertainty=RANGES))
+    for axis in (braked, random_axis("dc motor", 31, 1).model):
+        assert isinstance(policy_of(axis, TwinSettings(uncertainty=RANGES)), CertifiedPolicy)
