@@ -134,10 +134,11 @@ def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):
     page.locator(".table:not(.stale)").wait_for()
 
 
-def test_a_twin_that_goes_before_the_shared_stream_is_loaded_is_said_at_once(open_page):
+@pytest.mark.parametrize("loaded", ["/nothing.js", "/static/uPlot.iife.min.js"])
+def test_a_shared_stream_that_is_not_loaded_or_says_nothing_is_noticed(open_page, loaded):
     page = open_page(expected=("status of 404",))
     page.add_init_script(
-        "const W = SharedWorker; globalThis.SharedWorker = function () { return new W('/nothing.js'); };"
+        f"const W = SharedWorker; globalThis.SharedWorker = function () {{ return new W('{loaded}'); }};"
     )
     page.reload()
     has_text(page, "#state", "The twin cannot be reached. What is shown is of")

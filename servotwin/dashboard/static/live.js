@@ -5,6 +5,7 @@ import * as api from "./api.js";
 const SILENT_MS = 40000; // the twin sends a sign of life every 15 s
 const RETRY_MS = [1000, 2000, 4000, 8000, 15000];
 const HERE_MS = 20000; // between two signs of life to the worker that holds the stream for all tabs
+const JOIN_MS = 10000; // within which that worker answers a page that joins
 const SPREAD_MS = 10000; // within which all pages read the fleet anew, where very much changed at once
 
 export class Live {
@@ -162,10 +163,13 @@ class SharedSource extends EventTarget {
     super();
     this.readyState = EventSource.CONNECTING;
     const worker = new SharedWorker("/static/stream_worker.js");
-    // Of a worker that could not be loaded nothing else is heard.
-    worker.onerror = () => this.port.onmessage && this.dispatchEvent(new Event("unloaded"));
+    const unloaded = () => this.port.onmessage && this.dispatchEvent(new Event("unloaded"));
+    worker.onerror = unloaded;
+    // Of a worker that could not be loaded nothing else is heard, and now and then not even that.
+    this.joining = setTimeout(unloaded, JOIN_MS);
     this.port = worker.port;
     this.port.onmessage = ({ data: { type, data, lastEventId, readyState } }) => {
+      clearTimeout(this.joining);
       this.readyState = readyState;
       this.dispatchEvent(Object.assign(new Event(type), { data, lastEventId }));
     };
@@ -175,6 +179,7 @@ class SharedSource extends EventTarget {
 
   close() {
     clearInterval(this.timer);
+    clearTimeout(this.joining);
     this.port.onmessage = null;
     this.port.postMessage("leave");
     this.port.close();

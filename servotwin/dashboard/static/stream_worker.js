@@ -9,7 +9,9 @@ onconnect = ({ ports: [port] }) => {
   port.onmessage = ({ data }) => {
     if (data === "leave") return leave(port);
     tabs.set(port, Date.now());
-    if (data !== "here") follow(data);
+    if (data === "here") return;
+    follow(data);
+    port.postMessage({ type: "joined", readyState: source.readyState });
   };
 };
 
