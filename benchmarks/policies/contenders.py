@@ -7,7 +7,7 @@ from functools import cache
 
 from benchmarks.policies.trial import Contender
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certify import candidates_of
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy

@@ -26,8 +26,8 @@ from servotwin.estimation.disturbance import holds_position
 from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Setting
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Demands
-from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors

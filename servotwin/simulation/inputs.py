@@ -112,3 +112,9 @@ def recent(pieces: PiecewiseCubic, time: float) -> PiecewiseCubic:
 def raised(pieces: PiecewiseCubic, offset: float) -> PiecewiseCubic:
     """Add a constant to a signal."""
     return PiecewiseCubic(pieces.times, pieces.coeffs + np.array([offset, 0.0, 0.0, 0.0]))
+
+
+def whole_ratio(tick_rate: float, sample_rate: float) -> int | None:
+    """The higher rate over the lower one, if that is a whole number."""
+    ratio = max(tick_rate, sample_rate) / min(tick_rate, sample_rate)
+    return round(ratio) if abs(ratio - round(ratio)) <= 1e-9 * ratio else None

@@ -32,7 +32,7 @@ from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero
-from servotwin.simulation.inputs import RunInputs, quantised
+from servotwin.simulation.inputs import RunInputs, quantised, whole_ratio
 from servotwin.simulation.start import plant_start, set_states, started
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
@@ -341,12 +341,6 @@ class SampledEngine:
         """Ticks per second."""
         assert self.controller.sample_rate is not None
         return self.controller.sample_rate
-
-
-def whole_ratio(tick_rate: float, sample_rate: float) -> int | None:
-    """The higher rate over the lower one, if that is a whole number."""
-    ratio = max(tick_rate, sample_rate) / min(tick_rate, sample_rate)
-    return round(ratio) if abs(ratio - round(ratio)) <= 1e-9 * ratio else None
 
 
 def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:

@@ -17,11 +17,11 @@ from servotwin.plant.noise import Noise
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
-from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced
+from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced, whole_ratio
 from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
 from servotwin.simulation.run import Run
-from servotwin.simulation.sampled import SampledEngine, whole_ratio
+from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.sampled_law import SampledLawEngine
 
 # Hz, of what is recorded where nothing is said and the controller's rate is a multiple or a divisor of it.

@@ -24,8 +24,8 @@ from benchmarks.policies.worn import HALF_PERIOD, RATE, STEPS, worn_machines
 from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Beyond, Demands
-from servotwin.redesign.certified.certify import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design

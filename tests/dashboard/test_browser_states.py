@@ -120,6 +120,7 @@ def test_trouble_is_said_when_the_twin_reports_it(open_page):
         page.locator(".table.stale").wait_for()
         page.evaluate("stream.dispatchEvent(new Event('open'))")
         page.locator(".table:not(.stale)").wait_for()
+        assert page.locator(".rows .row").count() > 10
 
 
 def test_a_twin_that_goes_and_comes_back_needs_no_reload(open_page, twin):

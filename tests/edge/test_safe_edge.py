@@ -18,7 +18,7 @@ from servotwin.messages import Cause, Gains, Reason
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.certify import candidates_of
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import draw as members_of
 from servotwin.simulation import Simulation

@@ -15,8 +15,9 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.messages import Setting
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import _lag
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
-from servotwin.redesign.certified.certify import candidates_of, certify
+from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.fallback import CertificateFile, _decoder, _encoder
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import Trial

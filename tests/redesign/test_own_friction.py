@@ -13,8 +13,9 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import arrival_error, assess, nearness
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Beyond, Demands
-from servotwin.redesign.certified.certify import candidates_of, confirm
+from servotwin.redesign.certified.certify import confirm
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently, extreme_plants

@@ -14,8 +14,9 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import screening as module
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Demands
-from servotwin.redesign.certified.certify import _shortlist, candidates_of
+from servotwin.redesign.certified.certify import _shortlist
 from servotwin.redesign.certified.screening import Screening, exceeds_error_limit, has_widest_integral_zone, is_plain
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw

@@ -24,8 +24,9 @@ from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
 from servotwin.redesign.certified.attempt import share_at_least
+from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
-from servotwin.redesign.certified.certify import candidates_of, certify, confirm
+from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.margins import loop_margins, widened
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import Trial, trial_for

@@ -11,28 +11,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
 from itertools import islice
 from time import perf_counter
 
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
-from servotwin.control.retuning import integrates, only_integrates, static_gain
-from servotwin.plant.basis import BacklashKind
+from servotwin.control.retuning import integrates
 from servotwin.plant.plants import Plant, check_gap_in_loop
-from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
+from servotwin.redesign.certified.candidates import candidates_of, last_resort
 from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
 from servotwin.redesign.certified.margins import (
     has_slow_integral,
-    integral_shares,
-    laws_within,
     own_static_gain,
-    widened,
-    with_margins,
 )
-from servotwin.redesign.certified.rest_in_gap import drives_to_and_fro
 from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain, opens_in_zone
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty
@@ -41,16 +34,8 @@ from servotwin.redesign.design import Design
 _Gains = tuple[float, ...]
 # Gains with which integral action is tried: the best so many without it.
 _GAINS_WITH_INTEGRAL = 3
-# Time constant of a velocity feedforward's filter, in units of 1 / crossover of a motor that Kp alone moves.
-_VELOCITY_TIME = 0.5
 # Candidates that fail at little expense before all count as attempts.
 _LEFT_OUT = 64
-# Tolerances at which an integral that stops within the lost motion begins again.
-_LEAVES = 2.0
-# Zones that stop the integral of a filtered PID, in lost motions, and where it begins again.
-_GAP_ZONES = ((0.5, 2.0), (1.0, 1.0))
-# Of the error that may be left in the end: where the integral of such a zone begins again, at most.
-_WITHIN = 0.95
 # Candidates that are compared on a machine that was observed.
 _MOVED = 12
 # The same where each law with integral action has six zones.
@@ -109,7 +94,7 @@ def certify(
     running = None if running is None else with_feedforward(running, feedforward)
     attempts: list[Attempt] = []
     looked_at = 0
-    for group in (laws, _last_resort(servo, uncertainty, demands, laws)):
+    for group in (laws, last_resort(servo, uncertainty, demands, laws)):
         candidates = [with_feedforward(setting, feedforward) for setting in group]
         looked_at += len(candidates)
         found = _first_verified(question, candidates, running, attempts)
@@ -244,132 +229,6 @@ def _for_disturbance(demands: Demands, disturbed: bool) -> Demands:
     In the simulation the bias sets in together with the step, so the overshoot that it adds means nothing.
     """
     return replace(demands, overshoot=math.inf) if disturbed else demands
-
-
-def candidates_of(
-    servo: Plant, uncertainty: Uncertainty, demands: Demands, disturbed: bool, noisy: bool
-) -> list[Design]:
-    """Every combination of scales, shapes, feedforwards, integral action and dead zone within the bounds on Ms.
-
-    The friction that acts on every machine is fed forward, all of it or none: more would push.
-    Integral action is for friction and for an unknown input bias, a dead zone keeps noise out of the voltage: they are
-    candidates only where there is friction or bias, or noise. Integral action comes with and without a zone about the
-    reference that stops the integral only. A dead zone also leaves a motor alone that would drive to and fro in the gap
-    at any gain.
-
-    Raises
-    ------
-    InvalidInput
-        No scaled controller is within the bounds on Ms.
-    """
-    integral = integral_shares(servo, demands, disturbed)
-    within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
-    plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
-    fed = [each.controller for each in plain if not each.tolerance]
-    friction = uncertainty.friction[0] + uncertainty.own_friction_of(servo)[0]
-    plain += [Design(law) for law in _with_friction(servo, fed, friction, demands)]
-    # The lost motion is no part of an error of the motor.
-    zone = 0.0 if servo.at_motor else servo.tolerance_for(uncertainty.gap[1])
-    plain += _zones_in_gap(servo, within, zone, demands)
-    plain += _stopped_in_gap(servo, plain, zone, demands)
-    opens = isinstance(servo.controller, Controller) and not only_integrates(servo.controller)
-    if not (0.0 < zone <= demands.tolerance and opens):
-        return plain
-    laws = [each.controller for each in plain if not each.tolerance]
-    opened = [law.replace(enter=enter, leave=leave) for law in laws for enter, leave in demands.hysteresis if noisy]
-    plain += [Design(law, zone) for law in opened]
-    return plain + (_opened_in_gap(plain, zone) if drives_to_and_fro(servo, uncertainty, demands) else [])
-
-
-def _last_resort(servo: Plant, uncertainty: Uncertainty, demands: Demands, candidates: list[Design]) -> list[Design]:
-    """On a shaft that is free in the gap: dead zones that leave the motor alone there, where none was a candidate.
-
-    They leave an error of up to the lost motion, which a law that comes to rest without one does not.
-    """
-    zone = servo.tolerance_for(uncertainty.gap[1])
-    law = servo.controller
-    opens = isinstance(law, Controller) and not only_integrates(law) and 0.0 < zone <= demands.tolerance
-    if not opens or servo.backlash_kind is not BacklashKind.FREE or drives_to_and_fro(servo, uncertainty, demands):
-        return []
-    return [] if servo.at_motor else _opened_in_gap(candidates, zone)
-
-
-def _opened_in_gap(plain: list[Design], zone: float) -> list[Design]:
-    """Laws without integral action whose dead zone (m) of the lost motion leaves the motor alone in the gap."""
-    laws = [each.controller for each in plain if not each.tolerance and not integrates(each.controller)]
-    return [Design(law.replace(enter=1.0, leave=1.0), zone) for law in laws]
-
-
-@lru_cache(maxsize=16)
-def _without_zone(servo: Plant, within: tuple[AnyController, ...], demands: Demands, step: float) -> tuple[Design, ...]:
-    """Candidates without a dead zone that stops the whole law, the same for every gap, for a smallest step (m)."""
-    laws = [fed for law in within for fed in _with_velocity(servo, law, demands)]
-    stopped = [each for law in laws if integrates(law) for each in _stopped(servo, law, step, demands)]
-    return (*(Design(law) for law in laws), *stopped)
-
-
-def _with_velocity(servo: Plant, law: AnyController, demands: Demands) -> list[AnyController]:
-    """A law as it is, and a filtered PID with velocity feedforwards; others keep their own."""
-    if not isinstance(law, Controller):
-        return [law]
-    needed, own = servo.command_per_speed / servo.p, abs(servo.pidf.Kp)
-    shares = demands.velocity if demands.velocity_feedforward and own > 0.0 and needed > 0.0 else ()
-    time = _VELOCITY_TIME * needed / own if shares else law.velocity_time
-    return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
-
-
-def _with_friction(servo: Plant, laws: list[AnyController], friction: float, demands: Demands) -> list[AnyController]:
-    """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
-    every reversal what it holds against it."""
-    fed = min(float(servo.command_of(friction)), demands.friction_limit)
-    if not demands.friction_feedforward or not fed:
-        return []
-    fed = math.copysign(fed, static_gain(servo.controller))
-    pids = [law for law in laws if isinstance(law, Controller) and not law.Ki]
-    return [law.replace(friction_feedforward=fed) for law in pids]
-
-
-def _stopped(servo: Plant, law: AnyController, step: float, demands: Demands) -> list[Design]:
-    """A law with dead zones that stop its integral only, for a smallest step (m)."""
-    counts = COUNTS * servo.position_resolution
-    zones = [(share * step + counts, leave) for share, leave in demands.stops]
-    return [
-        Design(law.replace(integral_only=True, enter=1.0, leave=leave), tolerance)
-        for tolerance, leave in zones
-        if tolerance <= demands.tolerance
-    ]
-
-
-def _zones_in_gap(servo: Plant, laws: tuple[AnyController, ...], zone: float, demands: Demands) -> list[Design]:
-    """Laws other than the filtered PID with a dead zone over the lost motion (m), noise or not.
-
-    It stops the integral, which would wind up there, or opens the loop: a velocity loop in the motor holds the motor in
-    the middle of a gap only where the position loop asks for nothing.
-    """
-    if isinstance(servo.controller, Controller) or not 0.0 < zone <= demands.tolerance:
-        return []
-    stopped = [law.replace(integral_only=True, enter=1.0, leave=_LEAVES) for law in laws if integrates(law)]
-    opening = [law.replace(integral_only=False) for law in laws]
-    opened = [law.replace(enter=enter, leave=leave) for law in opening for enter, leave in demands.hysteresis]
-    return [Design(law, zone) for law in (*stopped, *opened)]
-
-
-def _stopped_in_gap(servo: Plant, plain: list[Design], zone: float, demands: Demands) -> list[Design]:
-    """Filtered PIDs whose integral may act as a whole, with zones about the lost motion (m) that stop it.
-
-    Within the lost motion the integral pushes the motor from flank to flank and does not move the load.
-    """
-    if not isinstance(servo.controller, Controller) or not has_slow_integral(servo):
-        return []
-    laws = [each.controller for each in plain if integrates(each.controller) and not each.tolerance]
-    # A zone that is wider than the error that may be left in the end would be in vain.
-    sizes = [(min(share * zone, _WITHIN * demands.tail / leave), leave) for share, leave in _GAP_ZONES]
-    zones = [(tolerance, leave) for tolerance, leave in sizes if 0.0 < tolerance <= demands.tolerance]
-    return [
-        Design(law.replace(integral_only=True, enter=1.0, leave=leave), tolerance)
-        for law in laws
-        for tolerance, leave in zones
-    ]
 
 
 def _gains(law: AnyController) -> _Gains:
