@@ -28,7 +28,7 @@ from servotwin.link.simulated import LinkSettings
 from servotwin.messages import Gains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.actuator import ACTUATORS
-from servotwin.plant.axis_file import LOADS, SENSOR_KEYS, TRANSMISSIONS, controller_keys, sensor_key
+from servotwin.plant.axis_file import LOADS, TRANSMISSIONS, units_of
 from servotwin.plant.linear_law_file import linear_law
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
@@ -80,8 +80,7 @@ _DRIVES = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in SUPERVISED
 
 def _controller_of(unit: str, motion: str, kind: Maker = Controller) -> TableSpec:
     """Keys of a controller in the units of an axis."""
-    names = {name: shown for shown, name in controller_keys(unit, motion, kind).items()}
-    return TableSpec((kind,), names=names)
+    return TableSpec((kind,), units=units_of(unit, motion))
 
 
 def _kinds(words: str, makers: Mapping[str, Maker]) -> TableSpec:
@@ -103,10 +102,7 @@ def _axis(controller: TableSpec, sensors: TableSpec) -> TableSpec:
 
 _SENSORS = TableSpec(
     help="Encoders; ideal where the table is absent.",
-    kinds={
-        f"load {motion}": TableSpec((Sensors,), names={name: sensor_key(name, motion) for name in SENSOR_KEYS})
-        for motion in LOADS
-    },
+    kinds={f"load {motion}": TableSpec((Sensors,), units=units_of("V", motion)) for motion in LOADS},
 )
 _SENSORS_SHOWN = TableSpec(
     (Sensors,),

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from servotwin.config.keys import Form, Item, Maker, items_of
+from servotwin.config.own_units import OwnUnits
 from servotwin.config.units import unit_of
 
 _Schema = dict[str, Any]
@@ -36,8 +37,8 @@ class TableSpec:
         Name of the inner tables, where the table holds any number of them.
     text : bool
         True: the table holds any keys, with texts as values.
-    names : mapping of str to str
-        Other names of some keys.
+    units : OwnUnits, optional
+        Units in which its keys are named; None: as they are declared.
     """
 
     makers: tuple[Maker, ...] = ()
@@ -48,7 +49,7 @@ class TableSpec:
     partial: bool = False
     repeated: str = ""
     text: bool = False
-    names: Mapping[str, str] = field(default_factory=dict)
+    units: OwnUnits | None = None
 
     def items(self) -> tuple[Item, ...]:
         """The attributes with a key in this table or in an inner one."""
@@ -56,9 +57,7 @@ class TableSpec:
         return tuple(self._named(item) for item in items if self.only is None or item.name in self.only)
 
     def _named(self, item: Item) -> Item:
-        if not self.names:
-            return item
-        return replace(item, key=replace(item.key, names=tuple(self.names.get(name, name) for name in item.names)))
+        return item if self.units is None else replace(item, key=replace(item.key, names=self.units.keys(item.names)))
 
 
 def markdown(title: str, spec: TableSpec) -> str:

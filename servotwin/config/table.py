@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from servotwin.config.own_units import OwnUnits
+from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
 _Default = TypeVar("_Default")
@@ -84,37 +86,39 @@ class Table:
         The parsed table.
     name : str
         Dotted path of the table inside its file; empty at the top.
-    shown : mapping
-        Names that the file has for some keys.
+    units : OwnUnits, optional
+        Units in which the file counts commands and positions, this table's and those within it; None: keys are named
+        as they are declared.
     """
 
     source: str
     values: Mapping[str, object]
     name: str = ""
-    shown: Mapping[str, str] = field(default_factory=dict)
+    units: OwnUnits | None = None
     _known: set[str] = field(default_factory=set)
 
-    def renamed(self, names: Mapping[str, str]) -> Table:
-        """The same table with other names for some of its keys.
+    def in_units(self, units: OwnUnits | None) -> Table:
+        """The same table, whose keys are named in other units; what one of the two has read the other has too."""
+        return Table(self.source, self.values, self.name, units, self._known)
 
-        Parameters
-        ----------
-        names : mapping
-            Names by the names that the file has for them; messages show those of the file.
+    def names(self, declared: Sequence[str]) -> tuple[str, ...]:
+        """Names that the file may have for the keys that set one attribute.
 
         Raises
         ------
         InvalidInput
-            The file gives a key by a name that `names` replaces.
+            The file names one of them in a unit that is not the machine's.
         """
-        shown = {name: given for given, name in names.items()}
-        for given in self.values:
-            if given in shown and given not in names:
+        if self.units is None:
+            return tuple(declared)
+        own = self.units.keys(declared)
+        for name in declared:
+            if name in self.values and name not in own:
                 raise InvalidInput(
-                    f"{self.source}: unknown key '{self.path(given)}'; here its name is '{self.path(shown[given])}'"
+                    f"{self.source}: unknown key '{self.path(name)}': this machine counts it in "
+                    f"{unit_of(own[0]).si}; here its name is '{self.path(own[0])}'"
                 )
-        values = {names.get(given, given): value for given, value in self.values.items()}
-        return Table(self.source, values, self.name, shown)
+        return own
 
     def number(
         self,
@@ -208,7 +212,7 @@ class Table:
             raise self.invalid(key, f"a table [{self.path(key)}]")
         if required and key not in self.values:
             raise self.missing(key, table=True)
-        return Table(self.source, value, self.path(key))
+        return Table(self.source, value, self.path(key), self.units)
 
     def tables(self, key: str) -> list[Table]:
         """The array of tables [[key]]; empty where it is absent."""
@@ -216,7 +220,7 @@ class Table:
         value = self.values.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.invalid(key, f"an array of tables [[{self.path(key)}]]")
-        return [Table(self.source, item, f"{self.path(key)}[{i}]") for i, item in enumerate(value)]
+        return [Table(self.source, item, f"{self.path(key)}[{i}]", self.units) for i, item in enumerate(value)]
 
     def known(self, *keys: str) -> None:
         """Allow keys in this table, whether they are read or not."""
@@ -226,16 +230,14 @@ class Table:
         """Refuse keys that were neither read nor declared known; raises InvalidInput."""
         for key in self.values:
             if key not in self._known:
-                known = [self.shown.get(name, name) for name in self._known]
-                allowed = _listed(sorted(known)) or "no key at all"
-                hint = did_you_mean(key, known)
+                allowed = _listed(sorted(self._known)) or "no key at all"
+                hint = did_you_mean(key, self._known)
                 where = f"table [{self.name}]" if self.name else "the top level"
                 raise InvalidInput(f"{self.source}: unknown key '{self.path(key)}'{hint}; {where} allows {allowed}")
 
     def path(self, key: str) -> str:
         """The key's dotted path inside its file."""
-        shown = self.shown.get(key, key)
-        return f"{self.name}.{shown}" if self.name else shown
+        return f"{self.name}.{key}" if self.name else key
 
     def missing(self, key: str, table: bool = False) -> InvalidInput:
         """The error for a key or a table that must be there; to be raised by the caller."""

@@ -61,11 +61,12 @@ def _read_items(table: Table, items: list[Item], folder: Path, base: Any, comple
         here = [item for item in items if item.key.table == name]
         required = complete and any(item.required for item in here)
         inner = table.table(name, required=required) if name else table
-        inner.known(*(key for item in here if item.key.prefix is None for key in (*item.names, *_switch(item))))
+        plain = [item for item in here if item.key.prefix is None]
+        inner.known(*(key for item in plain for key in (*inner.names(item.names), *_switch(item))))
         for item in here:
             _read_item(inner, item, folder, getattr(base, item.name, None), values)
             if complete and item.required and item.name not in values:
-                raise inner.missing(item.names[0], table=item.form is Form.TABLE)
+                raise inner.missing(inner.names(item.names)[0], table=item.form is Form.TABLE)
         if name:
             inner.done()
     return values
@@ -104,7 +105,7 @@ def _read_item(table: Table, item: Item, folder: Path, base: object, values: Val
     if item.key.switch and not table.boolean(item.key.switch, True):
         values[item.name] = None
         return
-    for name in item.names:
+    for name in table.names(item.names):
         if name in table.values and table.values[name] != []:
             values[item.name] = _value(table, item, name, folder, base)
 
@@ -113,10 +114,11 @@ def _prefixed(table: Table, item: Item, start: Any) -> Any:
     """Settings whose keys begin with a prefix, in the same table."""
     prefix, given = item.key.prefix or "", Values()
     for each in items_of(item.type):
-        table.known(*(prefix + name for name in each.names))
-        for name in each.names:
-            if prefix + name in table.values:
-                given[each.name] = _value(table, each, prefix + name, Path(), None)
+        names = table.names([prefix + name for name in each.names])
+        table.known(*names)
+        for name in names:
+            if name in table.values:
+                given[each.name] = _value(table, each, name, Path(), None)
     with named(table):
         return item.type(**given) if start is MISSING else dataclasses.replace(start, **given)
 

@@ -65,10 +65,15 @@ _SUFFIXES = {**_SCALED, **{suffix: Unit(name, name) for suffix, name in _PLAIN.i
 
 
 @cache
+def suffix_of(name: str) -> str:
+    """The end of a key's name that says its unit; empty for a key without."""
+    fitting = (suffix for suffix in _SUFFIXES if name == suffix == "megabytes" or name.endswith(f"_{suffix}"))
+    return max(fitting, key=len, default="")
+
+
 def unit_of(name: str) -> Unit:
     """The unit that the end of a key's name says; none for a key without."""
-    fitting = (suffix for suffix in _SUFFIXES if name == suffix == "megabytes" or name.endswith(f"_{suffix}"))
-    return _SUFFIXES.get(max(fitting, key=len, default=""), Unit("", ""))
+    return _SUFFIXES.get(suffix_of(name), Unit("", ""))
 
 
 _POSITIONS = ("m", "rad", "mm", "deg")

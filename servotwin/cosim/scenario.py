@@ -17,14 +17,14 @@ from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_
 from servotwin.config.toml import attribute, read
 from servotwin.control.gains import with_gains
 from servotwin.control.laws import AnyController
-from servotwin.cosim.scenario_file import GAPS, OWN_UNITS, REFERENCES, gap_maker, read_parts
+from servotwin.cosim.scenario_file import GAPS, REFERENCES, gap_maker, read_parts
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings, derive_seed
 from servotwin.messages import NAME_PATTERN
 from servotwin.plant.noise import Noise
-from servotwin.plant.own_units import INPUT_BIAS_KEYS, check_own_units
+from servotwin.plant.own_units import INPUT_BIAS_KEYS, own_units
 from servotwin.plant.plants import PLANT_KEY, Plant
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
@@ -149,7 +149,7 @@ class Scenario:
         """Read a scenario from a parsed table; a servo's path in it is relative to `folder`."""
         with named(table):
             servo: Plant = attribute(table, cls, "servo", folder)
-            check_own_units(table, servo, {**OWN_UNITS, "disturbances": (cls,)})
+            table = table.in_units(own_units(servo))
             scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))
             table.done()
             scenario.servo.check_loop(scenario.law)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,11 +22,9 @@ from servotwin.edge.settings_file import read_supervision
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltyRules
-from servotwin.plant.noise import Noise
-from servotwin.plant.own_units import own_controller
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.twin.settings import TWIN_UNITS, TwinSettings, read_twin_settings
+from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
     name_of(each) for each in (Controller, Recording, ProbeLimits, NoveltyRules, LinkSettings, TwinSettings)
@@ -81,14 +79,6 @@ REFERENCES: Mapping[str, Maker] = {
     "square": square_wave, "step": step, "s-curve": s_curve, "samples": samples, "constant": constant,
 }  # fmt: skip
 
-OWN_UNITS: Mapping[str, Sequence[Maker]] = {
-    "reference": tuple(REFERENCES.values()),
-    "noise": (Noise,),
-    "edge.probe": (ProbeLimits,),
-    **{f"{TWIN}.{path}": makers for path, makers in TWIN_UNITS.items()},
-}
-"""Tables whose keys are in the units of the servo."""
-
 
 def constant_gap(
     total: Annotated[float, key("total_deg", minimum=0.0, maximum=_TURN, help="Total gap.")],
@@ -125,7 +115,7 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    inner = own_controller(table, CONTROLLER, servo)
+    inner = table.table(CONTROLLER)
     with named(inner):
         controller = _changed(inner, servo.controller)
     inner.done()

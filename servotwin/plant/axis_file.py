@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Annotated, NamedTuple
 
 from servotwin.config.keys import Maker, items_of, key
+from servotwin.config.own_units import OwnUnits
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
-from servotwin.config.units import unit_of
 from servotwin.control.controller import Controller
 from servotwin.control.laws import CONTROLLERS, FILTERED_PID, LINEAR_LAW, AnyController
 from servotwin.control.laws import kind_of as kind_of_law
@@ -22,8 +22,6 @@ from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.transmission import FREE, HELD, Transmission
 
-# Commands by their unit: the end of a key, and the word for its limit.
-_COMMANDS = {"V": ("v", "voltage"), "N m": ("n_m", "torque"), "rad/s": ("rad_per_s", "speed"), "rad": ("rad", "angle")}
 _IN_GAP = key(
     choices=(HELD, FREE),
     help="The driven end inside the gap: held where it is by its own friction, or free to follow the load.",
@@ -177,7 +175,7 @@ def read_parts(table: Table, folder: Path) -> Parts:
             )
     load: Load = read_kind(tables["load"], LOADS, Path())
     law = _read_controller(tables["controller"], folder, actuator.unit, motion, transmission.p)
-    encoders = table.table("sensors").renamed({sensor_key(name, motion): name for name in SENSOR_KEYS})
+    encoders = table.table("sensors").in_units(units_of(actuator.unit, motion))
     sensors: Sensors = read(encoders, Sensors)
     encoders.done()
     table.done()
@@ -187,35 +185,18 @@ def read_parts(table: Table, folder: Path) -> Parts:
 def _read_controller(table: Table, folder: Path, unit: str, motion: str, ratio: float) -> AnyController:
     """Read the controller in the units of its axis; the ratio is the transmission's where it is not given."""
     kind = kind_of(table, LAWS, FILTERED_PID)
-    controller = table.renamed(controller_keys(unit, motion, LAWS[kind]))
+    units = units_of(unit, motion)
+    controller = table.in_units(units)
     controller.known("kind")
-    own = {"ratio": ratio} if kind != FILTERED_PID and "travel_m_per_rad" not in controller.values else {}
+    own = {"ratio": ratio} if kind != FILTERED_PID and units.key("travel_m_per_rad") not in controller.values else {}
     law: AnyController = read(controller, LAWS[kind], folder, **own)
     controller.done()
     return law
 
 
-def controller_keys(unit: str, motion: str, described: Maker = Controller) -> Mapping[str, str]:
-    """Keys of the controller's table in the units of an axis, and those of a voltage and a position in metres.
-
-    Parameters
-    ----------
-    unit : str
-        Unit of the actuator's command.
-    motion : str
-        Of the load.
-    described : class or function
-        Declares the controller's keys.
-    """
-    command, word = _COMMANDS[unit]
-    position = "m" if motion == LINEAR else "rad"
-    names = {}
-    for name in _keys_with_units(described):
-        suffix = _suffix(name)
-        renamed = {"v": command, "m": position}
-        units = "_".join(renamed.get(each, each) for each in suffix.split("_"))
-        names[name.removesuffix(suffix).replace("voltage", word) + units] = name
-    return names
+def units_of(command: str, motion: str) -> OwnUnits:
+    """Units of an axis, from that of its actuator's command and the motion of its load."""
+    return OwnUnits(command, "m" if motion == LINEAR else "rad")
 
 
 def file_values(controller: AnyController, unit: str, motion: str, only: Collection[str] | None = None) -> Values:
@@ -223,8 +204,7 @@ def file_values(controller: AnyController, unit: str, motion: str, only: Collect
     maker: Maker = linear_law if isinstance(controller, LinearLaw) else type(controller)
     if only is None and isinstance(controller, LinearLaw):
         only = [item.name for item in items_of(linear_law) if item.name != "system"]
-    shown = {name: key for key, name in controller_keys(unit, motion, maker).items()}
-    return {shown.get(name, name): value for name, value in values_of(controller, maker, only).items()}
+    return units_of(unit, motion).named(values_of(controller, maker, only))
 
 
 def described_law(controller: AnyController, unit: str, motion: str) -> str:
@@ -234,20 +214,6 @@ def described_law(controller: AnyController, unit: str, motion: str) -> str:
     names = [item.name for item in items_of(type(controller)) if getattr(controller, item.name) != item.default]
     values = file_values(controller, unit, motion, names)
     return f"{kind_of_law(controller)} ({', '.join(f'{key} = {value!r}' for key, value in values.items())})"
-
-
-def _keys_with_units(described: Maker) -> list[str]:
-    """Keys of a controller whose units contain volts or metres."""
-    names = [item.exact_name for item in items_of(described)]
-    return [name for name in names if {"v", "m"} & set(_suffix(name).split("_"))]
-
-
-def _suffix(name: str) -> str:
-    """The end of a key that is its unit, empty for none."""
-    unit = unit_of(name)
-    words = name.split("_")
-    ends = ("_".join(words[i:]) for i in range(1, len(words)))
-    return next((end for end in ends if unit_of(f"x_{end}") == unit and unit.name), "")
 
 
 def values_of_parts(axis: Parts) -> Values:
@@ -261,18 +227,9 @@ def values_of_parts(axis: Parts) -> Values:
         "actuator": {"kind": actuator, **values_of(axis.actuator)},
         "transmission": {"kind": kind, **_transmission_values(axis.transmission, kind)},
         "load": {"kind": motion, **values_of(axis.load, LOADS[motion])},
-        "sensors": {sensor_key(name, motion): value for name, value in values_of(axis.sensors).items()},
+        "sensors": units_of(axis.actuator.unit, motion).named(values_of(axis.sensors)),
         "controller": controller,
     }
-
-
-SENSOR_KEYS = ("position_resolution_m",)
-"""Keys of the sensors that have other names with a rotary load."""
-
-
-def sensor_key(name: str, motion: str) -> str:
-    """Name of a key of the sensors with a load of a kind."""
-    return "position_resolution_rad" if motion == ROTARY and name == "position_resolution_m" else name
 
 
 def _transmission_values(transmission: Transmission, kind: str) -> Values:

@@ -33,14 +33,14 @@ from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, Setting
-from servotwin.plant.own_units import check_own_units, own_controller
+from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import PLANT_KEY, Plant
 from servotwin.redesign.policy import Policy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.estimating import Estimator, estimator_of
 from servotwin.twin.model import TwinModel
 from servotwin.twin.servo_names import ServoNames
-from servotwin.twin.settings import TWIN_UNITS, TwinSettings, read_twin_settings
+from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 MAX_MODELS = 256
 
@@ -171,11 +171,11 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is not a name of a model: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo: Plant = read(table, servo_table, folder)
-    inner = own_controller(table, "controller", servo)
+    table = table.in_units(own_units(servo))
+    inner = table.table("controller")
     with named(inner):
         law = _changed(inner, servo.controller)
     inner.done()
-    check_own_units(table, servo, {f"twin.{path}": makers for path, makers in TWIN_UNITS.items()})
     settings = read_inner(table, "twin", partial(read_twin_settings, folder=folder, plant=servo))
     servo.check_loop(law)
     own = gains_of(law) == gains_of(servo.controller)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from servotwin.config.keys import Maker, check, key, settings
+from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table
 from servotwin.config.toml import attribute, part, read
 from servotwin.errors import InvalidInput
@@ -286,10 +286,6 @@ class TwinSettings:
     def replace(self, **changes: Any) -> TwinSettings:
         """A copy with some values changed, validated again."""
         return replace(self, **changes)
-
-
-TWIN_UNITS: Mapping[str, Sequence[Maker]] = {"uncertainty": (Uncertainty,), "excitation": (ExcitationSettings,)}
-"""Inner tables of [twin] whose keys are in the units of the servo."""
 
 
 def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None = None) -> TwinSettings:
