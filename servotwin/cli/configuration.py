@@ -10,7 +10,8 @@ from pathlib import Path
 
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.config.keys import Maker
-from servotwin.config.reference import TableSpec, markdown, schema
+from servotwin.config.own_units import COMMANDS, POSITIONS, OwnUnits
+from servotwin.config.reference import TableSpec, in_units, markdown, schema
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.cosim import scenario_file as tables
@@ -42,6 +43,11 @@ HEAD = """# Configuration reference
 Made by `make reference` from the declarations in the code: do not edit. A file may leave out every key that is not
 required. Where a key has two names, a file may give either; the unit is the end of the name. Editors that know TOML
 schemas (Even Better TOML, Taplo) check a file against the schema of its kind in `docs/schemas`.
+
+The files of a scenario, of an edge and of a twin name commands and positions in the units of their machine. Below are
+those of a voltage and of a position in metres. Of an axis that commands a torque `v` is `n_m` and `voltage` `torque`,
+of a speed `rad_per_s` and `speed`, of an angle `rad` and `angle`; of a rotary axis `m` is `rad` and `mm` is `deg`:
+`kp_n_m_per_rad`, `torque_limit_n_m`, `tolerance_deg`. An edge's file says so with `command_unit` and `position_unit`.
 """
 
 
@@ -80,7 +86,7 @@ _DRIVES = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in SUPERVISED
 
 def _controller_of(unit: str, motion: str, kind: Maker = Controller) -> TableSpec:
     """Keys of a controller in the units of an axis."""
-    return TableSpec((kind,), units=units_of(unit, motion))
+    return TableSpec((kind,), units=(units_of(unit, motion),))
 
 
 def _kinds(words: str, makers: Mapping[str, Maker]) -> TableSpec:
@@ -102,7 +108,7 @@ def _axis(controller: TableSpec, sensors: TableSpec) -> TableSpec:
 
 _SENSORS = TableSpec(
     help="Encoders; ideal where the table is absent.",
-    kinds={f"load {motion}": TableSpec((Sensors,), units=units_of("V", motion)) for motion in LOADS},
+    kinds={f"load {motion}": TableSpec((Sensors,), units=(units_of("V", motion),)) for motion in LOADS},
 )
 _SENSORS_SHOWN = TableSpec(
     (Sensors,),
@@ -216,10 +222,18 @@ FILES = {
 """The kinds of files: name of the schema, title, keys."""
 
 
+_ANY = tuple(OwnUnits(command, position) for command in COMMANDS for position in POSITIONS)
+_OWN_UNITS = ("scenario", "edge", "twin")
+"""Files whose keys are named in the units of their machine."""
+
+
 def texts() -> dict[str, str]:
     """The files of the reference, by their path below docs/."""
     pages = [markdown(title, AXIS_SHOWN if name == "axis" else spec) for name, (title, spec) in FILES.items()]
-    schemas = {f"schemas/{name}.json": _json(title, spec) for name, (title, spec) in FILES.items()}
+    specs = {
+        name: (title, in_units(spec, _ANY) if name in _OWN_UNITS else spec) for name, (title, spec) in FILES.items()
+    }
+    schemas = {f"schemas/{name}.json": _json(title, spec) for name, (title, spec) in specs.items()}
     return {"configuration.md": "\n".join([HEAD, *pages]).rstrip() + "\n", **schemas}
 
 

@@ -81,7 +81,7 @@ def enroll(
         Path | None,
         typer.Option(
             help="Enroll a servo for each row, all or none. Columns: name, and optionally edge, role, sample_rate_hz, "
-            "drive, url, noise_um, ca, which default to the options of those names."
+            "drive, url, noise_um or noise_mdeg, ca, which default to the options of those names."
         ),
     ] = None,
     edge: Annotated[Path | None, typer.Option(help="Folder of the edge; by default the servo's name.")] = None,
@@ -109,6 +109,9 @@ def enroll(
     noise_um: Annotated[
         float, typer.Option(min=0.0, help="Rms noise of the measured position that the edge's watch tolerates, um.")
     ] = 0.0,
+    noise_mdeg: Annotated[
+        float, typer.Option(min=0.0, help="The same of a rotary axis, thousandths of a degree.")
+    ] = 0.0,
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the edge checks the twin's.")] = None,
 ) -> None:
     """Enroll a servo: write its token and a folder with everything that its edge needs."""
@@ -118,6 +121,8 @@ def enroll(
 
     if (name is None) == (csv is None) or (csv is not None and (edge or operator or engineer)):
         raise InvalidInput("give a name, or --csv with a file; --edge, --operator and --engineer are for one name")
+    if noise_um and noise_mdeg:
+        raise InvalidInput("give --noise-um, or --noise-mdeg of a rotary axis")
     if operator is not None and engineer is not None:
         raise InvalidInput("give --operator or --engineer: a name has one role")
     if operator is not None or engineer is not None:
@@ -132,7 +137,7 @@ def enroll(
             drive=enrolment.drive_of(drive),
             url=url,
             replace_token=again,
-            noise=noise_um * 1e-6,
+            noise=enrolment.StatedNoise(noise_mdeg, "mdeg") if noise_mdeg else enrolment.StatedNoise(noise_um),
             ca=ca,
         )
         if csv is not None:

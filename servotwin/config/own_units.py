@@ -50,6 +50,10 @@ class OwnUnits:
         return {self.key(name): self.named(v) if isinstance(v, Mapping) else v for name, v in values.items()}
 
 
+VOLTS_METRES = OwnUnits()
+"""Those of a declaration."""
+
+
 @cache
 def _own(units: OwnUnits, name: str) -> str:
     suffix = suffix_of(name)

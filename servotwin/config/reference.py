@@ -37,8 +37,8 @@ class TableSpec:
         Name of the inner tables, where the table holds any number of them.
     text : bool
         True: the table holds any keys, with texts as values.
-    units : OwnUnits, optional
-        Units in which its keys are named; None: as they are declared.
+    units : tuple of OwnUnits
+        Units in which its keys, and those of the tables within it, may be named; empty: as they are declared.
     """
 
     makers: tuple[Maker, ...] = ()
@@ -49,7 +49,7 @@ class TableSpec:
     partial: bool = False
     repeated: str = ""
     text: bool = False
-    units: OwnUnits | None = None
+    units: tuple[OwnUnits, ...] = ()
 
     def items(self) -> tuple[Item, ...]:
         """The attributes with a key in this table or in an inner one."""
@@ -57,7 +57,18 @@ class TableSpec:
         return tuple(self._named(item) for item in items if self.only is None or item.name in self.only)
 
     def _named(self, item: Item) -> Item:
-        return item if self.units is None else replace(item, key=replace(item.key, names=self.units.keys(item.names)))
+        if not self.units:
+            return item
+        names = dict.fromkeys(name for units in self.units for name in units.keys(item.names))
+        return replace(item, key=replace(item.key, names=tuple(names)))
+
+
+def in_units(spec: TableSpec, units: tuple[OwnUnits, ...]) -> TableSpec:
+    """The keys of a table, and of all within it, in other units."""
+    tables, kinds = (
+        {name: in_units(each, units) for name, each in inner.items()} for inner in (spec.tables, spec.kinds)
+    )
+    return replace(spec, tables=tables, kinds=kinds, units=units)
 
 
 def markdown(title: str, spec: TableSpec) -> str:
@@ -79,15 +90,14 @@ def _flat(items: tuple[Item, ...]) -> Iterator[tuple[str, Item, str]]:
             yield item.key.table, item, ""
 
 
-def _inner(item: Item) -> TableSpec:
+def _inner(item: Item, units: tuple[OwnUnits, ...]) -> TableSpec:
     """The table that an attribute is read from."""
     makers = item.makers
     if len(makers) == 1:
-        return TableSpec((next(iter(makers.values())),), item.key.help)
-    if item.key.select is not None:
-        return TableSpec(help=item.key.help, kinds={name: TableSpec((maker,)) for name, maker in makers.items()})
-    tagged = {f'kind = "{name}"': TableSpec((maker,)) for name, maker in makers.items()}
-    return TableSpec(help=item.key.help, kinds=tagged)
+        return TableSpec((next(iter(makers.values())),), item.key.help, units=units)
+    tagged = item.key.select is None
+    kinds = {f'kind = "{name}"' if tagged else name: TableSpec((made,), units=units) for name, made in makers.items()}
+    return TableSpec(help=item.key.help, kinds=kinds)
 
 
 def _sections(path: str, spec: TableSpec) -> list[str]:
@@ -104,7 +114,7 @@ def _sections(path: str, spec: TableSpec) -> list[str]:
         if item.form in (Form.TABLE, Form.TABLES) and item.key.prefix is None:
             below = _join(path, item.key.table)
             inner_path = _join(below, item.names[0])
-            lines += _sections(f"[{inner_path}]" if item.form is Form.TABLES else inner_path, _inner(item))
+            lines += _sections(f"[{inner_path}]" if item.form is Form.TABLES else inner_path, _inner(item, spec.units))
     for key, inner in spec.tables.items():
         lines += _sections(_join(path, key), inner)
     return lines
@@ -181,7 +191,7 @@ def _object(spec: TableSpec) -> _Schema:
     for item in spec.items():
         if item.form not in (Form.TABLE, Form.TABLES) or item.key.prefix is not None:
             continue
-        here, inner = _at(top, item.key.table), _object(_inner(item))
+        here, inner = _at(top, item.key.table), _object(_inner(item, spec.units))
         described = {"description": item.key.help, **inner}
         here["properties"][item.names[0]] = (
             {"type": "array", "items": described} if item.form is Form.TABLES else described

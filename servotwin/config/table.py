@@ -114,9 +114,10 @@ class Table:
         own = self.units.keys(declared)
         for name in declared:
             if name in self.values and name not in own:
+                right = self.units.key(name) if self.units.key(name) in own else own[0]
                 raise InvalidInput(
-                    f"{self.source}: unknown key '{self.path(name)}': this machine counts it in "
-                    f"{unit_of(own[0]).si}; here its name is '{self.path(own[0])}'"
+                    f"{self.source}: unknown key '{self.path(name)}': this machine counts it in {unit_of(right).si}; "
+                    f"here its name is '{self.path(right)}'"
                 )
         return own
 

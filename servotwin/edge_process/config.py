@@ -10,6 +10,7 @@ from typing import Annotated
 from urllib.parse import urlsplit
 
 from servotwin.config.keys import check, key, settings
+from servotwin.config.own_units import COMMANDS, POSITIONS, OwnUnits
 from servotwin.config.table import Table
 from servotwin.control.laws import AnyController
 from servotwin.control.running_law import RunningLaw
@@ -183,6 +184,22 @@ class EdgeConfig:
             help="Real-time priority of the control process (SCHED_FIFO); 0: normal scheduling.",
         ),
     ] = 0
+    command_unit: Annotated[
+        str,
+        key(
+            choices=tuple(COMMANDS),
+            help="Unit of the drive's command, in which the keys of this file count it.",
+            later=True,
+        ),
+    ] = "V"
+    position_unit: Annotated[
+        str,
+        key(
+            choices=tuple(POSITIONS),
+            help="Unit of the position, in which the keys of this file count it; with rad a key may count degrees.",
+            later=True,
+        ),
+    ] = "m"
     folder: Path = field(default=Path(), compare=False)
     source: str = field(default="edge.toml", compare=False)
 
@@ -197,6 +214,11 @@ class EdgeConfig:
             raise InvalidInput(f"controller sample_rate_hz = {self.law_rate!r} Hz: {allowed}")
         if "kind" not in self.drive:
             raise InvalidInput("key 'drive.kind' is missing")
+
+    @property
+    def units(self) -> OwnUnits:
+        """Units of the file's keys, and of the status."""
+        return OwnUnits(self.command_unit, self.position_unit)
 
     @property
     def law_rate(self) -> float | None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from servotwin.config.keys import Maker, key
+from servotwin.config.own_units import VOLTS_METRES, OwnUnits
 from servotwin.config.table import Table, named, read_toml
 from servotwin.config.toml import Values, attribute, dumps, kind_of, part, read, values_of
 from servotwin.control.controller import Controller
@@ -60,6 +61,7 @@ def _check_complete(path: Path) -> None:
 
 def read_config(table: Table) -> EdgeConfig:
     """Read the configuration in a table."""
+    table = table.in_units(_units(table))
     with named(table):
         controller = _controller(table) if "controller" in table.values else None
         drive = dict(table.table("drive", required=True).values)
@@ -70,6 +72,12 @@ def read_config(table: Table) -> EdgeConfig:
     table.known("controller", "own", "start", "novelty")
     table.done()
     return config
+
+
+def _units(table: Table) -> OwnUnits | None:
+    """Units of the keys; None: as they are declared, but a probing move may then be in degrees."""
+    units = OwnUnits(*(attribute(table, EdgeConfig, name) for name in ("command_unit", "position_unit")))
+    return None if units == VOLTS_METRES else units
 
 
 def update_gains_table(
@@ -132,10 +140,11 @@ def edge_toml(config: EdgeConfig) -> str:
     """
     agent = config.agent
     values: Values = {
+        **values_of(config, only=("command_unit", "position_unit")),
         **values_of(agent),
         **values_of(config),
         "update_gains": agent.controller is not None,
-        "drive": dict(config.drive),
+        "drive": {},
         "start": start_values(agent.parameters, agent.controller),
         "supervision": supervision_values(agent.supervision, agent.controller),
     }
@@ -147,4 +156,6 @@ def edge_toml(config: EdgeConfig) -> str:
         values["own"] = written_gains(agent.own, agent.controller)
     if isinstance(agent.window_filter, NoveltySettings):
         values["novelty"] = values_of(agent.window_filter)
-    return f"{_BEGIN}\n{dumps(values)}{_END}\n"
+    # The keys of a drive are its own.
+    shown = config.units.named(values) | {"drive": dict(config.drive)}
+    return f"{_BEGIN}\n{dumps(shown)}{_END}\n"

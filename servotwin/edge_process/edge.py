@@ -11,9 +11,10 @@ from typing import Protocol
 
 import msgspec
 
-from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of
+from servotwin.control.cascade import Cascade
+from servotwin.control.gains import gains_of, written_gains
 from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
 from servotwin.edge.agent import Agent, ScheduledMessage
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.recorder import Recorder
@@ -194,20 +195,22 @@ class EdgeRuntime:
         store = _LinkParameterStore(first, self._outlet)
         agent = Agent(settings, store=store, outlet=self._outlet, recorder=self._recorder)
         self._outlet.send_letter(agent.hello())
-        log("boot", boot=boot, version=agent.parameters.version, tolerance_m=agent.parameters.setting.tolerance)
+        tolerance = {self.config.units.key("tolerance_m"): agent.parameters.setting.tolerance}
+        log("boot", boot=boot, version=agent.parameters.version, **tolerance)
         return agent
 
     def _status(self) -> StatusFrame:
         agent, p = self.agent, self.agent.parameters
+        law, units = agent.controller or self.config.controller, self.config.units
         values: dict[str, Value] = {
             "version": p.version,
-            "tolerance_m": p.setting.tolerance,
+            units.key("tolerance_m"): p.setting.tolerance,
             "gap_rad": p.gap,
             "fallback": p.fallback,
             "windows_cut": agent.windows_cut,
             "longest_tick_s": self.ticks.longest,
             "drive_sample": self.due,
-            **_gains(agent.controller or self.config.controller),
+            **units.named(_gains(law)),
             **self.counts,
         }
         return StatusFrame(agent.settings.boot, agent.samples, values, dict(self._outlet.lost), self.ticks.dumps())
@@ -217,8 +220,10 @@ def _gains(law: AnyController | None) -> dict[str, Value]:
     """Gains of the controller in force, for the status; empty where the drive's own controller is not known."""
     if law is None:
         return {}
-    if not isinstance(law, Controller):
+    if isinstance(law, LinearLaw):
         return {name: float(value) for name, value in msgspec.structs.asdict(gains_of(law)).items()}
+    if isinstance(law, Cascade):
+        return written_gains(gains_of(law), law)
     return {
         "kp_v_per_m": law.Kp,
         "ki_v_per_m_s": law.Ki,

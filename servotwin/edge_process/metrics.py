@@ -54,6 +54,12 @@ _METRICS = (
     _Metric("servotwin_edge_fallback", "gauge", "1: the fallback set is in force.", ("fallback",)),
     _Metric("servotwin_edge_conflict", "gauge", "1: another edge of the servo has taken over.", ("conflict",)),
     _Metric("servotwin_edge_tolerance_metres", "gauge", "Half width of the dead zone in force.", ("tolerance_m",)),
+    _Metric(
+        "servotwin_edge_tolerance_radians",
+        "gauge",
+        "Half width of the dead zone in force, of a rotary axis.",
+        ("tolerance_rad",),
+    ),
 )
 
 

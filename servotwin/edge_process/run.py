@@ -75,7 +75,7 @@ def run(path: str | os.PathLike[str]) -> None:
 
 def _run(config: EdgeConfig, path: Path) -> None:
     drive = _drive_of(config, path)
-    first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent)
+    first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent, config.units)
     # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
     boot = next_boot(config.path(config.files.boots), os.urandom(8))
     outlet = PipeOutlet(config.twin is not None)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from servotwin.config.own_units import VOLTS_METRES, OwnUnits
 from servotwin.control.gains import holds
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
@@ -109,7 +110,7 @@ def stored_parameters(path: Path) -> Parameters | None:
     return None
 
 
-def permitted(stored: Parameters | None, agent: AgentSettings) -> Parameters | None:
+def permitted(stored: Parameters | None, agent: AgentSettings, units: OwnUnits = VOLTS_METRES) -> Parameters | None:
     """Return the parameters of an earlier start where today's limits and law allow an update to them; else None."""
     if stored is None:
         return None
@@ -118,5 +119,6 @@ def permitted(stored: Parameters | None, agent: AgentSettings) -> Parameters | N
     allowed = stored.fallback or (good and agent.limits.allows_tolerance(stored.setting.tolerance))
     if allowed and (agent.controller is None or holds(agent.controller, gains)):
         return stored
-    log("last parameters not allowed any more", version=stored.version, tolerance_m=stored.setting.tolerance)
+    tolerance = {units.key("tolerance_m"): stored.setting.tolerance}
+    log("last parameters not allowed any more", version=stored.version, **tolerance)
     return None

@@ -17,6 +17,7 @@ from servotwin.up.enrolment import (
     CONFIG,
     TOKEN,
     Enrolment,
+    StatedNoise,
     drive_of,
     edge_file_text,
     open_tokens,
@@ -27,7 +28,12 @@ _ALL = 20
 """Bad rows that one message lists."""
 
 
-def _number(column: str, scale: float, unit: str, above: bool) -> Callable[[str], float]:
+def _noise(unit: str) -> Callable[[str], StatedNoise]:
+    parse = _number(f"noise_{unit}", f"{unit} rms", above=False)
+    return lambda text: StatedNoise(parse(text), unit)
+
+
+def _number(column: str, unit: str, above: bool) -> Callable[[str], float]:
     def parse(text: str) -> float:
         try:
             value = float(text)
@@ -36,7 +42,7 @@ def _number(column: str, scale: float, unit: str, above: bool) -> Callable[[str]
         if not (value > 0.0 if above else value >= 0.0) or value == float("inf"):
             allowed = "above 0" if above else "of 0 or more"
             raise InvalidInput(f"{column} = {text!r}: give a number {allowed}, in {unit}")
-        return value * scale
+        return value
 
     return parse
 
@@ -132,10 +138,11 @@ def _columns(folder: Path) -> dict[str, tuple[str, _Column]]:
         "name": ("servo", str),
         "edge": ("folder", lambda text: folder / text),
         "role": ("role", str),
-        "sample_rate_hz": ("sample_rate", _number("sample_rate_hz", 1.0, "Hz", above=True)),
+        "sample_rate_hz": ("sample_rate", _number("sample_rate_hz", "Hz", above=True)),
         "drive": ("drive", lambda text: drive_of(folder / text)),
         "url": ("url", str),
-        "noise_um": ("noise", _number("noise_um", 1e-6, "um rms", above=False)),
+        "noise_um": ("noise", _noise("um")),
+        "noise_mdeg": ("noise", _noise("mdeg")),
         "ca": ("ca", lambda text: folder / text),
     }
 

@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from servotwin.commissioning.edge_settings import Commissioning, Recording
 from servotwin.config.table import did_you_mean, read_toml
@@ -21,6 +21,9 @@ from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN
+from servotwin.plant.display_units import position_unit
+from servotwin.plant.own_units import own_units
+from servotwin.plant.plants import Plant
 from servotwin.runtime.files import make_directory, write_text
 from servotwin.twin_service.auth import PRIVATE, Verifiers, read_tokens, tokens_locked, write_private, write_tokens
 from servotwin.twin_service.config import ServiceConfig
@@ -32,6 +35,36 @@ LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S = 4.0, 0.3
 reverses the screw late."""
 _RATE = 5000.0  # Hz
 SIMULATED: Mapping[str, object] = {"kind": "simulated", "address": "unix:drive.sock"}
+
+
+class StatedNoise(NamedTuple):
+    """Noise on a measured position, rms.
+
+    Attributes
+    ----------
+    value : float
+    unit : str
+        "um", or "mdeg" of a rotary axis.
+    """
+
+    value: float = 0.0
+    unit: str = "um"
+
+    def si_of(self, servo: Plant) -> float:
+        """The noise in the unit that a servo has inside, m or rad.
+
+        Raises
+        ------
+        InvalidInput
+            The servo counts its position in another unit.
+        """
+        own = position_unit(servo).small
+        if self.value and self.unit != own.name:
+            raise InvalidInput(f"noise_{self.unit} = {self.value!r}: this servo's position needs noise_{own.name}")
+        return own.si_of(self.value)
+
+
+NO_NOISE = StatedNoise()
 
 
 @dataclass(frozen=True)
@@ -53,8 +86,8 @@ class Enrolment:
         Address at which the edge reaches the twin; None: that of the twin's file.
     replace_token : bool
         Replace an existing token, which thereby becomes invalid.
-    noise : float
-        Noise on the measured position, m rms; the edge's watch is set to tolerate it.
+    noise : StatedNoise
+        Noise that the edge's watch is set to tolerate.
     ca : Path or None
         Certificates against which the edge checks the twin's. None: the twin's own if it is self-signed, otherwise
         those of the edge's system.
@@ -67,7 +100,7 @@ class Enrolment:
     drive: Mapping[str, object] = field(default_factory=lambda: SIMULATED)
     url: str | None = None
     replace_token: bool = False
-    noise: float = 0.0
+    noise: StatedNoise = NO_NOISE
     ca: Path | None = None
 
 
@@ -181,14 +214,24 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     law = _running_law(own, request, rate)
     servo = model.servo.replace(controller=law)
     servo.check_loop(law)
-    commissioning = Commissioning(servo, law, model.settings, Recording(rate), noise=request.noise)
+    commissioning = Commissioning(servo, law, model.settings, Recording(rate), noise=request.noise.si_of(servo))
     most = twin.service.samples_per_window
     commissioning = commissioning.with_longest(LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S, most)
     commissioning.check_window()
     agent = commissioning.agent_settings(request.servo, UNBOOTED)
     certificate = None if _trusted_certificates(twin, request) is None else CERTIFICATE
     link = TwinLink(request.url or _url_of(twin.service), token_file=TOKEN, ca_file=certificate)
-    return EdgeConfig(agent, request.role, agent.controller or law, request.drive, link, folder=request.folder)
+    units = own_units(servo)
+    return EdgeConfig(
+        agent,
+        request.role,
+        agent.controller or law,
+        request.drive,
+        link,
+        command_unit=units.command,
+        position_unit=units.position,
+        folder=request.folder,
+    )
 
 
 def _running_law(own: AnyController, request: Enrolment, rate: float) -> AnyController:
@@ -199,7 +242,7 @@ def _running_law(own: AnyController, request: Enrolment, rate: float) -> AnyCont
     InvalidInput
         The edge is to tick a law that was made for another rate.
     """
-    if request.role != "control" and (own.sample_rate is not None or request.noise == 0.0):
+    if request.role != "control" and (own.sample_rate is not None or not request.noise.value):
         return own
     if isinstance(own, LinearLaw) and own.discrete and own.sample_rate != rate:
         raise InvalidInput(

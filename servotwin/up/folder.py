@@ -151,7 +151,7 @@ def _fill(path: Path) -> None:
             sample_rate=RATE,
             drive=drive,
             url=_PLACEHOLDER,
-            noise=servo.noise_mm * 1e-3,
+            noise=enrolment.StatedNoise(1e3 * servo.noise_mm),
         )
         enrolment.enroll(path / TWIN, request)
         config = load(folder / EDGE)

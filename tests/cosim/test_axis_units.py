@@ -59,6 +59,8 @@ def test_ranges_that_a_file_does_not_state_are_the_axis_s_own(tmp_path: Path) ->
         ("input_bias_n_m", "input_bias_v", "disturbances.input_bias_v'.* in N m; .*'disturbances.input_bias_n_m'"),
         ('"paper"', '"paper"\n[twin.uncertainty]\nstep_mm = [1.0, 2.0]', "step_mm'.*'twin.uncertainty.step_deg'"),
         ('"paper"', '"paper"\n[controller]\nvoltage_limit_v = 2.0', "here its name is 'controller.torque_limit_n_m'"),
+        ("2000.0", "2000.0\n[recording.limits]\nmaximum_mm = 1.0", "in rad; .*'recording.limits.maximum_deg'"),
+        ('"paper"', '"paper"\n[edge.watch]\neffort_floor_v = 1.0', "in N m; .*'edge.watch.effort_floor_n_m'"),
         ('"two-mass-drive"', '"paper"', "amplitude_deg'.* counts it in m; .*'reference.amplitude_mm'"),
         ('"two-mass-drive"', '"stepper-stage"', "amplitude_deg'.* counts it in m; .*'reference.amplitude_mm'"),
     ],
@@ -66,6 +68,15 @@ def test_ranges_that_a_file_does_not_state_are_the_axis_s_own(tmp_path: Path) ->
 def test_another_unit_is_refused_in_a_sentence(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(InvalidInput, match=words):
         loaded(tmp_path, ROTARY.replace(old, new))
+
+
+def test_limits_and_watch_of_a_rotary_axis_count_in_its_units(tmp_path: Path) -> None:
+    given = "[recording.limits]\nmaximum_deg = 2.0\n[edge.watch]\nerror_floor_deg = 0.5\neffort_floor_n_m = 0.1\n"
+    scenario = loaded(tmp_path, ROTARY + given)
+    assert scenario.recording.limits.maximum == pytest.approx(math.radians(2.0), rel=1e-15)
+    assert scenario.supervision is not None
+    watch = scenario.supervision.watch
+    assert (watch.error_floor, watch.effort_floor) == (pytest.approx(math.radians(0.5), rel=1e-15), 0.1)
 
 
 def test_a_map_of_a_rotary_axis_has_its_steps_in_degrees() -> None:

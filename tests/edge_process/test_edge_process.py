@@ -17,6 +17,7 @@ from running_edge import RATE, RunningEdge, is_complete, sequences
 from stubmachine import StubMachine
 from waiting import until
 
+from servotwin.control.cascade import Cascade
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge_process.config import TwinLink
 from servotwin.edge_process.config_file import edge_toml
@@ -104,6 +105,21 @@ def test_kill_9_of_the_whole_edge_loses_at_most_the_window_being_cut(
     assert edge.signal(signal.SIGTERM) == 0
     assert len({boot.split("-")[0] for boot in sequences(twin)}) == 4
     assert all(map(is_complete, sequences(twin).values()))
+
+
+@pytest.mark.slow
+def test_the_status_counts_in_the_units_of_the_machine(edge: RunningEdge) -> None:
+    law = Cascade(20.0, 0.01, 50.0, 0.1, sample_rate=RATE)
+    edge.write(controller=law, command_unit="N m", position_unit="rad", twin=None)
+    edge.start()
+    until(lambda: edge.status().get("samples", 0) > 0)
+    assert edge.signal(signal.SIGTERM) == 0
+    status = edge.status()
+    assert (status["tolerance_rad"], status["position_gain_per_s"], status["velocity_gain_n_m_s_per_rad"]) == (
+        0.0, 20.0, 50.0,
+    )  # fmt: skip
+    assert not {"tolerance_m", "velocity_gain"} & status.keys()
+    assert '"tolerance_rad":0.0' in edge.log().replace(" ", "")
 
 
 @pytest.mark.slow

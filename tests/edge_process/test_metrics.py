@@ -30,6 +30,12 @@ def test_every_number_of_the_status_is_a_metric() -> None:
     assert 'servotwin_edge_tick_seconds{servo="ax-1",quantile="1"} 0.0012345' in lines
 
 
+def test_the_dead_zone_of_a_rotary_axis_is_a_metric_in_radians() -> None:
+    text = metrics_text({"servo": "ax-1", "tolerance_rad": 2.5e-5})
+    lines = [line for line in text.splitlines() if line[0] != "#"]
+    assert lines == ['servotwin_edge_tolerance_radians{servo="ax-1"} 2.5e-05']
+
+
 def test_an_edge_without_a_twin_or_a_tick_says_only_what_it_knows() -> None:
     text = metrics_text({"servo": 'a"b', "written": 1.0})
     assert [line for line in text.splitlines() if line[0] != "#"] == ['servotwin_edge_written_seconds{servo="a\\"b"} 1']

@@ -1,15 +1,22 @@
 """Enrolling servos with controllers of their own: the edge's file has the one that runs, at its own rate."""
 
+import json
+import math
+import tomllib
 from pathlib import Path
 
+import jsonschema_rs
 import pytest
 
+from servotwin.cli.configuration import texts
+from servotwin.config.table import parse_toml
+from servotwin.config.units import unit_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.edge_process.config import EdgeConfig
-from servotwin.edge_process.config_file import load
+from servotwin.edge_process.config_file import edge_toml, load, read_config
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import AXES, Axis
-from servotwin.up.enrolment import Enrolment, enroll
+from servotwin.up.enrolment import Enrolment, StatedNoise, enroll
 
 TWIN = """
 [service]
@@ -77,3 +84,57 @@ def test_a_law_with_discrete_matrices_runs_at_their_rate(tmp_path: Path, rate: f
     config = enrolled(tmp_path, "own.toml", role=role, sample_rate=rate)
     assert config.controller is not None
     assert config.controller.sample_rate == 1000.0
+
+
+UNITS = {
+    "two-mass-drive": ("N m", "rad"),
+    "ball-screw": ("N m", "m"),
+    "robot-joint": ("N m", "rad"),
+    "stepper-stage": ("rad", "m"),
+    "paper": ("V", "m"),
+}
+
+
+@pytest.mark.parametrize(("name", "units"), UNITS.items())
+def test_the_edge_s_file_counts_in_the_units_of_its_machine(tmp_path: Path, name: str, units: tuple[str, str]) -> None:
+    config = enrolled(tmp_path, name)
+    text = (tmp_path / "edge" / "edge.toml").read_text()
+    assert (config.command_unit, config.position_unit) == units
+    keys = [line.partition(" = ")[0] for line in text.splitlines() if " = " in line]
+    said = {unit_of(key).si for key in keys}
+    assert ("m" in said, "m/s" in said) == (units[1] == "m", units[1] == "m")
+    assert ("V" in said) == (units[0] == "V")
+    assert ("command_unit" in text) == (units != ("V", "m"))
+    schema = json.loads(texts()["schemas/edge.json"])
+    jsonschema_rs.validate(schema, tomllib.loads(text.replace("= inf", "= 1e300")))
+    assert read_config(parse_toml(edge_toml(config), "edge.toml")) == config
+
+
+def test_an_edge_s_file_refuses_a_key_in_another_unit(tmp_path: Path) -> None:
+    enrolled(tmp_path, "robot-joint")
+    file = tmp_path / "edge" / "edge.toml"
+    text = file.read_text()
+    file.write_text(text.replace("maximum_rad = ", "maximum_mm = "))
+    with pytest.raises(
+        InvalidInput, match=r"'limits.maximum_mm': .* counts it in rad; here its name is 'limits.maximum_d"
+    ):
+        load(file)
+    file.write_text(text.replace("maximum_rad = inf", "maximum_deg = 45.0"))
+    assert load(file).agent.limits.maximum == pytest.approx(math.pi / 4.0, abs=0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "noise", "words"),
+    [
+        ("robot-joint", StatedNoise(2.0), r"noise_um = 2.0: this servo's position needs noise_mdeg"),
+        ("ball-screw", StatedNoise(2.0, "mdeg"), r"noise_mdeg = 2.0: this servo's position needs noise_um"),
+        ("robot-joint", StatedNoise(2.0, "mdeg"), ""),
+        ("ball-screw", StatedNoise(2.0), ""),
+    ],
+)
+def test_noise_is_stated_in_the_unit_of_the_position(tmp_path: Path, name: str, noise: StatedNoise, words: str) -> None:
+    if not words:
+        assert enrolled(tmp_path, name, noise=noise).agent.servo == "ax-1"
+        return
+    with pytest.raises(InvalidInput, match=words):
+        enrolled(tmp_path, name, noise=noise)
