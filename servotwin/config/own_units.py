@@ -11,8 +11,8 @@ from servotwin.config.units import suffix_of, unit_of
 
 COMMANDS = {"V": ("v", "voltage"), "N m": ("n_m", "torque"), "rad/s": ("rad_per_s", "speed"), "rad": ("rad", "angle")}
 """Units of a command: the end of a key, and the word for its quantity."""
-POSITIONS = {"m": {"m": "m", "mm": "mm"}, "rad": {"m": "rad", "mm": "deg"}}
-"""Units of a position: ends of keys by those of a position in metres."""
+POSITIONS: Mapping[str, Mapping[str, str]] = {"m": {}, "rad": {"m": "rad", "mm": "deg", "um": "mdeg"}}
+"""Units of a position: ends of keys by those of a position in metres, where they are others."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +61,9 @@ def _own(units: OwnUnits, name: str) -> str:
     if words[0] in _OTHERS:
         return name
     command, quantity = COMMANDS[units.command]
-    shown = POSITIONS[units.position] | {"v": command}
+    shown = {**POSITIONS[units.position], "v": command, "mv": f"m{command}"}
     stem = name.removesuffix(suffix)
-    stem = stem.replace("voltage", quantity) if "v" in words else stem
+    stem = stem.replace("voltage", quantity) if {"v", "mv"} & set(words) else stem
     return stem + "_".join(shown.get(word, word) for word in words)
 
 

@@ -25,6 +25,9 @@ DRIVE = OwnUnits("rad/s", "m")
         (JOINT, "rate_limit_v_per_s", "rate_limit_n_m_per_s"),
         (JOINT, "voltage_limit_v", "torque_limit_n_m"),
         (JOINT, "error_mm", "error_deg"),
+        (JOINT, "least_misfit_um", "least_misfit_mdeg"),
+        (JOINT, "bias_mv", "bias_mn_m"),
+        (DRIVE, "bias_mv", "bias_mrad_per_s"),
         (JOINT, "max_rate_mm_per_s", "max_rate_deg_per_s"),
         (JOINT, "static_gain_m_per_rad", "static_gain_rad_per_rad"),
         (DRIVE, "kd_v_s_per_m", "kd_rad_per_s_s_per_m"),
@@ -54,7 +57,8 @@ def test_a_key_has_the_units_of_its_machine(units: OwnUnits, declared: str, own:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_key_of_a_controller_says_its_unit(command: str, position: str) -> None:
     units = OwnUnits(command, position)
-    names = [units.key(name) for name in ("kp_v_per_m", "ki_v_per_m_s", "kd_v_s_per_m", "x_v", "x_m", "x_v_per_s")]
+    declared = ("kp_v_per_m", "ki_v_per_m_s", "kd_v_s_per_m", "x_v", "x_mv", "x_m", "x_um", "x_v_per_s")
+    names = [units.key(name) for name in declared]
     said = [unit_of(name).name for name in names]
     assert all(said)
     assert "V" not in "".join(said) or command == "V"
