@@ -1,4 +1,4 @@
-"""`servotwin simulate` and `convert`: write the signals of a simulated scenario, or a log in another format."""
+"""`servotwin simulate` and `convert`: run a scenario and write its signals, or a log in another format."""
 
 from __future__ import annotations
 
@@ -9,42 +9,70 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import servotwin as st
+from servotwin.cli.loop_report import summary, window_table
 from servotwin.cosim import Loop
 from servotwin.cosim.scenario import PRESETS, preset_text
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import check_output, read_log, write_log
 from servotwin.logs.recordings import RecordingColumns, read_recording
+from servotwin.runtime import files
+
+_PICTURES = (".png", ".svg")
 
 
-def record(scenario: Path, output: Path, console: Console | None = None) -> Path:
-    """Run a scenario file and write its signals.
+def record(
+    scenario: Path,
+    output: Path | None = None,
+    console: Console | None = None,
+    figure: Path | None = None,
+    windows: bool = False,
+) -> Path | None:
+    """Run a scenario file, show what its twin found, and write its signals.
 
     Parameters
     ----------
     scenario : Path
         A scenario's TOML, or the name of a packaged one.
-    output : Path
+    output : Path, optional
         NAME.parquet (needs the extra `parquet`), NAME.npz or NAME.csv (12 significant digits, metadata in the first row
         of a last column).
     console : Console, optional
-        Where progress is shown.
+        Where progress and the report are shown.
+    figure : Path, optional
+        NAME.png or NAME.svg.
+    windows : bool
+        Show a line for each window.
 
     Returns
     -------
-    Path
-        The file written.
+    Path or None
+        The file of the signals.
 
     Raises
     ------
     InvalidInput
         Before anything is computed: an output that cannot be written, a scenario that is not valid.
     """
-    check_output(output)
+    if output is not None:
+        check_output(output)
+    if figure is not None:
+        files.check_file(figure, _PICTURES)
+    console = console or Console()
     text, described = _read(scenario)
-    table = recording(_run(described, console or Console()), text)
-    write_log(table, output)
-    (console or Console()).print(f"{len(table.columns['time_s'])} samples: {output}", soft_wrap=True, highlight=False)
+    loop = _run(described, console)
+    for line in summary(loop):
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+    if windows and loop.windows:
+        console.print(window_table(loop))
+    if output is not None:
+        table = recording(loop, text)
+        write_log(table, output)
+        console.print(f"{len(table.columns['time_s'])} samples: {output}", soft_wrap=True, highlight=False)
+    if figure is not None:
+        with files.atomic_output(figure) as temporary:
+            loop.plot().savefig(temporary, format=figure.suffix[1:], dpi=150)
+        console.print(f"figure: {figure}", soft_wrap=True, highlight=False)
     return output
 
 

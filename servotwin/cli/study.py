@@ -60,12 +60,20 @@ def simulate(
     scenario: Annotated[
         Path, typer.Argument(help="A scenario's TOML, or fig15, fig15-sampled, fig16, calm or certified.")
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="run.parquet, run.npz or run.csv.")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="File for the signals: run.parquet, run.npz or run.csv.")
+    ] = None,
+    figure: Annotated[
+        Path | None, typer.Option(help="Picture of signals, gap and estimates: .png or .svg.", show_default=False)
+    ] = None,
+    windows: Annotated[
+        bool, typer.Option("--windows", help="A line for each window: gap, estimate, status, what followed.")
+    ] = False,
 ) -> None:
-    """Run one scenario and write its signals."""
+    """Run one scenario; say what its twin found, and write the signals."""
     from servotwin.cli.simulate import record
 
-    record(scenario, output)
+    record(scenario, output, figure=figure, windows=windows)
 
 
 def convert(
