@@ -262,7 +262,7 @@ def test_outliers_that_disagree_stay_outliers():
 
 @pytest.mark.parametrize("every", [20.0, 200.0])
 def test_a_wear_rate_that_no_longer_holds_costs_three_windows(every):
-    """A rival with the learnt rate contradicts the windows as the trend does: 283 of 20 s, 29 of 200 s did not count."""
+    """Otherwise 283 windows of 20 s, or 29 of 200 s, did not count: a rival with the learnt rate is as wrong."""
     trend, time, gap = Trend.start(0.0, TrendSettings.for_wear(math.radians(10.0), 3600.0)), 0.0, 4.0
     for k in range(43):
         step, rate = (20.0, 48.0) if k < 40 else (every, 4.0)
