@@ -68,6 +68,13 @@ def test_a_list_takes_no_more_room_than_it_fills(open_page):
     assert page.locator("section[aria-label=Oversight]").bounding_box()["height"] < 200.0
 
 
+def test_every_gain_of_an_update_has_its_unit(open_page):
+    page = open_page()
+    open_machine(page, WEARING)
+    setting = page.locator("[aria-label=Updates] tbody tr").first.locator("td").nth(4).text_content()
+    assert re.search(r"dead zone [\d.]+ mm; Kp \S+ V/m, Ki \S+ V/\(m s\), Kd \S+ V s/m", setting)
+
+
 def test_a_list_on_the_screen_keeps_its_height_while_rows_come(open_page):
     page = open_page()
     rows = """async (count) => {

@@ -171,7 +171,7 @@ export class MachinePage {
     this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time"]);
     this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
     this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? `refused: ${row.receipt}` : ""]);
-    this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? `${row.waiting} messages wait` : ""]);
+    this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? (row.waiting === 1 ? "1 message waits" : `${row.waiting} messages wait`) : ""]);
     this.tile("link", link.word, [link.note ?? "", row.last_message === null ? "" : `last message ${ago(row.last_message, now)}`]);
     this.tiles.link[0].className = `mark ${link.kind}`;
     const lines = row.alarms.map((alarm) => `${stamp(alarm.time)}: ${alarm.sentence}`);
