@@ -70,7 +70,11 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
             r"load k \(stiffness_n_per_m\) = \(0.0,\): must have one value for each",
         ),
         ('kind = "linear"', 'kind = "rotary"', 'rotary\' is not allowed; give "linear", for the transmission'),
-        ("kp_n_m_per_m", "kp_v_per_m", r"'controller.kp_v_per_m': this machine .* N m/m; here its name is 'controller.kp_n_m_per_m'"),
+        (
+            "kp_n_m_per_m",
+            "kp_v_per_m",
+            r"'controller.kp_v_per_m': this machine .* N m/m; here its name is 'controller.kp_n_m_per_m'",
+        ),
         ("kp_n_m_per_m = 1500.0", "kp_n_m_per_m = nan", "controller.kp_n_m_per_m = nan is not allowed"),
         ("kp_n_m_per_m = 1500.0", "kp_n_m_per_m = -1500.0", r"Kp = -1500 N m/m, .* unstable on this axis"),
         ("torque_limit_n_m", "torque_limt_n_m", "controller.torque_limt_n_m.*did you mean 'torque_limit_n_m'"),
