@@ -12,6 +12,8 @@ from servotwin.report.theme import SHADES
 from servotwin.runtime.templates import render
 
 BLUE, ORANGE, GREEN, RED = (SHADES[name].light for name in ("blue", "orange", "green", "red"))
+_LETTER = 7.0
+"""Width of a letter of the axes' words, at most."""
 _WIDTH, _HEIGHT, _LEFT, _RIGHT, _TOP, _BOTTOM = 760.0, 300.0, 62.0, 12.0, 26.0, 46.0
 _STEPS_S = (1, 2, 5, 10, 30, 60, 120, 300, 600, 1800, 3600, 7200, 21600, 43200, 86400, 172800, 604800, 2592000, 7776000)
 _DAY = 86400.0
@@ -174,6 +176,9 @@ def _labels(x: _Scale, y: _Scale) -> Iterator[tuple[str, float, float, str]]:
     for value in _ticks(y.low, y.high):
         yield f"{value:.6g}", _LEFT - 6, y(value) + 4, "end"
     for time in _time_ticks(x.low, x.high):
-        yield _time_text(time, x.high - x.low), x(time), _HEIGHT - _BOTTOM + 16, "middle"
+        word = _time_text(time, x.high - x.low)
+        place, low = x(time), _HEIGHT - _BOTTOM + 16
+        cut = place + 0.5 * _LETTER * len(word) > _WIDTH
+        yield (word, _WIDTH - 2, low, "end") if cut else (word, place, low, "middle")
     begin = datetime.fromtimestamp(x.low, UTC).strftime("%Y-%m-%d %H:%M")
     yield f"Time, UTC (from {begin})", (_LEFT + _WIDTH - _RIGHT) / 2, _HEIGHT - 8, "middle"

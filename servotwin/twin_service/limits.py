@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable, Mapping, MutableMapping
 from typing import Any, NamedTuple
@@ -186,3 +187,11 @@ class SampleTimeLimiter:
 def _check_possible(sample_time: float) -> None:
     if sample_time > _MAX_UPTIME_S:
         raise RequestRejected(Refusal.FUTURE, f"sample time {sample_time:.3g} s: no edge runs that long")
+
+
+def daily_bytes_limiter(megabytes_per_day: float, monotonic: Callable[[], float]) -> RateLimiter | None:
+    """Limit of the bytes that a servo stores; a day's worth may come at once, as after an outage. None: no limit."""
+    if math.isinf(megabytes_per_day):
+        return None
+    daily = megabytes_per_day * 1e6
+    return RateLimiter(daily / 86400.0, daily, monotonic, "bytes to be stored")

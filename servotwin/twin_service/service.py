@@ -35,7 +35,7 @@ from servotwin.twin_service.http_operator import OperatorApi
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.http_webhook import WebhookApi
 from servotwin.twin_service.ingest import Clocks, Ingest
-from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter
+from servotwin.twin_service.limits import MAX_SERVOS, RateLimiter, SampleTimeLimiter, daily_bytes_limiter
 from servotwin.twin_service.missing_windows import MissingWindows, SequenceWatch
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
@@ -44,6 +44,7 @@ from servotwin.twin_service.page_service import PageService
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_watch import StoreWatch
+from servotwin.twin_service.tls_expiry import CertificateExpiry
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.unauthenticated import UnauthenticatedLimit
 from servotwin.twin_service.worker_pool import WorkerPool, pool_of
@@ -84,6 +85,7 @@ class TwinService:
         self.access = AccessControl(None) if self.tokens is None else self.tokens.access
         self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
         self.unauthenticated = UnauthenticatedLimit.of(config, self.access, self.operators)
+        self._certificate = CertificateExpiry(config, self.clocks.wall)
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
@@ -134,7 +136,7 @@ class TwinService:
             clocks=self.clocks,
             note=sequences.note,
             samples=config.samples_per_window,
-            disk=_disk_limiter(config.megabytes_per_day, self.clocks.monotonic),
+            disk=daily_bytes_limiter(config.megabytes_per_day, self.clocks.monotonic),
         )
 
     def _make_dispatcher(self) -> Dispatcher:
@@ -199,6 +201,7 @@ class TwinService:
                 await self.executor.run(partial(self.store.release, self._owner))
         await self.pool.start()
         self._spawn(self._refresh_tokens())
+        self._spawn(self._certificate.watch(self._announce), vital=False)
         self._spawn(self.pages.feed.run(), vital=False)
         self._spawn(self.pages.what_if.run())
         if self.webhook is not None:
@@ -246,7 +249,8 @@ class TwinService:
         store, workers, dispatching = self._store_healthy(), self.pool.alive, self.dispatching
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
         fault = "" if self.tokens is None else self.tokens.fault
-        degraded = [*self._lagging(backlog), *([f"the former tokens stay in force: {fault}"] if fault else [])]
+        former = [f"the former tokens stay in force: {fault}"] if fault else []
+        degraded = [*self._lagging(backlog), *former, *self._certificate.sentences()]
         return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property
@@ -303,8 +307,8 @@ class TwinService:
                 if lagging and not before:
                     log.warning("updates lag", extra=figures)
                     # Always in the same words, so that a lag that comes and goes is not posted each time.
-                    limit = f"lag_limit_s = {self.config.lag_limit_s:g} s"
-                    self._announce("lag", f"new messages of a servo wait for longer than {limit}")
+                    limit = self.config.lag_limit_s
+                    self._announce("lag", f"new messages of a servo wait for longer than lag_limit_s = {limit:g} s")
                 if before and not lagging:
                     log.info("updates lag no longer", extra=figures)
 
@@ -378,14 +382,6 @@ def _log_failure(task: asyncio.Task[None]) -> None:
     """Log the exception of a background task at once: the task is awaited only when the service stops."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.error("a task of the service ended", exc_info=error)
-
-
-def _disk_limiter(megabytes_per_day: float, monotonic: Callable[[], float]) -> RateLimiter | None:
-    """Limit of the bytes that a servo stores; a day's worth may come at once, as after an outage."""
-    if math.isinf(megabytes_per_day):
-        return None
-    daily = megabytes_per_day * 1e6
-    return RateLimiter(daily / _DAY, daily, monotonic, "bytes to be stored")
 
 
 def _servo_test(servos: ServoNames) -> Callable[[str], bool]:

@@ -54,7 +54,7 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     _check_positive("--speed", speed, FASTEST)
     _check_positive("--for", seconds, 1e9)
     console = console or Console()
-    with opened(path) as folder, _counted_signals() as signals:
+    with opened(path, lambda made: _announce_making(made, console)) as folder, _counted_signals() as signals:
         _greet(folder, console)
         site = Site(folder, Outages(), signals, lambda url: _announce(folder, url, console))
         monitor = _Monitor(folder, site, speed, console)
@@ -71,15 +71,18 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
         monitor.print_summary()
 
 
+def _announce_making(path: Path, console: Console) -> None:
+    line = f"making {path}: a twin and three servos (the very first time, code is compiled for minutes) ..."
+    console.print(line, soft_wrap=True, highlight=False, markup=False)
+
+
 def _greet(folder: Folder, console: Console) -> None:
-    if folder.new:
-        console.print(f"made: {folder.path}: a twin and three servos", soft_wrap=True, highlight=False)
     for servo in SERVOS:
         state = folder.machine(servo)
         if state is not None:
             described = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
             console.print(f"continuing with {described}", soft_wrap=True, highlight=False)
-    console.print("starting (the very first time, code is compiled for a minute or two) ...", highlight=False)
+    console.print("starting (the very first time, code is compiled for minutes) ...", highlight=False)
 
 
 def _announce(folder: Folder, url: str, console: Console) -> None:

@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -85,8 +85,14 @@ class Folder:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[Folder]:
+def opened(path: Path, making: Callable[[Path], None] | None = None) -> Iterator[Folder]:
     """Open the folder, made at the first start, and lock it for this process.
+
+    Parameters
+    ----------
+    path : Path
+    making : callable, optional
+        Called with the folder before it is made, which takes minutes where code has to be compiled first.
 
     Raises
     ------
@@ -98,6 +104,8 @@ def opened(path: Path) -> Iterator[Folder]:
     try:
         new = not path.exists() or not any(path.iterdir())
         if new:
+            if making is not None:
+                making(path)
             _make(path)
         _check(path)
         with _locked(path) as lock:

@@ -51,6 +51,59 @@ def test_a_new_window_appears_by_itself(open_page, twin):
     has_text(page, ".rows .row [data-column=window]", "s ago")
 
 
+@pytest.mark.parametrize("width", [390, 1024, 1100, 1160, 1440])
+def test_the_fleet_fits_the_screen_with_its_last_column(open_page, width):
+    page = open_page(width=width)
+    assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+    alarms = page.locator(".rows .row [data-column=alarms]").first.bounding_box()
+    assert alarms["x"] + alarms["width"] <= width
+
+
+def test_a_list_takes_no_more_room_than_it_fills(open_page):
+    page = open_page(expected=("status of 404",))
+    open_machine(page, "m-0001")  # one window, no update, no act
+    has_text(page, "[role=region][aria-label=Acts]", "Nobody has acted on this machine")
+    for name in ("Updates", "Acts", "Verification"):
+        assert page.locator(f"[role=region][aria-label={name}]").bounding_box()["height"] < 60.0
+    assert page.locator("section[aria-label=Oversight]").bounding_box()["height"] < 200.0
+
+
+def test_every_gain_of_an_update_has_its_unit(open_page):
+    page = open_page()
+    open_machine(page, WEARING)
+    setting = page.locator("[aria-label=Updates] tbody tr").first.locator("td").nth(4).text_content()
+    assert re.search(r"dead zone [\d.]+ mm; Kp \S+ V/m, Ki \S+ V/\(m s\), Kd \S+ V s/m", setting)
+
+
+def test_a_list_on_the_screen_keeps_its_height_while_rows_come(open_page):
+    page = open_page()
+    rows = """async (count) => {
+        const { element, fill } = await import("/static/dom.js");
+        const list = window.tried ??= document.body.appendChild(element("div", { class: "list" }));
+        fill(list, element("div", {}, Array.from({ length: count }, (_, i) => element("p", {}, `row ${i}`))));
+        return [list.offsetHeight, list.scrollHeight];
+    }"""
+    first, _ = page.evaluate(rows, 2)
+    page.evaluate("window.tried.scrollIntoView()")
+    shown, inside = page.evaluate(rows, 4)
+    assert shown == first < inside
+    page.evaluate("window.tried.style.position = 'absolute'; window.tried.style.top = '9000px'")
+    assert page.evaluate(rows, 4)[0] == inside
+
+
+def test_numbers_have_no_more_digits_than_their_interval_deserves(open_page):
+    page = open_page()
+    text = "([rate, half]) => import('/static/format.js').then((f) =>"
+    text += " f.rateText(rate, [rate - half, rate + half], { factor: 1 }))"
+    assert page.evaluate(text, [0.0, 171810.0]) == "0 ± 170000"
+    assert page.evaluate(text, [12345.6, 234.5]) == "12350 ± 230"
+    assert page.evaluate(text, [6.53, 0.256]) == "6.53 ± 0.26"
+    ticks = "(step) => import('/static/charts.js').then((f) =>"
+    ticks += " [1, 2].map((k) => f.tickText(1 + k * step, [1 + step, 1 + 2 * step])))"
+    assert page.evaluate(ticks, 2.5e-7) == ["1.00000025", "1.00000050"]
+    assert page.evaluate(ticks, 0.5) == ["1.5", "2.0"]
+
+
 def test_text_from_outside_is_never_executed(open_page, twin):
     page = open_page(expected=("status of 400", "status of 404"))
     rows = httpx.get(f"{twin.url}/v1/fleet?limit=1", headers=bearer(OPERATOR)).json()

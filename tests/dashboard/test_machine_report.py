@@ -1,5 +1,6 @@
 """Report of a machine as one HTML file."""
 
+import math
 import re
 import time
 
@@ -67,3 +68,12 @@ def test_a_chart_of_any_length_has_few_dates(span):
     text = TimeChart("y", [NOW, NOW + span], (ChartLine("a", "#000", [1e-9, 2e-9]),)).svg().decode()
     assert text.count('text-anchor="middle"') <= 14
     assert time.strftime("%Y", time.gmtime(NOW)) in text
+
+
+def test_the_last_time_of_a_chart_is_not_cut_off():
+    end = 60.0 * math.ceil(NOW / 60.0)
+    text = TimeChart("y", [end - 400.0, end], (ChartLine("a", "#000", [1.0, 2.0]),)).svg().decode()
+    last = time.strftime("%H:%M:%S", time.gmtime(end))
+    word = re.search(rf'<text x="([\d.]+)"[^>]*text-anchor="(\w+)"[^>]*>{last}<', text)
+    assert word.group(2) == "end"
+    assert float(word.group(1)) <= 760.0

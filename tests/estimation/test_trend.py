@@ -249,14 +249,28 @@ def test_outliers_that_agree_are_a_change_of_the_machine():
 
 
 def test_outliers_that_disagree_stay_outliers():
-    """Each is measured against the one before it; a window that was expected ends it all."""
-    trend = steady()
+    """Each is measured against the one before it, at any rate that was plausible at the start; a window that was
+    expected ends it all."""
+    trend = replace(steady(), settings=replace(STEADY, rate_std_rad_per_s=2e-3))
     for k, gap in enumerate((0.8, 0.1, 0.6, 0.05)):
         trend = trend.update(seen(40.0 + 10.0 * k, gap, 0.001))
         assert trend.refused == k + 1
         assert trend.gap == pytest.approx(0.3, abs=0.01)
     assert trend.update(seen(80.0, 0.3, 0.001)).refused == 0
     assert trend.update(seen(80.0, 0.05, 0.001)).gap == pytest.approx(0.05, abs=0.005)
+
+
+@pytest.mark.parametrize("every", [20.0, 200.0])
+def test_a_wear_rate_that_no_longer_holds_costs_three_windows(every):
+    """Otherwise 283 windows of 20 s, or 29 of 200 s, did not count: a rival with the learnt rate is as wrong."""
+    trend, time, gap = Trend.start(0.0, TrendSettings.for_wear(math.radians(10.0), 3600.0)), 0.0, 4.0
+    for k in range(43):
+        step, rate = (20.0, 48.0) if k < 40 else (every, 4.0)
+        time, gap = time + step, gap + rate * step / 3600.0
+        trend = trend.update(seen(time, math.radians(gap), math.radians(0.02)))
+    assert trend.refused == 0
+    assert math.degrees(trend.gap) == pytest.approx(gap, abs=0.05)
+    assert 3600.0 * math.degrees(trend.rate) == pytest.approx(4.0, abs=2.0)
 
 
 def test_how_many_must_agree_is_a_setting():

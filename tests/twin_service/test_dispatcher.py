@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Sequence
 
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import Lease, MessageKind, StoredMessage, WorkResult
 from servotwin.twin_service import dispatcher as dispatching
 from servotwin.twin_service.dispatcher import Dispatcher
@@ -175,3 +176,20 @@ def test_an_estimate_that_kills_its_workers_is_counted_although_glances_succeed(
 def test_a_servo_waits_until_its_share_of_a_worker_is_not_exceeded():
     assert WorkPace(0.25).hold(2.0) == 6.0
     assert WorkPace(0.25).hold(0.01) == WorkPace(1.0).hold(60.0) == 0.0
+
+
+def test_a_store_that_is_away_is_said_once_and_again_when_it_is_back(monkeypatch, caplog):
+    lease, faults = Lender.lease, iter(["the disk is full", "the disk is full", "read-only"])
+
+    def away(self, *args, **more):
+        for fault in faults:
+            raise StoreUnavailable(fault)
+        return lease(self, *args, **more)
+
+    monkeypatch.setattr(Lender, "lease", away)
+    monkeypatch.setattr(dispatching, "_RETRY_S", 1e-3)
+    caplog.set_level("INFO")
+    through([[claim("ax-1")]])
+    said = [(record.message, getattr(record, "why", "")) for record in caplog.records if "available" in record.message]
+    away_twice = [("store not available", "the disk is full"), ("store not available", "read-only")]
+    assert said == [*away_twice, ("store available again", "")]

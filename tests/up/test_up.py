@@ -1,5 +1,6 @@
 """`servotwin up` with real processes: it runs, ends, resumes, and leaves nothing behind, however it ends."""
 
+import errno
 import io
 import json
 import os
@@ -125,7 +126,7 @@ def test_it_continues_after_a_kill_and_ends_in_order(tmp_path: Path, monkeypatch
     path = tmp_path / "up"
     with started(path, "--speed", "10") as first:
         lines = lines_until(first, RUNNING)
-        assert "made: " in lines[0]
+        assert lines[0].startswith("making ")
         [address] = [line for line in lines if line.startswith("twin: listening on http://127.0.0.1:")]
         assert lines.index(address) < len(lines) - 1
         assert eventually(lambda: min(times(path)) > 5.0)
@@ -176,6 +177,23 @@ def test_a_folder_that_cannot_be_made_is_one_sentence(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(InvalidInput, match="file"), folder.opened(tmp_path / "file" / "up"):
         pass
+
+
+def test_the_first_start_says_what_takes_so_long_before_it_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written, said = io.StringIO(), []
+
+    def make(path: Path) -> None:
+        said.append(written.getvalue())
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(folder, "_make", make)
+    with pytest.raises(InvalidInput, match="no space left"):
+        command.up(tmp_path / "up", console=Console(file=written, width=300))
+    assert said == [
+        f"making {tmp_path / 'up'}: a twin and three servos (the very first time, code is compiled for minutes) ...\n"
+    ]
 
 
 @pytest.fixture(scope="module")

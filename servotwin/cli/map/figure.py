@@ -122,7 +122,7 @@ def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Fig
         "share of the runs that settle",
         f"over every {up.label.partition(' (')[0].partition(' /')[0]}",
         f"worst error at the end ({name})",
-        f"worst swing at the end, half peak-to-peak ({name})",
+        f"worst half swing at the end ({name})",
         "worst 5 % settling time (s); white: never",
         _effort(result),
     )

@@ -1,7 +1,7 @@
 // Acts of engineers on one machine: hold, release, approve, roll back. Operators see what holds, and what was done.
 
 import * as api from "./api.js";
-import { element, setText } from "./dom.js";
+import { element, fill, setText } from "./dom.js";
 import { brief, gapText, stamp } from "./format.js";
 
 const SAID = { hold: "held", release: "released", "roll back": "rolled back", "ask first": "new versions wait for approval", "ask no more": "new versions are sent at once", approve: "approved" };
@@ -9,7 +9,7 @@ const SAID = { hold: "held", release: "released", "roll back": "rolled back", "a
 export class ActsPanel {
   constructor(name, done) {
     Object.assign(this, { name, done, oversight: null });
-    this.state = element("p", { class: "oversight", role: "status" });
+    this.state = element("p", { role: "status" });
     this.waiting = element("p", { class: "waiting" });
     this.why = element("input", { type: "text", maxlength: 256, "aria-label": "Reason", placeholder: "Reason (stored with the act)" });
     this.version = element("select", { "aria-label": "Version to roll back to" });
@@ -19,10 +19,11 @@ export class ActsPanel {
     this.approving = button("Approve", () => "approve", () => ({ window: this.oversight.proposal.window }));
     this.back = button("Roll back to", () => "roll back", () => ({ version: this.version.value === "fallback" ? null : Number(this.version.value) }));
     this.error = element("p", { class: "error", role: "alert" });
-    this.sent = element("p", { class: "sent", role: "status" });
+    this.sent = element("p", { role: "status" });
     this.form = element("div", { class: "acts", hidden: true }, this.why, this.holding, this.asking, this.approving, element("span", { class: "together" }, this.back, this.version));
     this.list = element("div", { class: "scroll list low", tabindex: "0", role: "region", "aria-label": "Acts" });
-    this.content = [this.state, this.waiting, this.form, this.error, this.sent, this.list];
+    this.body = element("div", {}, element("div", { class: "oversight" }, this.state, this.waiting), this.form, element("div", { class: "words" }, this.error, this.sent), this.list);
+    this.content = [this.body];
   }
 
   show(oversight, versions, unit) {
@@ -33,6 +34,7 @@ export class ActsPanel {
     setText(this.state, [holds, asks ? "Each new version waits for an engineer's approval." : "", !held && !asks ? "Updates are sent as soon as they are verified." : ""].filter(Boolean).join(" "));
     setText(this.waiting, proposal ? proposalText(proposal, unit) : "");
     this.form.hidden = !oversight.may_act;
+    this.body.classList.toggle("acting", oversight.may_act); // what an engineer's acts will say has its place
     setText(this.holding, held ? "Release" : "Hold");
     setText(this.asking, asks ? "Ask no more" : "Ask first");
     this.approving.disabled = !proposal;
@@ -48,7 +50,7 @@ export class ActsPanel {
       element("td", { class: "number" }, stamp(act.time ?? act.done)), element("td", {}, act.who ?? "?"),
       element("td", {}, actText(act)), element("td", {}, act.why ?? ""), element("td", {}, act.outcome)));
     const heads = ["When", "Who", "What", "Why", "Outcome"];
-    this.list.replaceChildren(rows.length
+    fill(this.list, rows.length
       ? element("table", {}, element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))), element("tbody", {}, rows))
       : element("p", { class: "soft" }, "Nobody has acted on this machine."));
   }

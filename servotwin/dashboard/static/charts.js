@@ -80,7 +80,7 @@ export class TimePlot {
       scales: { x: { time: Boolean(options.time) }, y: { range: (_, low, high) => this.range(low, high) } },
       axes: [
         axis(options.xLabel, options.time ? 46 : 34, { space: (options.time ? 75 : 52) * rem(), values: options.time ? [...TIME_FORMATS] : undefined }),
-        axis(options.yLabel, 58, { space: 30 * rem(), values: (_, ticks) => ticks.map((tick) => (tick === null || this.empty ? "" : label(tick, ticks))) }),
+        axis(options.yLabel, 72, { size: (_, ticks) => widthOf(ticks), space: 30 * rem(), values: (_, ticks) => ticks.map((tick) => (tick === null || this.empty ? "" : tickText(tick, ticks))) }),
       ],
       series: [{}, ...options.series.map((each) => ({
         label: each.label, stroke: colour(each.color), width: each.width ?? 1.6, dash: each.dash, spanGaps: Boolean(each.spanGaps),
@@ -150,11 +150,15 @@ const TIME_FORMATS = [
   [0.001, ":{ss}.{fff}", "\n{HH}:{mm}", null, null, null, null, null, 1],
 ];
 
+// Of an axis with these labels: of one width up to seven characters; a longer number does not reach into the axis's name.
+const widthOf = (labels) => Math.max(72, 27 + 6.4 * Math.max(0, ...(labels ?? []).map((each) => (each ?? "").length))) * rem();
+
 // As many decimals as the distance of two ticks needs.
-function label(tick, ticks) {
+export function tickText(tick, ticks) {
   const step = Math.abs(ticks[1] - ticks[0]) || 1;
   let decimals = 0;
-  while (decimals < 9 && Math.abs(step * 10 ** decimals - Math.round(step * 10 ** decimals)) > 1e-6) decimals++;
+  const whole = (size) => Math.abs(size - Math.round(size)) <= 1e-6 * size;
+  while (decimals < 9 && !whole(step * 10 ** decimals)) decimals++;
   return fixed(tick, decimals);
 }
 
@@ -170,10 +174,10 @@ export function loopPlot(x, y, { xLabel, yLabel, about }) {
   const line = (d, stroke, width) => svg("path", { d, fill: "none", stroke, "stroke-width": width });
   const across = ticksOf(x0, x1), up = ticksOf(y0, y1);
   for (const tick of across) {
-    node.append(line(`M${px(tick)} ${top}V${H - bottom}`, "var(--grid)", 1), text(label(tick, across), px(tick), H - bottom + 16, "middle"));
+    node.append(line(`M${px(tick)} ${top}V${H - bottom}`, "var(--grid)", 1), text(tickText(tick, across), px(tick), H - bottom + 16, "middle"));
   }
   for (const tick of up) {
-    node.append(line(`M${left} ${py(tick)}H${W - right}`, "var(--grid)", 1), text(label(tick, up), left - 6, py(tick) + 4, "end"));
+    node.append(line(`M${left} ${py(tick)}H${W - right}`, "var(--grid)", 1), text(tickText(tick, up), left - 6, py(tick) + 4, "end"));
   }
   const d = x.map((value, i) => `${i ? "L" : "M"}${px(value).toFixed(1)} ${py(y[i]).toFixed(1)}`).join("");
   node.append(line(d, "var(--blue)", 1.4), text(xLabel, (left + W - right) / 2, H - 8, "middle"));

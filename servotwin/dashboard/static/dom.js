@@ -25,6 +25,15 @@ export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
+// Fills a list that is as high as its content, up to its greatest height. While it is on the screen it keeps the
+// height that it has, and scrolls inside: nothing below it moves.
+export function fill(list, content) {
+  const { top, bottom, height } = list.getBoundingClientRect();
+  const looked = list.firstChild && bottom > 0 && top < innerHeight;
+  list.style.height = looked ? `${height}px` : "";
+  list.replaceChildren(content);
+}
+
 // The colour that a custom property has in the present theme.
 const probe = document.createElement("i");
 export function colour(name) {

@@ -77,7 +77,13 @@ export function rateText(rate, interval, unit) {
   const half = interval ? ((interval[1] - interval[0]) / 2) * unit.factor : 0;
   if (!(half > 0)) return brief(rate * unit.factor);
   const decimals = Math.min(DECIMALS, decimalsFor(half));
-  return `${fixed(rate * unit.factor, decimals)} ± ${fixed(half, decimals)}`;
+  return `${fixed(rounded(rate * unit.factor, half), decimals)} ± ${fixed(rounded(half, half), decimals)}`;
+}
+
+// To the two digits that a large interval deserves: 170000, not 171810.
+function rounded(value, half) {
+  const last = 10 ** (Math.floor(Math.log10(half)) - 1);
+  return last > 1 ? Math.round(value / last) * last : value;
 }
 
 export function duration(seconds) {

@@ -10,7 +10,7 @@ const WORDS = {
   off: ["Off at the edge", "Set live = true in the table [twin] of the edge's file. Edges of earlier versions have no live view."],
   away: ["The edge is not connected", "The live view begins when the edge connects."],
   waiting: ["Waiting", "The edge has been asked; nothing has come yet."],
-  live: ["Live", "Least and greatest sample of each column. The edge streams while somebody looks at such a page."],
+  live: ["Live", "The edge sends the newest samples while somebody looks at this page."],
   stale: ["Stale", "No new data for a while: the curves are old."],
   failed: ["Unknown", ""],
   asking: ["Waiting", "The twin is being asked."],

@@ -4,7 +4,7 @@
 import * as api from "./api.js";
 import { ActsPanel } from "./acts.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
-import { element, setText } from "./dom.js";
+import { element, fill, setText } from "./dom.js";
 import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
 import { LiveViewPanel } from "./live_view.js";
 import { ResidualPanel } from "./residual.js";
@@ -170,8 +170,8 @@ export class MachinePage {
     this.tile("gap", rowGapText(row), [statusText(row.status), travelText(row.gap, row)]);
     this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time"]);
     this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
-    this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? row.receipt : ""]);
-    this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? `${row.waiting} messages wait` : ""]);
+    this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? `refused: ${row.receipt}` : ""]);
+    this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? (row.waiting === 1 ? "1 message waits" : `${row.waiting} messages wait`) : ""]);
     this.tile("link", link.word, [link.note ?? "", row.last_message === null ? "" : `last message ${ago(row.last_message, now)}`]);
     this.tiles.link[0].className = `mark ${link.kind}`;
     const lines = row.alarms.map((alarm) => `${stamp(alarm.time)}: ${alarm.sentence}`);
@@ -241,10 +241,10 @@ export class MachinePage {
     const residual = smallUnit(Math.max(0, ...windows.residual), unit.name === "deg");
     this.residualPlot.options.yLabel = `Residual, rms (${residual[0]})`;
     this.residualPlot.show([windows.received, scaled(windows.residual, residual[1])], "Root mean square of each fit's residual");
-    this.chain.replaceChildren(chainTable(this.updates, this.gaps, unit));
-    this.verification.replaceChildren(simulated(this.updates, unit));
+    fill(this.chain, chainTable(this.updates, this.gaps, unit));
+    fill(this.verification, simulated(this.updates, unit));
     this.acts.show(this.oversight, this.gaps.versions, unit);
-    this.events.replaceChildren(eventList(this.happened));
+    fill(this.events, eventList(this.happened));
     await this.chooseWindows();
   }
 

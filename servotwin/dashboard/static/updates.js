@@ -13,7 +13,7 @@ export function chainTable(traces, gaps, unit) {
   const heads = ["Version", "Sent", "Window", "Gap, deg (95 %)", "Setting", "Verified on", "The edge", `Error at the end, before → after (${unit.name})`];
   const table = element("table", {},
     element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))),
-    element("tbody", {}, steps.sort((a, b) => b.step.update.version - a.step.update.version).map(({ trace, step }) => row(trace, step, unit))));
+    element("tbody", {}, steps.sort((a, b) => b.step.update.version - a.step.update.version).map(({ trace, step }) => row(trace, step, unit, gaps.machine))));
   return element("div", {}, open, table);
 }
 
@@ -25,12 +25,12 @@ function newestDecision(gaps, some) {
   return why ? `${first}The newest window led to none: ${why}.` : first;
 }
 
-function row(trace, step, unit) {
+function row(trace, step, unit, machine) {
   const body = step.update.body ?? {}, { verification } = body;
   const half = body.interval && body.interval[0] !== null ? body.interval : null;
   return element("tr", {},
     cell(String(step.update.version), true), cell(stamp(step.update.created), true), cell(`${trace.window.sequence}`, true),
-    cell(gapText(body.gap ?? null, half), true), cell(settingText(body.setting ?? {}, unit)),
+    cell(gapText(body.gap ?? null, half), true), cell(settingText(body.setting ?? {}, unit, machine)),
     cell(verification ? `${verification.members} simulated machines` : "not simulated"),
     cell(answerText(step)), cell(effectText(step.effect, unit), true));
 }
@@ -42,12 +42,13 @@ export function settingInForce(traces, events, version) {
   return steps.at(-1)?.update.body?.setting ?? hello?.body?.setting ?? null;
 }
 
-function settingText(setting, unit) {
+function settingText(setting, unit, { command_unit: command, travel_unit: travel }) {
   const parts = [setting.tolerance ? `dead zone ${brief(setting.tolerance * unit.factor)} ${unit.name}` : "no dead zone"];
   const gains = setting.gains ?? {};
-  const named = ["Kp", "Ki", "Kd"].filter((name) => typeof gains[name] === "number");
-  if (named.length) parts.push(named.map((name) => `${name} ${brief(gains[name])}`).join(", "));
-  if (gains.feedforward) parts.push(`feedforward ${brief(gains.feedforward)}`);
+  const units = { Kp: `${command}/${travel}`, Ki: `${command}/(${travel} s)`, Kd: `${command} s/${travel}` };
+  const named = Object.keys(units).filter((name) => typeof gains[name] === "number");
+  if (named.length) parts.push(named.map((name) => `${name} ${brief(gains[name])} ${units[name]}`).join(", "));
+  if (gains.feedforward) parts.push(`feedforward ${brief(gains.feedforward)} ${command}`);
   return parts.join("; ");
 }
 

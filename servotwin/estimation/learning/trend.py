@@ -265,11 +265,12 @@ class Trend:
         """State that this outlier makes together with the earlier ones that agree with it."""
         if self.rival is not None and self.rival._distance(measurement.of_gap) <= self.settings.agreement_std:
             return self.rival._corrected(measurement)
-        fresh = Trend.start(self.time, self.settings).covariance
-        # The gap has jumped; the wear rate that was learnt stays.
-        fresh[RATE, RATE] = self.covariance[RATE, RATE]
-        mean = np.array([0.0, self.mean[RATE], 0.0])
-        return Trend(self.time, mean, fresh, self.settings)._joseph(measurement)
+        start = Trend.start(self.time, self.settings)
+        if self.rival is None:
+            # The gap has jumped; the wear rate that was learnt stays.
+            start.covariance[RATE, RATE] = self.covariance[RATE, RATE]
+            start.mean[RATE] = self.mean[RATE]
+        return start._joseph(measurement)
 
     def _bounded(self, estimate: GapEstimate) -> Trend:
         """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
