@@ -7,6 +7,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
+from servotwin.config.keys import items_of
+from servotwin.config.own_units import OwnUnits
+from servotwin.config.units import unit_of
+from servotwin.control.cascade import Cascade
+from servotwin.control.controller import Controller
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.messages import Cause
 from servotwin.plant.display_units import DEGREES, MILLIMETRES, DisplayUnit
@@ -44,6 +49,12 @@ class Units(NamedTuple):
     def error(self) -> str:
         """Heading of the errors."""
         return f"error, {self.position.name}"
+
+    def of_gain(self, law: type, name: str, value: float) -> str:
+        """A gain of a class of controllers, by its name, with its unit."""
+        key = next((item.exact_name for item in items_of(law) if item.name == name), name)
+        unit = unit_of(OwnUnits(self.command, self.position.si).key(key)).name
+        return f"{name} {value:.6g} {unit}".rstrip()
 
     def of_command(self, value: float) -> str:
         """A small command with its unit."""
@@ -238,16 +249,15 @@ def _sent_update(update: JsonObject, units: Units) -> str:
     zone = "no dead zone" if not tolerance else f"dead zone {units.position.text(tolerance, '.4g')}"
     parts = [] if tolerance is None else [zone]
     if gains:
-        parts.append(", ".join(f"{name} {gains[name]:.6g}" for name in ("Kp", "Ki", "Kd", "Tf")))
+        parts.append(", ".join(units.of_gain(Controller, name, gains[name]) for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {units.of_command(gains['feedforward'])}"] if gains.get("feedforward") else []
         moving, friction = gains.get("velocity_feedforward"), gains.get("friction_feedforward")
         parts += [f"velocity feedforward {moving:.4g} {units.command} s/{units.position.si}"] if moving else []
         parts += [f"friction feedforward {units.of_command(friction)}"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     law = setting.get("law") or {}
-    parts += [", ".join(f"{name} {value:.6g}" for name, value in law.items() if _is_number(value) and value)] * bool(
-        law
-    )
+    numbers = [units.of_gain(Cascade, name, value) for name, value in law.items() if _is_number(value) and value]
+    parts += [", ".join(numbers)] if numbers else []
     if verification:
         parts.append(f"verified on {verification['members']} simulated machines")
     return f"version {update['version']} sent: {', '.join(parts)}"

@@ -88,8 +88,8 @@ def test_a_version_from_its_window_to_its_effect() -> None:
     lines = chain(first, link(2, after, found("redesign", "what was verified is in force already")))
     assert lines[0] == "boot b1"
     assert [line[HEAD.index("what followed") :] for line in lines[1:]] == [
-        "version 3 sent: dead zone 61.25 um, Kp 1377.7, Ki 0, Kd -135.1, Tf 0.1, feedforward -20.0 mV, "
-        "velocity feedforward 94.25 V s/m, verified on 256 "
+        "version 3 sent: dead zone 61.25 um, Kp 1377.7 V/m, Ki 0 V/(m s), Kd -135.1 V s/m, Tf 0.1 s, "
+        "feedforward -20.0 mV, velocity feedforward 94.25 V s/m, verified on 256 "
         "simulated machines",
         "version 3 applied at sample 5000",
         "version 3 in window 2: error 12.3 -> 5.0 um",
@@ -190,9 +190,11 @@ def test_an_invalid_body_does_not_fail_the_report() -> None:
 
 
 def test_an_update_of_a_cascade_shows_its_numbers() -> None:
-    law = {"type": "cascade", "position_gain": 20.0, "integral_time": 0.0, "integral_only": True}
+    law = {"type": "cascade", "position_gain": 20.0, "integral_time": 0.0, "velocity_feedforward": 0.9}
     update = {"version": 4, "body": {"setting": {"tolerance": 2e-5, "law": law}}}
-    assert _sent_update(update, Units()) == "version 4 sent: dead zone 20 um, position_gain 20"
+    assert _sent_update(update, Units()) == (
+        "version 4 sent: dead zone 20 um, position_gain 20 1/s, velocity_feedforward 0.9"
+    )
 
 
 def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
@@ -207,6 +209,7 @@ def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
     assert "error, mdeg" in lines[4]
     text = "\n".join(lines)
     assert "dead zone 3.509 mdeg" in text
+    assert "Kp 1377.7 N m/rad, Ki 0 N m/(rad s)" in text
     assert "feedforward -0.02 N m, velocity feedforward 94.25 N m s/rad" in text
     assert "error 11.5 -> 5.7 mdeg" in text
     assert ", 9 N m where 8 N m are allowed" in text
