@@ -47,7 +47,8 @@ schemas (Even Better TOML, Taplo) check a file against the schema of its kind in
 The files of a scenario, of an edge and of a twin name commands and positions in the units of their machine. Below are
 those of a voltage and of a position in metres. Of an axis that commands a torque `v` is `n_m` and `voltage` `torque`,
 of a speed `rad_per_s` and `speed`, of an angle `rad` and `angle`; of a rotary axis `m` is `rad`, `mm` `deg` and `um`
-`mdeg`: `kp_n_m_per_rad`, `torque_limit_n_m`, `tolerance_deg`. An edge's file says so with `command_unit` and `position_unit`.
+`mdeg`: `kp_n_m_per_rad`, `torque_limit_n_m`, `tolerance_deg`. An edge's file says so with `command_unit` and
+`position_unit`.
 """
 
 
