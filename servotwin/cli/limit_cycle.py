@@ -140,6 +140,12 @@ def _in_unit(
                     f"give --{option}-{unit.name}"
                 )
     tolerance, step = positions[unit.name]
+    if step is not None and not (math.isfinite(step) and step != 0.0):
+        raise InvalidInput(
+            f"--step-{unit.name} {step:g} {unit.name}: must be finite and not 0, or the loop never leaves its rest"
+        )
+    if tolerance is not None and not (math.isfinite(tolerance) and tolerance >= 0.0):
+        raise InvalidInput(f"--tolerance-{unit.name} {tolerance:g} {unit.name}: must be finite and 0 or more")
     return tolerance, 1.0 if step is None else step
 
 

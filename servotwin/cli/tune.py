@@ -15,7 +15,8 @@ from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.laws import filtered_pid
+from servotwin.control.laws import LINEAR_LAW, filtered_pid
+from servotwin.control.linear_law import LinearLaw
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
@@ -53,6 +54,11 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     if isinstance(servo, Axis) and isinstance(servo.controller, Cascade):
         print_cascade(servo, servo.controller, request, as_json)
         return
+    if isinstance(servo.controller, LinearLaw):
+        raise InvalidInput(
+            f'{request.servo}: controller.kind = "{LINEAR_LAW}": tune finds the gains of a filtered PID or a cascade; '
+            "describe one of these in the table [controller]"
+        )
     servo = servo.replace(sample_rate=None)
     delay = 1e-3 * request.delay_ms
     tuning = tune(

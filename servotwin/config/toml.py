@@ -190,9 +190,11 @@ def read_kind(table: Table, makers: Mapping[str, Maker], folder: Path) -> Any:
 
 
 def _whole(table: Table, maker: Maker, folder: Path) -> Any:
-    made = read(table, maker, folder)
-    table.done()
-    return made
+    items = [item for item in items_of(maker) if item.key.in_file]
+    values = _read_items(table, items, folder, None, complete=True)
+    table.done()  # before the values meet: a misspelt key explains why they do not fit
+    with named(table):
+        return maker(**values)
 
 
 def values_of(described: Any, maker: Any = None, only: Collection[str] | None = None) -> Values:

@@ -9,6 +9,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
+from servotwin.plant.load import LINEAR
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 
@@ -47,9 +48,10 @@ def servo_of(axis: Axis) -> Servo:
         )
     load, motor = axis.load, axis.actuator
     if load.friction > 0.0:
+        unit = "N" if load.motion == LINEAR else "N m"
         raise InvalidInput(
-            f'load friction = {load.friction!r}: methods "whitened" and "paper" know no Coulomb friction of the load; '
-            "its transmission must be free in the gap for an estimate"
+            f'load {load.key("friction")} = {load.friction!r} {unit}: methods "whitened" and "paper" know no Coulomb '
+            "friction of the load; its transmission must be free in the gap for an estimate"
         )
     # With a rigid transmission the first spring is inert: a free load may have any.
     springs = (load.k[0] or load.k[1], *load.k[1:]) if axis.rigid else _grounded(load.k)

@@ -37,6 +37,7 @@ def screw(
     in_gap: Annotated[str, _IN_GAP] = HELD,
 ) -> Transmission:
     """Screw, rack or belt."""
+    _check_shaft(k_d, c_d, in_gap, ("stiffness_n_per_m", "damping_n_s_per_m", "N s/m"))
     return Transmission(p, k_d, c_d, in_gap)
 
 
@@ -59,7 +60,17 @@ def gear(
     """Gear or direct drive."""
     if (ratio is None) == (p is None):
         raise InvalidInput("transmission: give either ratio or travel_rad_per_rad")
+    _check_shaft(k_d, c_d, in_gap, ("stiffness_n_m_per_rad", "damping_n_m_s_per_rad", "N m s/rad"))
     return Transmission(p if ratio is None else 1.0 / ratio, k_d, c_d, in_gap)  # type: ignore[arg-type]
+
+
+def _check_shaft(k_d: float, c_d: float, in_gap: str, keys: tuple[str, str, str]) -> None:
+    """Refuse a shaft that does not fit its gap; `keys` of stiffness and damping, and the damping's unit."""
+    stiffness, damping, unit = keys
+    if in_gap == FREE and math.isinf(k_d):
+        raise InvalidInput(f'in_gap = "free": needs a finite {stiffness}; a rigid transmission is "held" in the gap')
+    if c_d > 0.0 and in_gap != FREE:
+        raise InvalidInput(f'{damping} = {c_d!r} {unit}: only with in_gap = "free"; leave it out, or give that')
 
 
 def linear_load(

@@ -77,7 +77,9 @@ class Load:
             for i, value in enumerate(values):
                 least = "positive" if self._positive(name, i) else "0 or more"
                 if not (math.isfinite(value) and (value > 0.0 if least == "positive" else value >= 0.0)):
-                    raise InvalidInput(f"load {name}[{i}] = {value!r} {unit}: must be finite and {least}")
+                    raise InvalidInput(
+                        f"load {name}[{i}] ({self.key(name)}) = {value!r} {unit}: must be finite and {least}"
+                    )
 
         for name in ("friction", "force"):
             object.__setattr__(self, name, a_number("load", name, getattr(self, name)))

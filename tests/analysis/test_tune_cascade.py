@@ -107,3 +107,13 @@ def test_the_command_takes_no_option_that_it_would_ignore(
     with pytest.raises(st.InvalidInput, match=words):
         print_tuning(replace(options, **changes), as_json=True)
     assert not capsys.readouterr().out
+
+
+def test_the_command_refuses_a_linear_law_by_the_key_of_its_file(tmp_path: Path) -> None:
+    law = st.LinearLaw(A=((-50.0,),), B=((1.0, 0.0, -1.0),), C=(-47000.0,), D=(1060.0, 0.0, -1060.0))
+    path = tmp_path / "axis.toml"
+    path.write_text(SCREW.replace(controller=law).dumps())
+    options = TuneOptions(str(path), "PIDF", 300.0, 40.0, math.inf, "Ms", 0.0, 1.0, None)
+    with pytest.raises(st.InvalidInput, match=r'axis\.toml: controller\.kind = "linear": tune finds') as error:
+        print_tuning(options, as_json=True)
+    assert "<" not in str(error.value)

@@ -47,8 +47,11 @@ def test_hysteresis_is_passed_on():
         (("papre",), "papre"),
         (("--gap-deg", -1), "--gap-deg -1 deg: must be from 0 to 360, one turn"),
         (("--gap-deg", "nan"), "--gap-deg nan deg: must be from 0 to 360, one turn"),
-        (("--step-mm", 0), "step = 0.0 m"),
-        (("--tolerance-mm", -1), "tolerance"),
+        (("--step-mm", 0), "--step-mm 0 mm: must be finite and not 0"),
+        (("telescope", "--step-deg", 0), "--step-deg 0 deg: must be finite and not 0"),
+        (("telescope", "--step-deg", "inf"), "--step-deg inf deg: must be finite and not 0"),
+        (("--tolerance-mm", -1), "--tolerance-mm -1 mm: must be finite and 0 or more"),
+        (("telescope", "--tolerance-deg", -1), "--tolerance-deg -1 deg: must be finite and 0 or more"),
         (("--tolerance-mm", 1, "--enter", 2), "leave = 1.0 tolerances"),
     ],
 )

@@ -291,7 +291,7 @@ def test_a_load_that_does_not_follow_the_model_is_refused() -> None:
         (
             TABLE.replace(transmission=Transmission(1e-3, 1e6), load=Load(TABLE.load.m, c=(1.0,))),
             None,
-            "no method estimates this gap",
+            "with a finite stiffness and one mass: no method estimates this gap",
         ),
         (TWO_MASS.replace(sensors=Sensors(feedback="motor")), "output_error", "give the load's own position"),
     ],

@@ -76,7 +76,18 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
         ("torque_limit_n_m", "torque_limt_n_m", "controller.torque_limt_n_m.*did you mean 'torque_limit_n_m'"),
         ('feedback = "load"', 'feedback = "screw"', "feedback = 'screw' is not allowed; give one of load, motor"),
         ("[load]", "[lod]", r"table \[load\] is missing"),
-        ("stiffness_n_per_m = 50000000.0", "stiffness_n_per_m = inf", "needs a finite stiffness k_d"),
+        ("stiffness_n_per_m = 50000000.0", "stiffness_n_per_m = inf", "needs a finite stiffness_n_per_m"),
+        (
+            "stiffness_n_per_m = 50000000.0",
+            "stiffness_n_m_per_rad = 5e7",
+            r"unknown key 'transmission.stiffness_n_m_per_rad'.*allows .*stiffness_n_per_m",
+        ),
+        ('in_gap = "free"', 'in_gap = "held"', r"damping_n_s_per_m = 6000.0 N s/m: only with in_gap = \"free\""),
+        (
+            "mass_kg = [20.0]\nstiffness_n_per_m = [0.0]\ndamping_n_s_per_m = [100.0]",
+            "mass_kg = [20.0, 3.0]\nstiffness_n_per_m = [0.0, 0.0]\ndamping_n_s_per_m = [100.0, 0.0]",
+            r"load k\[1\] \(stiffness_n_per_m\) = 0.0 N/m: must be finite and positive",
+        ),
     ],
 )  # fmt: skip
 def test_a_wrong_file_is_refused_in_a_sentence(old: str, new: str, words: str) -> None:

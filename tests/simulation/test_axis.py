@@ -253,8 +253,11 @@ def test_integral_action_swings_in_the_gap_and_rests_without() -> None:
         (lambda: Transmission(0.0), "transmission p = 0.0: must be positive and finite"),
         (lambda: Transmission(1.0, in_gap="free"), "needs a finite stiffness"),
         (lambda: Transmission(1.0, 1e3, 1.0), 'only a transmission that is "free"'),
-        (lambda: Load((-1.0,)), r"load m\[0\] = -1.0 kg: must be finite and positive"),
-        (lambda: Load((1.0, 2.0), (0.0, 0.0), (0.0, 0.0)), r"load k\[1\] = 0.0 N/m: must be finite and positive"),
+        (lambda: Load((-1.0,)), r"load m\[0\] \(mass_kg\) = -1.0 kg: must be finite and positive"),
+        (
+            lambda: Load((1.0, 2.0), (0.0, 0.0), (0.0, 0.0)),
+            r"load k\[1\] \(stiffness_n_per_m\) = 0.0 N/m: must be finite and positive",
+        ),
         (lambda: Load((1.0, 2.0)), "must have one value for each of the 2 masses"),
         (lambda: TorqueDrive(J=0.0), "actuator J = 0.0 kg m\\^2"),
         (lambda: Sensors(feedback="screw"), "sensors feedback = 'screw': must be one of load, motor"),

@@ -182,8 +182,8 @@ def _checked(window: Window, axis: Axis | Servo) -> Array:
         )
     if axis.backlash_kind is BacklashKind.HELD:
         raise InvalidInput(
-            'transmission in_gap = "held" with a finite k_d and one mass: no method estimates this gap; describe the '
-            'transmission as "free", or as rigid'
+            'transmission in_gap = "held" with a finite stiffness and one mass: no method estimates this gap; describe '
+            'it as "free", or as rigid'
         )
     if window.theta_m is None:
         raise InvalidInput(f"{window.where}the window has no theta_m: method {METHOD!r} needs the motor's angle in rad")
