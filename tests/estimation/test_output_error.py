@@ -19,7 +19,8 @@ from servotwin.estimation.output_error.learnt_shaft import adapted_shaft
 from servotwin.estimation.output_error.models import Priors, ShaftModel
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.search import search
-from servotwin.estimation.output_error.verdict import _slow, grown
+from servotwin.estimation.output_error.unexplained import slow
+from servotwin.estimation.output_error.verdict import grown
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
@@ -246,8 +247,23 @@ def test_a_load_with_dynamics_has_no_profile_of_possible_gaps() -> None:
 
 def test_slow_errors_are_told_from_white_noise() -> None:
     noise, time = np.random.default_rng(5).normal(size=4000), np.arange(4000) / 4000.0
-    assert _slow(noise) < 0.05
-    assert _slow(noise + 0.3 * np.sin(6.0 * time)) > 0.1
+    assert slow(noise, 40) < 0.05
+    assert slow(noise + 0.3 * np.sin(6.0 * time), 40) > 0.1
+
+
+def test_a_sensor_that_errs_with_its_way_widens_the_interval_and_nothing_else_does() -> None:
+    axis = Axis.preset("ball-screw")
+    gap = 2e-5 / axis.p
+    run = simulate(axis, 1.2, reference=SquareWave(3e-4, 0.8), gap=gap, sample_rate=2000.0)
+    clean = Window.from_run(run, 0.38, 0.2)
+    error = 0.25 * np.sin(2.0 * math.pi * clean.position / 8e-4 + 1.0)
+    exact = estimate_gap(clean, axis)
+    wrong = estimate_gap(clean.replace(position=clean.position + 2e-5 * error), axis)
+    assert exact.ok, exact.reasons
+    assert exact.interval[1] - exact.gap < 0.02 * gap
+    assert wrong.ok, wrong.reasons
+    assert abs(wrong.gap - gap) > 0.03 * gap, "the error of the sensor does not show in the gap"
+    assert wrong.interval[0] <= gap <= wrong.interval[1]
 
 
 def test_errors_of_floating_point_are_no_mismatch_and_errors_in_a_few_places_are_one() -> None:

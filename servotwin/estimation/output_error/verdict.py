@@ -15,6 +15,7 @@ from servotwin.estimation.output_error.models import HALF, RATIO
 from servotwin.estimation.output_error.possible import PossibleHalf
 from servotwin.estimation.output_error.rounding import per_count
 from servotwin.estimation.output_error.settings import OutputErrorSettings
+from servotwin.estimation.output_error.unexplained import slow, unexplained
 from servotwin.plant.signals import Array
 
 _BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
@@ -23,7 +24,6 @@ _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
 _APART = 4.0  # standard deviations between the halves of a window
 _UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
 _OUTLYING = 7.0  # standard deviations
-_CHANCE = 2.0  # times the usual variance of an average of white noise
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
@@ -104,7 +104,7 @@ def judge(
     allowed = _allowed(found, half, settings)
     doubts = tuple(filter(None, (_wide(std, allowed, unit), _rival(found, half, total, unit), _hidden(found, half))))
     if not doubts:
-        return JudgedFit(GapStatus.OK, half, std, total)
+        return JudgedFit(GapStatus.OK, half, std, math.hypot(total, _DOUBT * unexplained(found)))
     ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
     reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
     return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
@@ -183,13 +183,13 @@ def _mismatches(found: Search, likely: Array, rate: float, least: float) -> tupl
     best, problem = found.best, found.problem
     sentences = []
     variation = float(np.std(problem.position))
-    slow = _slow(best.raw)
-    share = slow / variation if variation > 0.0 else math.inf
+    left = slow(best.raw, max(1, best.raw.size // 100))
+    share = left / variation if variation > 0.0 else math.inf
     if share > _UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
-    elif problem.model.speed == 0.0 and slow > max(_UNEXPLAINED * best.values[HALF], problem.count):
+    elif problem.model.speed == 0.0 and left > max(_UNEXPLAINED * best.values[HALF], problem.count):
         sentences.append(
-            f"the model leaves motion of {100.0 * slow / best.values[HALF]:.0f} % of half the gap unexplained"
+            f"the model leaves motion of {100.0 * left / best.values[HALF]:.0f} % of half the gap unexplained"
         )
     sentences += unusual_numbers(found, likely)
     sentences += _outliers(found, least)
@@ -238,13 +238,6 @@ def _outliers(found: Search, least: float) -> tuple[str, ...]:
     if found.problem.model.speed > 0.0 or most <= _OUTLYING * max(rms, found.problem.count, least):
         return ()
     return (f"in a few places the model errs by {most / rms:.2g} times as much as in the others",)
-
-
-def _slow(raw: Array) -> float:
-    """rms of a residual averaged over a hundredth of the window, beyond what white noise would leave."""
-    size = max(1, raw.size // 100)
-    left = float(np.mean(np.convolve(raw, np.full(size, 1.0 / size), "valid") ** 2))
-    return math.sqrt(max(0.0, left - _CHANCE * 0.5 * float(np.mean(np.diff(raw) ** 2)) / size))
 
 
 def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple[float, float, float]:
