@@ -89,7 +89,10 @@ def test_where_the_gap_may_only_grow_beyond_the_range_the_fallback_set_is_sent(p
     assert made.setting is not None
     assert structs.replace(made.setting.gains, feedforward=0.0) == gains_of(far.fallback().setting.controller)
     assert made.reason.startswith("the gap may grow to")
-    assert "within 200 s, and at most 60 deg are certified; the fallback set is sent" in made.reason
+    assert (
+        "within 200 s by the wear that [twin.trend] states, and at most 60 deg are certified; the fallback set is sent"
+        in made.reason
+    )
     again = far.redesign(Evidence(last, at_rest(0.01), trend, rests=(0.01, 0.01), setting=made.setting))
     assert again.setting is None
     assert again.reason.endswith("the fallback set stays")

@@ -227,6 +227,16 @@ class ShaftModel:
         values[-2 * n : -n], values[-n:] = first
         return values
 
+    def hidden_friction(self, values: Array) -> float:
+        """Change of the half gap (m or rad at the load) that hides a load friction other than the model's own.
+
+        Reversed slowly, the load follows its motor behind half the gap and what friction winds up of the shaft: these
+        two are told apart by quick motion only.
+        """
+        named = {unknown.name: value for unknown, value in zip(self.unknowns, values.tolist(), strict=True)}
+        stiffness = math.exp(named["shaft stiffness"]) * self.axis.transmission.k_d
+        return abs(math.expm1(named.get("load friction", 0.0))) * self.axis.load.friction / stiffness
+
     def prepared(self, drive: Array, interval: float, values: Array) -> PreparedShaft:
         """The numbers of a simulation under the motor's motion (N,) at the load, for unknowns (u,)."""
         n = self.axis.n

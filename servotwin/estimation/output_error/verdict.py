@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
-from servotwin.estimation.output_error.models import HALF, RATIO
+from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
 from servotwin.estimation.output_error.rounding import per_count
 from servotwin.estimation.output_error.settings import OutputErrorSettings
@@ -102,9 +102,17 @@ def judge(
         status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
         return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
     allowed = _allowed(found, half, settings)
-    doubts = tuple(filter(None, (_wide(std, allowed, unit), _rival(found, half, total, unit), _hidden(found, half))))
+    model = problem.model
+    friction = model.hidden_friction(best.values) if isinstance(model, ShaftModel) else 0.0
+    found_doubts = (
+        _wide(std, allowed, unit),
+        _rival(found, half, total, unit),
+        _hidden(found, half),
+        _of_friction(friction, allowed, unit),
+    )
+    doubts = tuple(filter(None, found_doubts))
     if not doubts:
-        return JudgedFit(GapStatus.OK, half, std, math.hypot(total, _DOUBT * unexplained(found)))
+        return JudgedFit(GapStatus.OK, half, std, math.hypot(total, friction, _DOUBT * unexplained(found)))
     ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
     reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
     return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
@@ -122,6 +130,16 @@ def _wide(std: float, allowed: float, unit: float) -> str:
     if std <= allowed:
         return ""
     return f"the gap is known to {_deg(unit * std)} only, and {_deg(unit * allowed)} are allowed"
+
+
+def _of_friction(friction: float, allowed: float, unit: float) -> str:
+    """Sentence for a half gap (m or rad at the load) that would be another with the stated friction."""
+    if friction <= allowed:
+        return ""
+    return (
+        f"with the stated load friction the gap would be {_deg(unit * friction)} off, and {_deg(unit * allowed)} are "
+        "allowed: slow motion does not tell friction from a gap"
+    )
 
 
 def _hidden(found: Search, half: float) -> str:
