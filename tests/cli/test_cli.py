@@ -149,7 +149,7 @@ def test_a_process_ends_with_2_and_without_traceback(tmp_path):
 
 
 def test_an_interrupt_is_130_and_one_line(scenario, monkeypatch):
-    monkeypatch.setattr("servotwin.cli.simulate.record", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    monkeypatch.setattr("servotwin.cli.simulate.record", lambda *_, **__: (_ for _ in ()).throw(KeyboardInterrupt))
     result = run("simulate", scenario, "-o", scenario.parent / "run.csv")
     assert result.exit_code == 130
     assert result.stderr.count("\n") == 1
@@ -170,7 +170,7 @@ WHILE_COMPILING = """
 import sys
 from servotwin.__main__ import main
 import servotwin.cli.simulate
-servotwin.cli.simulate.record = lambda *_: exec("raise KeyboardInterrupt")
+servotwin.cli.simulate.record = lambda *_, **__: exec("raise KeyboardInterrupt")
 sys.argv = ["servotwin", "simulate", "scenario.toml", "-o", "run.csv"]
 main()
 """
