@@ -95,8 +95,9 @@ class Load:
         return f"{name} ({self.key(name)})"
 
     def key(self, name: str) -> str:
-        """Key of m, k, c or friction in a file."""
-        return _FRICTION_KEYS[self.motion][0] if name == "friction" else _KEYS[self.motion][name]
+        """Key of m, k, c, friction or static in a file."""
+        frictions = dict(zip(("friction", "static"), _FRICTION_KEYS[self.motion], strict=False))
+        return frictions.get(name) or _KEYS[self.motion][name]
 
     @staticmethod
     def _positive(name: str, place: int) -> bool:

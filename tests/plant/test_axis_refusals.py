@@ -66,7 +66,7 @@ def cascade(**changes: object) -> st.Cascade:
                     load=st.Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.1, static=0.2, stribeck=0.1)
                 ),
             ),
-            "knows no friction of the load that falls with its speed",
+            "load static_friction_n_m = 0.2 N m: the estimate of the gap knows no friction of the load that falls",
         ),
     ],
 )  # fmt: skip

@@ -32,6 +32,7 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
+from servotwin.plant.load import LINEAR
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -170,9 +171,11 @@ def _prepared(
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
     """The motor's angle of a window that can be fitted."""
-    if axis.guide.stribeck.slope:
+    if isinstance(axis, Axis) and axis.guide.stribeck.slope:
+        unit = "N" if axis.load.motion == LINEAR else "N m"
+        where = f"load {axis.load.key('static')} = {axis.load.static!r} {unit}: "
         raise InvalidInput(
-            "load static_friction: the estimate of the gap knows no friction of the load that falls with its speed; "
+            f"{where}the estimate of the gap knows no friction of the load that falls with its speed; "
             "leave static friction and Stribeck speed out of the model for an estimate with Coulomb friction"
         )
     if isinstance(axis, Servo) or has_servo(axis):
