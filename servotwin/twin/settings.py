@@ -274,10 +274,17 @@ class TwinSettings:
         friction = float(servo.command_of(servo.own_friction))
         return replace(
             self,
-            trend=TrendSettings.on(second) if self.trend == TrendSettings() else self.trend,
+            trend=self._trend(servo, second),
             excitation=None if self.excitation is None else self.excitation.on(second),
             triage=None if self.triage is None else self.triage.on(volt, friction, self.uncertainty.step[0]),
         )
+
+    def _trend(self, servo: Plant, second: float) -> TrendSettings:
+        if self.trend != TrendSettings():
+            return self.trend
+        if isinstance(servo, Axis) and self.horizon > 0.0:
+            return TrendSettings.within(self.uncertainty.gap[1], self.horizon)
+        return TrendSettings.on(second)
 
     def initial_tolerance(self, servo: Plant) -> float:
         """Tolerance before the first update by Eq 21, m; 0 where no gap is assumed."""

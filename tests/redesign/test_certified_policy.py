@@ -90,8 +90,8 @@ def test_where_the_gap_may_only_grow_beyond_the_range_the_fallback_set_is_sent(p
     assert structs.replace(made.setting.gains, feedforward=0.0) == gains_of(far.fallback().setting.controller)
     assert made.reason.startswith("the gap may grow to")
     assert (
-        "within 200 s by the wear that [twin.trend] states, and at most 60 deg are certified; the fallback set is sent"
-        in made.reason
+        "within 200 s at the rate of wear seen and assumed ([twin.trend]), and at most 60 deg are certified; "
+        "the fallback set is sent" in made.reason
     )
     again = far.redesign(Evidence(last, at_rest(0.01), trend, rests=(0.01, 0.01), setting=made.setting))
     assert again.setting is None

@@ -56,6 +56,24 @@ def test_what_a_file_leaves_out_is_in_the_machines_own_units(units: Units) -> No
     assert found.on(scaled(SERVO, *units)) == found
 
 
+@pytest.mark.parametrize("name", ["ball-screw", "robot-joint"])
+def test_an_axis_without_a_trend_wears_within_its_stated_range(name: str) -> None:
+    axis, paper = Axis.preset(name), TrendSettings()
+    for gap, horizon in ((math.radians(0.6), 40.0), (math.radians(30.0), 4.0)):
+        known = SETTINGS.uncertainty.replace(gap=(0.0, gap))
+        found = SETTINGS.replace(uncertainty=known, horizon=horizon).on(axis).trend
+        share = gap / math.radians(60.0)
+        assert found.rate_std_rad_per_s * horizon == pytest.approx(share * 40.0 * paper.rate_std_rad_per_s)
+        walk = found.rate_walk_rad_per_s_per_sqrt_s * horizon**1.5
+        assert walk == pytest.approx(share * 40.0**1.5 * paper.rate_walk_rad_per_s_per_sqrt_s)
+        assert found.shared_error_rad == pytest.approx(share * paper.shared_error_rad)
+
+
+def test_an_axis_keeps_a_stated_trend() -> None:
+    stated = TrendSettings.for_wear(1e-3, 3600.0)
+    assert SETTINGS.replace(trend=stated).on(Axis.preset("ball-screw")).trend == stated
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_the_presets_are_supervised_with_the_papers_numbers(name: str) -> None:
     fallback = FallbackSet(Setting(1e-5))

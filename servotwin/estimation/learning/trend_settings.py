@@ -79,6 +79,20 @@ class TrendSettings:
         return cls(rate_std_rad_per_s=rate, rate_walk_rad_per_s_per_sqrt_s=walk)
 
     @classmethod
+    def within(cls, gap: float, horizon: float) -> TrendSettings:
+        """Defaults for an axis whose stated gap is at most `gap` (rad), and whose settings hold for `horizon` (s).
+
+        In proportion to the defaults: a range of 60 deg and settings that hold for 40 s.
+        """
+        size, time = gap / math.radians(60.0), horizon / 40.0
+        rate, walk = math.radians(0.2) * size / time, math.radians(0.015) * size / time**1.5
+        return cls(
+            rate_std_rad_per_s=rate,
+            rate_walk_rad_per_s_per_sqrt_s=walk,
+            shared_error_rad=math.radians(0.02) * size,
+        )
+
+    @classmethod
     def for_wear(cls, gap: float, over: float, **changes: float) -> TrendSettings:
         """Settings for a gap that grows by about `gap` (rad) within `over` (s), at a rate that may change.
 

@@ -138,8 +138,8 @@ class CertifiedPolicy:
             return None
         high, most = (math.degrees(x) for x in (region.gap[1], self.uncertainty.gap[1]))
         reason = (
-            f"the gap may grow to {high:.3g} deg within {self.horizon:g} s by the wear that [twin.trend] states, "
-            f"and at most {most:.3g} deg are certified"
+            f"the gap may grow to {high:.3g} deg within {self.horizon:g} s at the rate of wear seen and assumed "
+            f"([twin.trend]), and at most {most:.3g} deg are certified"
         )
         if alike(fallback.setting, evidence.setting):
             return Redesign(None, math.nan, f"{reason}; the fallback set stays")
