@@ -79,7 +79,8 @@ def _end(message: str, code: int) -> None:
 def _usage(error: Any) -> str:
     """Make one sentence of an error of usage."""
     command = "servotwin" if error.ctx is None else error.ctx.command_path
-    text = _SUGGESTION.sub(r" (did you mean \1?)", " ".join(error.format_message().split())).rstrip(".")
+    said = " ".join(error.format_message().split()).replace(": Value error, ", ": ")
+    text = _SUGGESTION.sub(r" (did you mean \1?)", said).rstrip(".")
     return f"error: {command}: {text[:1].lower()}{text[1:]}; see {command} --help"
 
 

@@ -50,7 +50,7 @@ def twin(
         TwinAction | None,
         typer.Argument(
             help="Instead of serving. check: check the whole store, even while the twin runs. "
-            "test-alarm: post a test to the webhook in the file's table service.webhook."
+            "test-alarm: post a test to the webhook in the file's table service.webhook. --config names the file."
         ),
     ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
