@@ -9,6 +9,7 @@ block.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -71,8 +72,8 @@ class LiftedWorkspace(NamedTuple):
     column: Array  # 3 * 16
 
 
-def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
-    """Room for so many slots."""
+def lifted_counts(states: int, watches: int, slots: int) -> tuple[int, ...]:
+    """Numbers in each table of so many slots."""
     n2 = states * states
     sizes = (
         states * row_count(states, watches, FINE),
@@ -85,7 +86,12 @@ def new_lifted(states: int, watches: int, slots: int) -> LiftedTables:
         n2,
         states,
     )
-    return LiftedTables(states, watches, *(zeros(slots * size) for size in sizes))
+    return tuple(slots * size for size in sizes)
+
+
+def lifted_in(arrays: Sequence[Array], states: int, watches: int) -> LiftedTables:
+    """Tables in arrays of `lifted_counts`, whatever these hold: none is filled yet."""
+    return LiftedTables(states, watches, *arrays)
 
 
 def new_lifted_workspace(states: int, watches: int) -> LiftedWorkspace:

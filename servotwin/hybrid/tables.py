@@ -8,6 +8,7 @@ means "the cubic does not leave the mode", and one product decides a whole block
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -217,6 +218,17 @@ def zeros(count: int) -> Array:
     room = np.zeros(count + 8)
     start = -(room.ctypes.data // 8) % 8
     return room[start : start + count]
+
+
+def room_for(counts: Sequence[int]) -> int:
+    """Numbers that arrays of so many need in one piece of memory."""
+    return sum(map(padded, counts))
+
+
+def cut(room: Array, counts: Sequence[int]) -> list[Array]:
+    """Arrays in a piece of memory of `zeros`, each from a cache line on."""
+    ends = np.cumsum([0, *map(padded, counts)]).tolist()
+    return [room[first : first + count] for first, count in zip(ends, counts, strict=False)]
 
 
 def _bernstein_of_taylor() -> Array:

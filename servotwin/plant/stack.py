@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,6 +26,8 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.servo_changes import PerMass
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
+
+_FEW = 8  # servos of a stack that is kept
 
 
 class LoopStack(NamedTuple):
@@ -149,8 +152,17 @@ def continuous_loops(servos: Sequence[Plant], laws: Sequence[Controller], shape:
 
 def sampled_plants(servos: Sequence[Plant], gap_degree: int, bias: bool, friction: bool) -> LoopStack:
     """Automata of servos of one structure under a constant voltage."""
+    # A search simulates hundreds of controllers on the same few machines; larger stacks take up to 50 MB.
+    build = _few_sampled_plants if len(servos) <= _FEW else _sampled_plants
+    return build(tuple(servos), gap_degree, bias, friction)
+
+
+def _sampled_plants(servos: tuple[Plant, ...], gap_degree: int, bias: bool, friction: bool) -> LoopStack:
     plants = PlantStack(servos)
     return LoopStack(plants, *sampled_parts(plants, gap_degree, bias, friction).stacked(plants.count))
+
+
+_few_sampled_plants = lru_cache(maxsize=8)(_sampled_plants)
 
 
 def _column(items: Sequence[Plant] | Sequence[Controller], name: str) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,8 +19,8 @@ from servotwin.hybrid.kernel import (
     grown,
     new_record,
 )
-from servotwin.hybrid.lifted import BLOCK, COARSE, new_lifted, new_lifted_workspace, row_count
-from servotwin.hybrid.tables import search_step
+from servotwin.hybrid.lifted import BLOCK, COARSE, lifted_counts, lifted_in, new_lifted_workspace, row_count
+from servotwin.hybrid.tables import search_step, zeros
 from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, tables_for
 from servotwin.plant.automaton import ServoAutomaton, degree, sampled_plant
 from servotwin.plant.plants import Plant
@@ -126,10 +127,16 @@ def watches_of(plant: ServoAutomaton, controller: Controller, dead_zone: bool, c
 
 def new_memory(places: Places, modes: int, watches: int) -> LiftedMemory:
     """Tables and working memory of one run."""
+    tables = [zeros(count) for count in lifted_counts(places.states, watches, modes * 2 * KINDS)]
+    return memory_around(tables, places, modes, watches)
+
+
+def memory_around(tables: Sequence[Array], places: Places, modes: int, watches: int) -> LiftedMemory:
+    """Working memory around tables of `lifted_counts`."""
     n, slots = places.states, modes * 2 * KINDS
     rows = max(row_count(n, watches, COARSE), COARSE * n)
     return LiftedMemory(
-        new_lifted(n, watches, slots),
+        lifted_in(tables, n, watches),
         new_lifted_workspace(n, watches),
         np.zeros(slots, dtype=np.int8),
         np.zeros(slots * n),

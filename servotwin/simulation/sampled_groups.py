@@ -20,8 +20,8 @@ from servotwin.hybrid.buffer_pool import BufferPool
 from servotwin.hybrid.ensemble import on_threads
 from servotwin.hybrid.flow import new_scratch
 from servotwin.hybrid.kernel import CHANGES_AT_ONCE, DONE, EVENTS_PER_STEP, ZENO, RunRecord, grown, new_record
-from servotwin.hybrid.lifted import BLOCK
-from servotwin.hybrid.tables import divisors, empty_tables
+from servotwin.hybrid.lifted import BLOCK, lifted_counts, lifted_in
+from servotwin.hybrid.tables import cut, divisors, empty_tables, room_for, zeros
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.automaton import ServoAutomaton, degree
 from servotwin.plant.plants import Plant, structure_of
@@ -29,7 +29,7 @@ from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.stack import LoopStack, sampled_plants
 from servotwin.simulation.ensemble_starts import starts_of
 from servotwin.simulation.lifted import Segments, more_segments, new_segments
-from servotwin.simulation.lifted_engine import new_memory, places_of, start_law, watches_of
+from servotwin.simulation.lifted_engine import memory_around, places_of, start_law, watches_of
 from servotwin.simulation.lifted_tables import KINDS, Place, Places
 from servotwin.simulation.sampled_members import (
     SampledFamily,
@@ -224,14 +224,16 @@ class _Part(NamedTuple):
 
 
 class _Memory(NamedTuple):
-    """Memory of one worker."""
+    """Memory of one worker, all but its large tables."""
 
     worker: SampledWorker
     segments: Segments
     record: RunRecord
 
 
-_STOCK: BufferPool[_Memory] = BufferPool(most=16)
+# Groups of all structures share the rooms for large tables, by their size: one a structure took a gigabyte.
+_STOCK: BufferPool[_Memory] = BufferPool(most=32)
+_ROOMS: BufferPool[Array] = BufferPool(most=4)
 
 
 def run_groups(runs: Sequence[GroupRun], span: SampledSpan, threads: int | None) -> None:
@@ -264,8 +266,12 @@ def _run_parts(parts: Iterator[_Part], span: SampledSpan) -> list[int]:
     for _, mine in groupby(parts, key=lambda part: id(part.run)):
         first = next(mine)
         group = first.run.group
-        with _STOCK.lent(group.kind, partial(_new_memory, group)) as memory:
-            memory = memory._replace(worker=_loaded(memory.worker, group.family))
+        size = 1 << (room_for(_counts(group)) - 1).bit_length()
+        with (
+            _STOCK.lent(group.kind, partial(_new_memory, group)) as kept,
+            _ROOMS.lent(size, partial(zeros, size)) as room,
+        ):
+            memory = kept._replace(worker=_loaded(kept.worker, group, room))
             zeno += [place for part in chain([first], mine) for place in _run_part(part, span, memory)]
     return zeno
 
@@ -291,9 +297,16 @@ def _run_part(part: _Part, span: SampledSpan, memory: _Memory) -> list[int]:
     return []
 
 
-def _loaded(worker: SampledWorker, family: SampledFamily) -> SampledWorker:
-    """The worker with the numbers of a family, none of whose tables are filled yet."""
+def _counts(group: SampledGroup) -> tuple[int, ...]:
+    """Numbers in each of the large tables of a group; the last holds the outputs."""
+    slots, n = group.family.modes * 2 * KINDS, group.places.states
+    return *lifted_counts(n, group.watches, slots), len(group.family.rows) * slots * BLOCK * n
+
+
+def _loaded(worker: SampledWorker, group: SampledGroup, room: Array) -> SampledWorker:
+    """The worker with its large tables in a room, and the numbers of a group; none of its tables are filled yet."""
     worker.loaded[:] = -1
+    family = group.family
     pending = worker.scratch.pending._replace(
         flows=family.flows,
         rows=family.guards,
@@ -302,22 +315,28 @@ def _loaded(worker: SampledWorker, family: SampledFamily) -> SampledWorker:
         # The flow of a tick is made of fine and coarse jumps; blocks are those of ticks.
         reach=family.searches,
     )
-    return worker._replace(scratch=worker.scratch._replace(pending=pending))
+    *tables, outputs = cut(room, _counts(group))
+    lifted = lifted_in(tables, group.places.states, group.watches)
+    return worker._replace(
+        scratch=worker.scratch._replace(pending=pending),
+        lifted=worker.lifted._replace(lifted=lifted),
+        outputs=outputs.reshape(len(family.rows), -1),
+    )
 
 
 def _new_memory(group: SampledGroup) -> _Memory:
     family, n = group.family, group.places.states
     tables = empty_tables(group.loop.automaton, group.flow_of)
-    slots, outputs = family.modes * 2 * KINDS, len(family.rows)
+    *elsewhere, outputs = [np.empty(0)] * len(_counts(group))
     worker = SampledWorker(
         tables,
-        new_memory(group.places, family.modes, group.watches),
+        memory_around(elsewhere, group.places, family.modes, group.watches),
         new_scratch(tables),
         np.zeros(n),
         Place(np.zeros(9, dtype=np.int64), np.zeros(1)),
         np.full(2, -1),
         np.zeros(4),
-        np.zeros((outputs, slots), dtype=np.int8),
-        np.zeros((outputs, slots * BLOCK * n)),
+        np.zeros((len(family.rows), family.modes * 2 * KINDS), dtype=np.int8),
+        outputs,
     )
     return _Memory(worker, new_segments(n, _ROOM), new_record(group.places.plant))

@@ -1,14 +1,19 @@
 """Ensembles of sampled loops: every member is the run that it would be alone."""
 
+import math
+
 import numpy as np
 import pytest
 from held_plant import HeldPlant
 
 from servotwin.control import law
 from servotwin.errors import InvalidInput
+from servotwin.hybrid.buffer_pool import BufferPool
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
-from servotwin.simulation import simulate
+from servotwin.plant.stack import sampled_plants
+from servotwin.simulation import sampled_groups, simulate
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled, summarise_sampled
 
 DEGREE = np.pi / 180.0
@@ -16,6 +21,7 @@ PAPER = Servo.preset("paper")
 LIMITED = PAPER.controller.replace(
     voltage_limit=1.5, rate_limit=20.0, loop_filter_hz=40.0, tracking_time=0.05, enter=0.6, leave=1.4
 )
+LAWS = (PAPER.controller, LIMITED, PAPER.controller.replace(velocity_feedforward=150.0, notch_hz=4.0))
 
 
 def test_members_are_runs() -> None:
@@ -84,6 +90,32 @@ def test_figures_are_those_of_the_samples() -> None:
         assert np.allclose(found.last_mean, last.mean(axis=-1), rtol=1e-12)
     beyond = [[np.flatnonzero(np.abs(y) > 1e-4)[-1] + 1 for y in row] for row in samples["error"]]
     assert np.array_equal(figures["error"].outside, beyond)
+
+
+@pytest.mark.parametrize("name", ["paper", "robot-joint"])
+def test_what_a_room_held_before_changes_no_bit(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Groups of different structures share the memory of their large tables."""
+    axis = PAPER if name == "paper" else Axis.preset(name)
+    rate = axis.controller.sample_rate or 1e3
+    laws = np.array([law.replace(sample_rate=rate, loop_filter_hz=hz) for law in LAWS for hz in (None, 40.0)])
+    cases = SampledCases(1e-3, np.array([[1.0], [3.0]]) * DEGREE, [[[0.0]], [[1e-4]]], 0.01, 0.05, delay=1)
+
+    def figures() -> list[bytes]:
+        found = summarise_sampled(axis, laws, 1.0, cases, 0.2, sample_rate=100.0, threads=1)
+        return [np.asarray(values).tobytes() for each in found.values() for values in each]
+
+    expected = figures()
+    monkeypatch.setattr(sampled_groups, "_ROOMS", BufferPool(most=1))
+    monkeypatch.setattr(sampled_groups, "zeros", lambda count: np.full(count, math.nan))
+    assert figures() == expected
+
+
+def test_few_plants_are_assembled_once() -> None:
+    plants = [PAPER, PAPER.replace(k=8e3)]
+    assert sampled_plants(plants, 0, True, False) is sampled_plants(list(plants), 0, True, False)
+    assert sampled_plants(plants, 0, True, False) is not sampled_plants(plants, 0, False, False)
+    many = [PAPER.replace(k=8e3 + number) for number in range(9)]
+    assert sampled_plants(many, 0, True, False) is not sampled_plants(many, 0, True, False)
 
 
 def test_threads_change_no_bit() -> None:
