@@ -96,7 +96,7 @@ def _of_settings(loop: Loop) -> Iterator[str]:
         yield f"  {count} returns to the fallback set: {reason}"
     unsent = [each.reason for each in loop.redesigns if each.setting is None and each.reason]
     for reason, count in Counter(unsent).most_common(1):
-        yield f"  after {count} windows none was sent: {reason}"
+        yield f"  after {count} window{'s' * (count > 1)} none was sent: {reason}"
 
 
 def _of_steps(run: Run) -> Iterator[str]:
@@ -124,20 +124,32 @@ def true_gap(loop: Loop, estimate: GapEstimate) -> float:
 
 
 def window_table(loop: Loop) -> Table:
-    """A line for each window: the gap, its estimate, and what followed."""
+    """A line for each window: the gap, its estimate, and the setting."""
     table = Table(box=None)
     for heading in ("time, s", "gap, deg", "estimate, deg", "95 % interval, deg"):
         table.add_column(heading, justify="right")
     table.add_column("status")
-    table.add_column("what followed")
+    table.add_column("setting")
     for each, redesign in zip(loop.estimates, loop.redesigns, strict=True):
         known = math.isfinite(each.gap)
+        setting = "kept" if redesign.setting is None else "fallback set" if redesign.reason else "found"
         table.add_row(
             f"{each.time:.4g}",
             f"{math.degrees(true_gap(loop, each)):.4g}",
             f"{math.degrees(each.gap):.4g}" if known else "-",
             f"{math.degrees(each.interval[0]):.4g} .. {math.degrees(each.interval[1]):.4g}" if known else "-",
             str(each.status),
-            redesign.reason or "a setting was found",
+            setting,
         )
     return table
+
+
+def reasons(loop: Loop) -> Iterator[str]:
+    """Reasons why windows gave no setting, or the fallback set, each with its windows."""
+    times: dict[str, list[float]] = {}
+    for each, redesign in zip(loop.estimates, loop.redesigns, strict=True):
+        if redesign.reason:
+            times.setdefault(redesign.reason, []).append(each.time)
+    for reason, windows in times.items():
+        others = "" if len(windows) == 1 else f" and {len(windows) - 1} more"
+        yield f"  {windows[0]:.4g} s{others}: {reason}"

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import servotwin as st
-from servotwin.cli.loop_report import summary, window_table
+from servotwin.cli.loop_report import reasons, summary, window_table
 from servotwin.cosim import Loop
 from servotwin.cosim.scenario import PRESETS, preset_text
 from servotwin.errors import InvalidInput
@@ -65,6 +65,8 @@ def record(
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if windows and loop.windows:
         console.print(window_table(loop))
+        for line in reasons(loop):
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
     if output is not None:
         table = recording(loop, text)
         write_log(table, output)

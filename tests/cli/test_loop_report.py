@@ -1,5 +1,7 @@
 """What `servotwin simulate` says of a loop: estimates beside the true gap, settings, ends of the steps."""
 
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,11 +9,12 @@ import pytest
 from rich.console import Console
 
 import servotwin as st
-from servotwin.cli.loop_report import step_ends, summary, window_table
+from servotwin.cli.loop_report import reasons, step_ends, summary, window_table
 from servotwin.cli.simulate import record
 from servotwin.cosim import Loop
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
+from servotwin.redesign.policy import Redesign
 
 SCENARIO = """
 servo = "paper"
@@ -77,6 +80,16 @@ def test_the_report_says_what_the_twin_found(loop: Loop) -> None:
     assert " um in the median" in text
     truth = np.degrees(np.interp(accepted[0].time, loop.run.time, loop.run.gap))
     assert f"{truth:.4g}" in text
+
+
+def test_every_window_without_a_setting_has_a_reason(loop: Loop) -> None:
+    assert list(reasons(loop)) == []
+    first, *others = loop.redesigns
+    kept = [Redesign(None, math.nan, "in force already")] * len(others)
+    found = list(reasons(replace(loop, redesigns=(replace(first, reason="the fallback set is sent"), *kept))))
+    times = [each.time for each in loop.estimates]
+    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+    assert found == [f"  {times[0]:.4g} s: the fallback set is sent", f"  {times[1]:.4g} s{more}: in force already"]
 
 
 def test_simulate_shows_the_report_and_writes_what_is_asked_for(file: Path, tmp_path: Path) -> None:
