@@ -285,12 +285,20 @@ class HttpApp:
     own_names : bool
         Refuse requests under a domain's name, as a page of that domain can send them once its name leads here (DNS
         rebinding): where no token protects the service.
+    wrong_token : callable
+        Called with the servo in the path of a request whose token is refused; empty: the path names none.
     """
 
     def __init__(
-        self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan, own_names: bool = False
+        self,
+        routes: Iterable[HttpRoute],
+        metrics: Metrics,
+        lifespan: _Lifespan,
+        own_names: bool = False,
+        wrong_token: Callable[[str], None] = lambda _servo: None,
     ) -> None:
         self._metrics, self.lifespan, self._own_names = metrics, lifespan, own_names
+        self._wrong_token = wrong_token
         self._refusals = RefusalLog(log)
         declared = list(routes)
         # Encoded once: the routes do not change.
@@ -346,6 +354,9 @@ class HttpApp:
         code, status = rejected.refusal.value, rejected.status
         self._metrics.rejected.add(code)
         servo = request.path.get("servo", "")[:64]
+        # A page without a session shows no token, and is no attempt.
+        if rejected.refusal is Refusal.BAD_TOKEN and request.token is not None:
+            self._wrong_token(servo)
         self._refusals.write(code, servo=servo, why=rejected.detail, method=request.method, status=status)
         headers = {"retry-after": "1"} if status in (429, 503) else {}
         if status == 401:
