@@ -41,6 +41,7 @@ from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.pace import VerificationQuota, WorkPace
 from servotwin.twin_service.page_service import PageService
+from servotwin.twin_service.refusals import Refusals
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.store_health import StoreHealth
@@ -198,7 +199,8 @@ class TwinService:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
         own_names = self.tokens is None
-        return HttpApp(routes, self.metrics, self._lifespan, own_names=own_names, wrong_token=self.wrong_tokens.note)
+        refusals = Refusals(self.metrics, self.wrong_tokens.note)
+        return HttpApp(routes, refusals, self._lifespan, own_names=own_names)
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""
