@@ -24,6 +24,7 @@ from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
+from servotwin.twin_service.clock_check import ClockCheck
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher
 from servotwin.twin_service.fleet_reader import EdgePresence
@@ -88,6 +89,7 @@ class TwinService:
         self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
         self.unauthenticated = UnauthenticatedLimit.of(config, self.access, self.operators)
         self._certificate = CertificateExpiry(config, self.clocks.wall)
+        self._clock = ClockCheck(store, self.executor, self.clocks.wall)
         repeat = WebhookConfig.repeat if config.webhook is None else config.webhook.repeat
         self.wrong_tokens = WrongTokens(self._is_enrolled, repeat, self.clocks.monotonic)
         self._shared = not config.store.startswith(SQLITE)
@@ -212,6 +214,7 @@ class TwinService:
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self._certificate.watch(self._announce), vital=False)
+        self._spawn(self._clock.tell(self._announce), vital=False)
         self._spawn(self.wrong_tokens.watch(self._announce), vital=False)
         self._spawn(self._store_health.watch(self._announce), vital=False)
         self._spawn(self.pages.feed.run(), vital=False)
@@ -263,7 +266,7 @@ class TwinService:
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
         fault = "" if self.tokens is None else self.tokens.fault
         former = [f"the former tokens stay in force: {fault}"] if fault else []
-        own = *self._certificate.sentences(), *self.wrong_tokens.sentences()
+        own = *self._clock.sentences(), *self._certificate.sentences(), *self.wrong_tokens.sentences()
         degraded = [*self._lagging(backlog), *former, *own]
         return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 

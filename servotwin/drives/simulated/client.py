@@ -1,11 +1,11 @@
 """Clients of a simulated machine, one for each role; standard library only."""
 
-import os
 import socket
 import sys
 from array import array
 from dataclasses import dataclass
 from math import nan
+from pathlib import Path
 
 from servotwin.drives.simulated import wire
 from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
@@ -103,7 +103,7 @@ class _MachineConnection:
 def _is_linked(address: wire.Address) -> bool:
     """True for a socket with a second name: a folder copied by hard links would lead to the first one's machine."""
     try:
-        return address.path is not None and os.stat(address.path).st_nlink > 1
+        return address.path is not None and Path(address.path).stat().st_nlink > 1
     except OSError:  # connecting says why
         return False
 
