@@ -16,7 +16,7 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Event, Thread
@@ -29,7 +29,15 @@ from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
 from servotwin.edge_process.live_view import LiveView
 from servotwin.edge_process.metrics import write_metrics
-from servotwin.edge_process.monitoring import TroubleLog, log, overwrite_status, read_status, summarise, write_status
+from servotwin.edge_process.monitoring import (
+    TroubleLog,
+    former_trouble,
+    log,
+    overwrite_status,
+    read_status,
+    summarise,
+    write_status,
+)
 from servotwin.edge_process.shared_samples import SampleReader
 from servotwin.edge_process.transports import exclusive_transport, link_token, live_link
 from servotwin.edge_process.twin_limits import limits_told, window_trouble
@@ -65,17 +73,20 @@ class LinkProcess:
 
     def __init__(self, config: EdgeConfig, end: socket.socket, run: str, samples: SampleReader | None = None) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
-        self.outbox = _outbox(config)
+        last = read_status(config.path(config.files.status)) or {}
+        self._run, self.outbox = run, _outbox(config, last)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
         self._token, self._token_replaced = link_token(config), False
         self._transport = exclusive_transport(config, self.outbox, run)
         self._session = Session(self.outbox, config.agent.retry, random.random)
         self._sender = self._receiver = None
+        up, down = former_trouble(last, run, "up"), former_trouble(last, run, "down")
         if self._transport is not None:
-            cursor, retry = self.outbox.number(CURSOR), config.agent.retry
+            servo, retry, cursor = config.agent.servo, config.agent.retry, self.outbox.number(CURSOR)
+            self._session.trouble = up
             self._sender = Sender(self._session, self._transport)
-            self._receiver = Receiver(self._transport, config.agent.servo, self._token, cursor, retry, random.random)
+            self._receiver = Receiver(self._transport, servo, self._token, cursor, retry, random.random, trouble=down)
         self._outbox_changed, self._stopping = Event(), Event()
         self._live = _live_view(config, run, samples, self._transport, self._stopping)
         self._wake, self._woken = socket.socketpair()
@@ -85,9 +96,9 @@ class LinkProcess:
         self._control: frames.StatusFrame | None = None
         self._pending = (-1, Counter[str]())
         self._faults: Counter[str] = Counter()
-        new_losses = self.outbox.salvages or self.outbox.missing
         # Counts of earlier processes are in their logs; what a corrupt file has just cost is in none.
-        self._troubles, self._dropped = TroubleLog(), {} if new_losses else self._dropped_unintended()
+        self._troubles = TroubleLog({"to the twin": up, "from the twin": down})
+        self._dropped = {} if self.outbox.salvages or self.outbox.missing else self._dropped_unintended()
         self._conflict, self._status_trouble = False, ""
 
     def run(self) -> None:
@@ -176,7 +187,7 @@ class LinkProcess:
 
     def _check_token(self) -> None:
         """End where the token was replaced: the next link process reads the new one."""
-        if self._receiver is None or not (self._session.trouble or self._receiver.trouble):
+        if self._token_replaced or self._receiver is None or not (self._session.trouble or self._receiver.trouble):
             return
         with suppress(InvalidInput):  # it is being replaced just now
             self._token_replaced = link_token(self._config) != self._token
@@ -287,7 +298,7 @@ class LinkProcess:
 
     def _status(self) -> dict[str, Any]:
         control, box = self._control, self.outbox
-        status: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role}
+        status: dict[str, Any] = {"servo": self._config.agent.servo, "role": self._config.role, "run": self._run}
         if control is not None:
             longest = float(control.values.get("longest_tick_s") or 0.0)
             status |= {"boot": control.boot, "samples": control.samples, **control.values}
@@ -304,19 +315,20 @@ class LinkProcess:
             "faults": dict(box.faults + self._faults + self._handler.faults),
         }
         if self._receiver is not None:
-            status["up"] = {"trouble": self._session.trouble, **self._session.counts}
+            # As logged: while the process ends, its own end is no trouble.
+            status["up"] = {"trouble": self._troubles.logged("to the twin"), **self._session.counts}
             status["conflict"] = self._conflict
             status["limits"] = limits_told(self._twin)
             if self._live is not None:
                 status["live"] = dict(self._live.counts)
-            status["down"] = {"trouble": self._receiver.trouble, **self._receiver.counts}
+            status["down"] = {"trouble": self._troubles.logged("from the twin"), **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
 
 
-def _outbox(config: EdgeConfig) -> SqliteOutbox:
+def _outbox(config: EdgeConfig, last_status: Mapping[str, Any]) -> SqliteOutbox:
     """Open the outbox; the last status tells how many windows waited in it, and how many it had had."""
     files = config.files
-    windows = (read_status(config.path(files.status)) or {}).get("windows")
+    windows = last_status.get("windows")
     known = windows if isinstance(windows, dict) else {}
     numbers = (known.get(name) for name in LastStatus._fields)
     last = LastStatus(*(number if isinstance(number, int) else 0 for number in numbers))

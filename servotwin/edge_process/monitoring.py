@@ -17,6 +17,7 @@ import msgspec
 from servotwin.runtime.files import replace_file
 
 _STATUS_SCHEMA = "servotwin-edge-status/1"
+_FORMER = "not tried again since the link process was started anew; before: "
 BINS = 4096
 """Bins of one microsecond; a longer time counts in the last one."""
 
@@ -24,10 +25,20 @@ _TYPECODE = "Q"  # 64 bits on every machine: at 5 kHz 32 bits are full in ten da
 
 
 class TroubleLog:
-    """Logs the trouble of each part once, again when it changes, and when it is over."""
+    """Logs the trouble of each part once, again when it changes, and when it is over.
 
-    def __init__(self) -> None:
-        self._logged: dict[str, str] = {}
+    Parameters
+    ----------
+    logged : mapping of str to str, optional
+        Troubles of parts that are in the log already.
+    """
+
+    def __init__(self, logged: Mapping[str, str] | None = None) -> None:
+        self._logged = dict(logged or {})
+
+    def logged(self, where: str) -> str:
+        """Trouble of a part by the log; empty: there is none."""
+        return self._logged.get(where, "")
 
     def update(self, where: str, why: str) -> None:
         """Log a change; `why` is the present trouble of a part, empty: there is none."""
@@ -91,6 +102,16 @@ def read_status(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     except (OSError, msgspec.MsgspecError):
         return None
     return status if isinstance(status, dict) and status.get("schema") == _STATUS_SCHEMA else None
+
+
+def former_trouble(last: Mapping[str, Any], run: str, way: str) -> str:
+    """Trouble in a direction, by the last status, where that is one of the same run; empty: there was none.
+
+    It lasts until the twin answers, but in other words, so that it is logged again where it goes on.
+    """
+    told = last.get(way)
+    why = told.get("trouble") if isinstance(told, dict) and last.get("run") == run else None
+    return _FORMER + why.removeprefix(_FORMER) if isinstance(why, str) and why else ""
 
 
 class TickHistogram:

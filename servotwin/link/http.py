@@ -27,6 +27,8 @@ CLAIM = "Servotwin-Claim"
 _LONGEST_PAUSE_S = 300.0
 """A longer Retry-After is cut to this."""
 _PIECE = 65536
+_OUT_OF_DATE = 9, 10
+"""OpenSSL's codes for a certificate that is not yet valid, and for one that has expired."""
 _LONGEST_RESPONSE, _LONGEST_ERROR = 64 * 1024, 8 * 1024
 """Bytes of a response to a message, and of an error, that are read."""
 
@@ -93,7 +95,7 @@ class _PersistentConnection:
             self.drop()
             # A server may close an idle connection at any time: only a fresh one tells that it is out of reach.
             if fresh or isinstance(error, TimeoutError):
-                raise Unreachable(f"{type(error).__name__}: {error}") from None
+                raise Unreachable(_reason(error)) from None
         return self._request(method, path, body, headers, limit)
 
     def drop(self) -> None:
@@ -263,6 +265,14 @@ class HttpTransport:
         """Close both connections."""
         self._up.close()
         self._down.close()
+
+
+def _reason(error: Exception) -> str:
+    """Reason for which no twin was reached; where its certificate is out of date, with the date of this computer."""
+    reason = f"{type(error).__name__}: {error}"
+    if getattr(error, "verify_code", 0) in _OUT_OF_DATE:
+        reason += f"; the clock of this computer says {time.strftime('%Y-%m-%d', time.gmtime())}"
+    return reason
 
 
 def _claimed(claim: HeldClaim) -> dict[str, str]:

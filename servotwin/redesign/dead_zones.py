@@ -9,7 +9,7 @@ from typing import ClassVar
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate
-from servotwin.messages import Setting
+from servotwin.messages import AnyGains, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.uncertainty import Range
 from servotwin.redesign.policy import Evidence, Redesign
@@ -90,9 +90,17 @@ class HysteresisPolicy:
     needs_estimate: ClassVar[bool] = True
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        """Tolerance and thresholds for an estimate that is OK."""
+        """Tolerance and thresholds for an estimate that is OK; none where those in force fit it already."""
         if evidence.unusable:
             return Redesign(None, math.nan, evidence.unusable)
         estimate = evidence.estimate
-        law = self.servo.controller.replace(enter=self.enter, leave=self.leave)
-        return Redesign(Setting.of(self.servo.p * estimate.gap, gains_of(law)), estimate.gap, "")
+        gains = gains_of(self.servo.controller.replace(enter=self.enter, leave=self.leave))
+        if self._in_force(evidence, gains):
+            return Redesign(None, estimate.gap, "the dead zone in force is that of a gap in the estimate's interval")
+        return Redesign(Setting.of(self.servo.p * estimate.gap, gains), estimate.gap, "")
+
+    def _in_force(self, evidence: Evidence, gains: AnyGains) -> bool:
+        """True where the edge runs these gains, with a dead zone that the estimate does not tell from its own."""
+        low, high = gap_range(evidence.estimate)
+        now = evidence.setting
+        return now is not None and now.gains == gains and self.servo.p * low <= now.tolerance <= self.servo.p * high

@@ -76,6 +76,13 @@ def old_messages(store: Store, now: float, age: float) -> OldMessages:
     return OldMessages(0, left_out)
 
 
+def newest_receipt(store: Store) -> float:
+    """Time at which the message with the highest number was received, s since the epoch; 0: there is none."""
+    with transaction(store.engines.reader) as connection:
+        last = _receipt(connection, _LAST)
+    return 0.0 if last is None else last.received
+
+
 def _backwards(
     first: _Receipt, last: _Receipt, step: float, up_to: Callable[[int], _Receipt | None]
 ) -> Iterator[_Receipt]:

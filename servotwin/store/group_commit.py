@@ -194,12 +194,14 @@ class AwaitedCommits:
     ----------
     failed_at : float
         Time of the last failure, on `clock`; -inf: the last write succeeded.
+    failure : str
+        Reason of that failure.
     """
 
     def __init__(self, commits: GroupCommit, clock: Callable[[], float] = time.monotonic) -> None:
         self._commits, self._clock = commits, clock
         self._done: deque[tuple[asyncio.Future[Any], Future[Any]]] = deque()
-        self.failed_at = -math.inf
+        self.failed_at, self.failure = -math.inf, ""
 
     async def put(self, item: Incoming) -> PutResult:
         """Store a message; returns when it is on the disk. Raises as `GroupCommit.put` and its future do."""
@@ -212,10 +214,10 @@ class AwaitedCommits:
     async def _result(self, write: Callable[[_Record], Future[_Result]], record: _Record) -> _Result:
         try:
             result = await self._wrap(write(record))
-        except StoreUnavailable:
-            self.failed_at = self._clock()
+        except StoreUnavailable as error:
+            self.failed_at, self.failure = self._clock(), str(error)
             raise
-        self.failed_at = -math.inf
+        self.failed_at, self.failure = -math.inf, ""
         return result
 
     def _wrap(self, future: Future[_Result]) -> asyncio.Future[_Result]:

@@ -63,6 +63,11 @@ class Dispatcher:
         True while nothing new is to be begun.
     speed : float
         Least ratio of sample time to real time.
+
+    Attributes
+    ----------
+    away : str
+        Why no work can be taken from the store now; empty: it can.
     """
 
     def __init__(
@@ -87,7 +92,7 @@ class Dispatcher:
         self._estimate_pace, self._estimates = WorkPace(), EstimateShare()
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for, self._latest = False, False, set[str]()
-        self._away = ""
+        self.away = ""
         self._tasks: set[asyncio.Task[None]] = set()
         self._to_release: set[str] = set()
         self._failures: Counter[_Queue] = Counter()
@@ -170,25 +175,15 @@ class Dispatcher:
                 await self._release_failed()
                 leases = await self._lease_next()
             except StoreUnavailable as error:
-                self._say_away(str(error))
+                self.away = str(error)
                 await self._rest(_RETRY_S)
                 continue
-            self._say_away("")
+            self.away = ""
             if leases:
                 return leases
             self._waited_for = False
             await self._rest(_POLL_S)
         return []
-
-    def _say_away(self, why: str) -> None:
-        """Log that the store went away, with another reason, or came back, once each: a log fills a full disk too."""
-        if why == self._away:
-            return
-        self._away = why
-        if why:
-            log.error("store not available", extra={"why": why})
-        else:
-            log.info("store available again")
 
     async def _lease_next(self) -> list[Lease]:
         """Lease a verification if the quota allows one, otherwise messages, or an estimate that was deferred."""

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import ipaddress
-import logging
 import math
 import re
 import traceback
@@ -23,10 +22,8 @@ from servotwin.messages import Refusal
 from servotwin.messages.codec import ENCODINGS
 from servotwin.twin_service.auth import bearer_token
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
-from servotwin.twin_service.monitoring import Metrics, RefusalLog
 from servotwin.twin_service.openapi import JSON, MAX_INTEGER, MSGPACK, Operation, openapi_document
-
-log = logging.getLogger(__name__)
+from servotwin.twin_service.refusals import Refusals
 
 Scope = MutableMapping[str, Any]
 Send = Callable[[MutableMapping[str, Any]], Awaitable[None]]
@@ -278,8 +275,8 @@ class HttpApp:
     Parameters
     ----------
     routes : iterable of HttpRoute
-    metrics : Metrics
-        Counts rejections.
+    refusals : Refusals
+        Counts, logs and slows rejections.
     lifespan : callable
         Context manager that is entered before the first request and left after the last.
     own_names : bool
@@ -288,10 +285,13 @@ class HttpApp:
     """
 
     def __init__(
-        self, routes: Iterable[HttpRoute], metrics: Metrics, lifespan: _Lifespan, own_names: bool = False
+        self,
+        routes: Iterable[HttpRoute],
+        refusals: Refusals,
+        lifespan: _Lifespan,
+        own_names: bool = False,
     ) -> None:
-        self._metrics, self.lifespan, self._own_names = metrics, lifespan, own_names
-        self._refusals = RefusalLog(log)
+        self._refusals, self.lifespan, self._own_names = refusals, lifespan, own_names
         declared = list(routes)
         # Encoded once: the routes do not change.
         document = msgspec.json.encode(
@@ -324,7 +324,7 @@ class HttpApp:
             handler = handlers.get(scope["method"])
             if handler is None:
                 allowed = {"allow": ", ".join(sorted(handlers))}
-                return self._no_route(405, "this path does not know that method", allowed)
+                return await self._no_route(405, "this path does not know that method", allowed)
             request = HttpRequest(scope, receive, match.groupdict())
             try:
                 if self._own_names and _is_domain(request.host):
@@ -333,20 +333,21 @@ class HttpApp:
                     raise RequestRejected(Refusal.NOT_UNDERSTOOD, "the request comes from a page of another site", 403)
                 return await handler(request)
             except RequestRejected as rejected:
-                return self._rejection(request, rejected)
-        return self._no_route(404, "there is no such path")
+                return await self._rejection(request, rejected)
+        return await self._no_route(404, "there is no such path")
 
-    def _no_route(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> HttpResponse:
-        code = Refusal.NOT_UNDERSTOOD.value
-        self._metrics.rejected.add(code)
-        return json_response({"code": code, "detail": detail}, status, headers)
+    async def _no_route(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> HttpResponse:
+        code = Refusal.NOT_UNDERSTOOD
+        await self._refusals.count(code)
+        return json_response({"code": code.value, "detail": detail}, status, headers)
 
-    def _rejection(self, request: HttpRequest, rejected: RequestRejected) -> HttpResponse:
+    async def _rejection(self, request: HttpRequest, rejected: RequestRejected) -> HttpResponse:
         """Error body; the rejection is counted, and logged without the body of the request."""
         code, status = rejected.refusal.value, rejected.status
-        self._metrics.rejected.add(code)
-        servo = request.path.get("servo", "")[:64]
-        self._refusals.write(code, servo=servo, why=rejected.detail, method=request.method, status=status)
+        servo, shown = request.path.get("servo", "")[:64], request.token is not None
+        about = {"why": rejected.detail, "method": request.method, "status": status}
+        self._refusals.log(rejected.refusal, servo, shown, **about)
+        await self._refusals.count(rejected.refusal)
         headers = {"retry-after": "1"} if status in (429, 503) else {}
         if status == 401:
             headers["www-authenticate"] = "Bearer"

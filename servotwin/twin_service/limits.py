@@ -92,6 +92,13 @@ class RateLimiter:
         RequestRejected
             TOO_MANY: the bucket holds fewer, and is not full.
         """
+        if not self.admits(servo, number):
+            raise RequestRejected(
+                Refusal.TOO_MANY, f"more than {self._rate:g} {self._counted} per s of {self._owner} {servo!r}"
+            )
+
+    def admits(self, servo: str, number: float = 1.0) -> bool:
+        """Take tokens of a servo; False: the bucket holds fewer, and none is taken."""
         now = self._now()
         level, at = self._levels.get(servo, (self._burst, now))
         level = min(self._burst, level + self._rate * (now - at))
@@ -102,10 +109,7 @@ class RateLimiter:
         self._levels.move_to_end(servo)
         if len(self._levels) > MAX_SERVOS:
             self._levels.popitem(last=False)
-        if empty:
-            raise RequestRejected(
-                Refusal.TOO_MANY, f"more than {self._rate:g} {self._counted} per s of {self._owner} {servo!r}"
-            )
+        return not empty
 
     def give_back(self, servo: str, number: float) -> None:
         """Give tokens back that were taken for nothing."""

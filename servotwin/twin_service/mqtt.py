@@ -62,6 +62,8 @@ class MqttRequestHandler:
     wake : callable
         Wakes the dispatcher after a new message.
     metrics : Metrics
+    wrong_token : callable
+        Called with the servo of a request whose seal, or its servo's lack of a token, is refused.
     """
 
     def __init__(
@@ -73,10 +75,11 @@ class MqttRequestHandler:
         live: LiveIntake,
         wake: Callable[[], None],
         metrics: Metrics,
+        wrong_token: Callable[[str], None],
     ) -> None:
         self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
         self._claims, self._live = claims, live
-        self._refusals = RefusalLog(log)
+        self._refusals, self._wrong_token = RefusalLog(log), wrong_token
 
     def decode(self, servo: str, data: bytes) -> ReceivedRequest | bytes | None:
         """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
@@ -125,6 +128,8 @@ class MqttRequestHandler:
     def _count(self, servo: str, code: Refusal, why: str) -> None:
         self._metrics.rejected.add(code.value)
         self._refusals.write(code.value, servo=servo, why=why)
+        if code is Refusal.BAD_TOKEN:
+            self._wrong_token(servo)
 
 
 class MqttServer:

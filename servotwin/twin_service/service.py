@@ -24,6 +24,7 @@ from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
+from servotwin.twin_service.clock_check import ClockCheck
 from servotwin.twin_service.config import SQLITE
 from servotwin.twin_service.dispatcher import Dispatcher
 from servotwin.twin_service.fleet_reader import EdgePresence
@@ -41,13 +42,17 @@ from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
 from servotwin.twin_service.pace import VerificationQuota, WorkPace
 from servotwin.twin_service.page_service import PageService
+from servotwin.twin_service.refusals import Refusals
 from servotwin.twin_service.sessions import OperatorAccess
 from servotwin.twin_service.store_executor import StoreExecutor
+from servotwin.twin_service.store_health import StoreHealth
 from servotwin.twin_service.store_watch import StoreWatch
 from servotwin.twin_service.tls_expiry import CertificateExpiry
 from servotwin.twin_service.twin_file import TwinFile
 from servotwin.twin_service.unauthenticated import UnauthenticatedLimit
+from servotwin.twin_service.webhook import WebhookConfig
 from servotwin.twin_service.worker_pool import WorkerPool, pool_of
+from servotwin.twin_service.wrong_tokens import WrongTokens
 
 log = logging.getLogger(__name__)
 
@@ -55,8 +60,6 @@ _REFRESH_S, _WATCH_S, _RETENTION_S, _DAY = 1.0, 5.0, 600.0, 86400.0
 _LEAST_DELETED = 4096
 """Windows that one pass of retention may empty, beside twice those that came since the pass before: it keeps pace, and
 a mistake does not cost the past at once."""
-_UNHEALTHY_S = 60.0
-"""s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
 _SOLE_OWNER = "twin"
 """Owner of all leases where one process has the store to itself: after a crash it releases its own."""
 
@@ -86,6 +89,9 @@ class TwinService:
         self.operators = OperatorAccess(self.access, self.clocks.wall, config.encrypted)
         self.unauthenticated = UnauthenticatedLimit.of(config, self.access, self.operators)
         self._certificate = CertificateExpiry(config, self.clocks.wall)
+        self._clock = ClockCheck(store, self.executor, self.clocks.wall)
+        repeat = WebhookConfig.repeat if config.webhook is None else config.webhook.repeat
+        self.wrong_tokens = WrongTokens(self._is_enrolled, repeat, self.clocks.monotonic)
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
@@ -109,6 +115,9 @@ class TwinService:
         if config.webhook is not None:
             self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
         self.dispatcher = self._make_dispatcher()
+        self._store_health = StoreHealth(
+            self.executor, self._writes, lambda: self.dispatcher.away, lambda: self.watch.fault, self.clocks.monotonic
+        )
         self.claims = self._make_claims()
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)
@@ -117,8 +126,9 @@ class TwinService:
         if config.mqtt is not None:
             live = self.pages.live_intake
             handler = MqttRequestHandler(
-                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self.metrics
-            )
+                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self.metrics,
+                self.wrong_tokens.note,
+            )  # fmt: skip
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []
         self._vital: list[asyncio.Task[None]] = []
@@ -190,7 +200,9 @@ class TwinService:
         if self.config.lockstep:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
-        return HttpApp(routes, self.metrics, self._lifespan, own_names=self.tokens is None)
+        own_names = self.tokens is None
+        refusals = Refusals(self.metrics, self.wrong_tokens.note)
+        return HttpApp(routes, refusals, self._lifespan, own_names=own_names)
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""
@@ -202,11 +214,14 @@ class TwinService:
         await self.pool.start()
         self._spawn(self._refresh_tokens())
         self._spawn(self._certificate.watch(self._announce), vital=False)
+        self._spawn(self._clock.tell(self._announce), vital=False)
+        self._spawn(self.wrong_tokens.watch(self._announce), vital=False)
+        self._spawn(self._store_health.watch(self._announce), vital=False)
         self._spawn(self.pages.feed.run(), vital=False)
         self._spawn(self.pages.what_if.run())
         if self.webhook is not None:
             self._spawn(self.webhook.run())
-            self._spawn(self._announce_damage())
+            self._spawn(self.watch.tell(self._announce), vital=False)
         if self._shared:
             self._spawn(self._poll_outgoing())
         if not self.config.lockstep:
@@ -246,11 +261,13 @@ class TwinService:
 
     def health(self, backlog: Backlog | None = None) -> dict[str, Any]:
         """Health of each part, "ok" for all, and in "degraded" a sentence for all that works, but not as it should."""
-        store, workers, dispatching = self._store_healthy(), self.pool.alive, self.dispatching
+        store = not self.watch.fault and not self._store_health.trouble
+        workers, dispatching = self.pool.alive, self.dispatching
         parts = {"store": store, "damage": self.watch.fault, "workers": workers, "dispatching": dispatching}
         fault = "" if self.tokens is None else self.tokens.fault
         former = [f"the former tokens stay in force: {fault}"] if fault else []
-        degraded = [*self._lagging(backlog), *former, *self._certificate.sentences()]
+        own = *self._clock.sentences(), *self._certificate.sentences(), *self.wrong_tokens.sentences()
+        degraded = [*self._lagging(backlog), *former, *own]
         return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property
@@ -265,11 +282,8 @@ class TwinService:
             return []
         return [f"new messages of a servo have waited for {backlog.lag:.0f} s, {backlog.messages} in all"]
 
-    def _store_healthy(self) -> bool:
-        """Last read and last write succeeded, or that write failed long ago: none may have been tried since."""
-        if self.watch.fault:
-            return False
-        return not self.executor.fault and self.clocks.monotonic() - self._writes.failed_at >= _UNHEALTHY_S
+    def _is_enrolled(self, servo: str) -> bool:
+        return not self.access.open and self.access.verifier(servo) is not None
 
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
         return await self.executor.run(lambda: self.store.outgoing(servo, after))
@@ -316,15 +330,6 @@ class TwinService:
         """Post an alarm, where there is a webhook."""
         if self.webhook is not None:
             self.webhook.announce(kind, sentence, servo)
-
-    async def _announce_damage(self) -> None:
-        """Post that the store has lost messages, if it has, and that it is damaged, once it is."""
-        if self.watch.lost:
-            self._announce("the store has lost messages", self.watch.lost)
-        while not self.watch.fault:
-            await asyncio.sleep(_REFRESH_S)
-        self._announce("store damaged", f"it is not written any more: {self.watch.fault}")
-        await asyncio.Event().wait()
 
     async def _apply_retention(self) -> None:
         """Delete the bodies of windows that are too old: never at the start, where a wrong clock is set right."""

@@ -29,6 +29,7 @@ _BODIES, _SHARE = 32, 0.02
 """Bodies that are compared at once, and the share of the time for that."""
 _MARK_S = 5.0
 """s between two notes of the newest message: as many acknowledged messages may go unnoticed if the log is lost."""
+_TELL_S = 1.0
 _MARK = "newest"
 _LOST = "the twin's store has lost messages"
 
@@ -64,7 +65,7 @@ class StoreWatch:
         self._store, self._executor = store, executor
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
-        self._marked = 0
+        self._marked, self._not_marked = 0, ""
         self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
@@ -105,6 +106,14 @@ class StoreWatch:
             with suppress(StoreUnavailable):
                 await self._executor.run(self.mark)
 
+    async def tell(self, announce: Callable[[str, str], None]) -> None:
+        """Announce that the store has lost messages, if it has, and that it is damaged, once it is."""
+        if self.lost:
+            announce("the store has lost messages", self.lost)
+        while not self.fault:
+            await asyncio.sleep(_TELL_S)
+        announce("store damaged", f"it is not written any more: {self.fault}")
+
     def mark(self) -> None:
         """Note the newest message beside an SQLite store."""
         file = self._mark_file
@@ -113,9 +122,11 @@ class StoreWatch:
             return
         try:
             replace_file(file, b"%d\n" % newest, durable=True, mode=0o600)
-            self._marked = newest
+            self._marked, self._not_marked = newest, ""
         except OSError as error:
-            log.warning("newest message not noted", extra={"why": str(error)})
+            if str(error) != self._not_marked:  # each reason once: a log fills a full disk too
+                log.warning("newest message not noted", extra={"why": str(error)})
+            self._not_marked = str(error)
 
     @property
     def _mark_file(self) -> Path | None:

@@ -20,6 +20,7 @@ from servotwin.cosim.scenario import Scenario
 from servotwin.drives.simulated import wire
 from servotwin.drives.simulated.client import SimulatedControl, SimulatedSupervised
 from servotwin.drives.simulated.plants import ControlledPlant, SupervisedPlant
+from servotwin.drives.simulated.server import listening
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge.drive import Block, ControlDrive, DriveLost, DriveRefused, DriveSample, SupervisedDrive
 from servotwin.edge.parameters import Parameters
@@ -298,3 +299,30 @@ def _ticked(drive: ControlDrive) -> DriveSample:
     assert sample is not None
     drive.write(0.0)
     return sample
+
+
+@pytest.mark.slow
+def test_a_copied_socket_leads_to_no_other_folders_machine_and_is_none_in_the_way(tmp_path: Path) -> None:
+    """`cp -r` copies the file of a socket, and hard links (`cp -al`) would lead to the first folder's machine."""
+    first, copy, links = tmp_path / "ax-1", tmp_path / "ax-2", tmp_path / "ax-3"
+    for folder in (first, copy, links):
+        folder.mkdir()
+    with wire.new_socket(wire.Address(str(first / "drive.sock"))) as machine_of_first:
+        machine_of_first.bind(str(first / "drive.sock"))
+        machine_of_first.listen()
+        machine_of_first.setblocking(False)
+        subprocess.run(["cp", "-r", first / "drive.sock", copy], check=True)
+        (links / "drive.sock").hardlink_to(first / "drive.sock")
+        for folder, words in ((copy, "nobody listens at this socket"), (links, "hard link to the socket of another")):
+            with closing(SimulatedControl(f"unix:{folder / 'drive.sock'}")) as drive:
+                with pytest.raises(DriveLost, match=words):
+                    drive.connect()
+                with pytest.raises(BlockingIOError):
+                    machine_of_first.accept()
+        # The machine of the copy replaces the copied file.
+        with listening(wire.Address(str(copy / "drive.sock"))) as machine_of_copy:
+            machine_of_copy.setblocking(False)
+            with closing(SimulatedControl(f"unix:{copy / 'drive.sock'}", silence=0.1)) as drive:
+                with pytest.raises(DriveLost):  # accepted, but nobody answers
+                    drive.connect()
+                machine_of_copy.accept()[0].close()

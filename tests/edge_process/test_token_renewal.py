@@ -5,9 +5,16 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
+from edge_process_parts import cut
+from faketwin import FakeTwin
+from waiting import until
 
+from servotwin.edge_process import frames
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.link_process import LinkProcess
+from servotwin.edge_process.monitoring import read_status
+from servotwin.messages import ClaimStatus, Refusal
+from servotwin.runtime.frames import FrameSocket
 
 EDGE = """
 servo = "ax-1"
@@ -68,3 +75,71 @@ def test_the_link_process_goes_on_while_its_token_is_missing(linked):
     (folder / "token").unlink()
     running.join(2.5)
     assert running.is_alive()
+
+
+class Link:
+    """A link process in a thread, as the control process of a run starts it."""
+
+    def __init__(self, folder: Path, run: str) -> None:
+        self.pipe, theirs = socket.socketpair()
+        self.running = Thread(target=LinkProcess(load(folder / "edge.toml"), theirs, run).run)
+        self.running.start()
+
+    def send(self, sequence: int) -> None:
+        near = FrameSocket(self.pipe)
+        near.post(frames.encode(frames.window_frame(cut(sequence), "b1-00", sequence + 1)))
+        while near.backlog:
+            near.send()
+
+    def end(self) -> None:
+        self.pipe.close()
+        self.running.join(PATIENCE)
+        assert not self.running.is_alive()
+
+
+@pytest.mark.slow
+def test_trouble_that_a_new_token_ends_is_over_in_the_log_once_the_twin_has_acknowledged(tmp_path, capfd):
+    log = ""
+
+    def logged(event: str, where: str) -> int:
+        nonlocal log
+        log += capfd.readouterr().err
+        return sum(f'"event":"{event}","where":"{where}"' in line for line in log.splitlines())
+
+    both = "to the twin", "from the twin"
+    write_token(tmp_path, "first")
+    with FakeTwin("ax-1", "second") as twin:
+        twin.claim_status = ClaimStatus("ax-1")
+        (tmp_path / "edge.toml").write_text(EDGE.format(port=twin.url.rpartition(":")[2]))
+        link = Link(tmp_path, "b1-00")
+        link.send(0)
+        until(lambda: all(logged("trouble", way) == 1 for way in both))
+        twin.fault = lambda handler, _: handler.refuse(503, Refusal.UNAVAILABLE) or True
+        write_token(tmp_path, "second")
+        link.running.join(PATIENCE)
+        link.end()
+        link = Link(tmp_path, "b1-00")
+        until(lambda: all(logged("trouble", way) >= 2 for way in both))
+        assert log.count("token replaced") == 1
+        assert not any(logged("trouble over", way) for way in both), "nothing was acknowledged yet"
+        twin.fault = None
+        until(lambda: ("b1-00", 0) in twin.windows)
+        until(lambda: all(logged("trouble over", way) == 1 for way in both))
+        link.end()
+        link = Link(tmp_path, "b1-00")  # restarted again, in a run without trouble since
+        link.send(1)
+        until(lambda: ("b1-00", 1) in twin.windows)
+        until(lambda: (read_status(tmp_path / "status.json") or {})["up"].get("windows") == 1)
+        link.end()
+        assert all(logged("trouble over", way) == 1 for way in both)
+        twin.token = "third"
+        link = Link(tmp_path, "b1-00")
+        link.send(2)
+        until(lambda: "bad_token" in (read_status(tmp_path / "status.json") or {})["up"]["trouble"])
+        link.end()
+        twin.token = "second"
+        log = ""
+        link = Link(tmp_path, "b2-00")  # another start of the edge, whose log has no trouble
+        until(lambda: ("b1-00", 2) in twin.windows)
+        link.end()
+        assert not any(logged("trouble over", way) for way in both)

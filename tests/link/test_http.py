@@ -3,6 +3,7 @@
 import socket
 import ssl
 import threading
+import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -238,8 +239,27 @@ def test_over_tls_the_certificate_is_checked(twin: FakeTwin, certificate: Path) 
         HttpTransport(url, "axis-1", "secret", str(certificate.with_name("absent.pem")))
 
 
+@pytest.mark.parametrize(("begin", "end", "words"), [(1, 2, "not yet valid"), (-2, -1, "has expired")])
+def test_a_certificate_that_is_out_of_date_is_named_with_the_date_of_this_computer(
+    twin: FakeTwin, tmp_path: Path, begin: int, end: int, words: str
+) -> None:
+    made = make_certificate(tmp_path, begin, end)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(made)
+    twin.server.socket = context.wrap_socket(twin.server.socket, server_side=True)
+    link = HttpTransport(twin.url.replace("http:", "https:"), "axis-1", "secret", str(made), 5.0)
+    today = time.strftime("%Y-%m-%d", time.gmtime())
+    with pytest.raises(Unreachable, match=f"{words}.*; the clock of this computer says {today}"):
+        link.deliver(parcel(0))
+
+
 @pytest.fixture(scope="module")
 def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_certificate(tmp_path_factory.mktemp("tls"), -1, 2)
+
+
+def make_certificate(folder: Path, begin: int, end: int) -> Path:
+    """A certificate that is valid between two days from now, with its key."""
     import datetime
     import ipaddress
 
@@ -257,13 +277,13 @@ def certificate(tmp_path_factory: pytest.TempPathFactory) -> Path:
         .issuer_name(name)
         .public_key(key.public_key())
         .serial_number(1)
-        .not_valid_before(now - datetime.timedelta(days=1))
-        .not_valid_after(now + datetime.timedelta(days=2))
+        .not_valid_before(now + datetime.timedelta(days=begin))
+        .not_valid_after(now + datetime.timedelta(days=end))
         .add_extension(x509.SubjectAlternativeName([x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]), False)
         .add_extension(x509.BasicConstraints(ca=True, path_length=None), True)
         .sign(key, hashes.SHA256())
     )
-    file = tmp_path_factory.mktemp("tls") / "twin.pem"
+    file = folder / "twin.pem"
     private = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )

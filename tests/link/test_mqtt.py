@@ -156,6 +156,7 @@ def test_another_servos_token_speaks_for_nobody_else(server: Mosquitto, store: S
                 here.deliver(parcel(0))
             assert refused.value.reason.temporary
         assert refusals(there) == {"bad_token": 3}
+        assert len(there.wrong_tokens) == 3
     assert kept(store) == []
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy, gap_range
 from servotwin.redesign.policy import Evidence
@@ -60,3 +62,20 @@ def test_hysteresis_enters_inside_and_leaves_outside() -> None:
     assert made.setting is not None
     assert (made.setting.gains.enter, made.setting.gains.leave) == (0.5, 1.5)
     assert made.setting.tolerance == SERVO.tolerance_for(10.0 * DEG)
+
+
+def test_hysteresis_sends_nothing_while_the_dead_zone_in_force_fits_the_estimate() -> None:
+    """A gap that stays sends one setting; wear, other gains and an unknown setting send one again."""
+    rule = HysteresisPolicy(SERVO)
+    sent = rule.redesign(Evidence(estimated(10.0))).setting
+    spread = gap_range(estimated(10.0))[1] / DEG - 10.0
+    for gap in (10.0, 10.0 + 0.9 * spread, 10.0 - 0.9 * spread):
+        again = rule.redesign(Evidence(estimated(gap), setting=sent))
+        assert again.setting is None
+        assert again.gap == gap * DEG
+        assert again.reason == "the dead zone in force is that of a gap in the estimate's interval"
+    for gap in (10.0 + 1.1 * spread, 10.0 - 1.1 * spread):
+        assert rule.redesign(Evidence(estimated(gap), setting=sent)).setting.tolerance == SERVO.tolerance_for(gap * DEG)
+    others = (Setting(sent.tolerance), Setting.of(sent.tolerance, msgspec.structs.replace(sent.gains, leave=2.0)))
+    for other in others:
+        assert rule.redesign(Evidence(estimated(10.0), setting=other)).setting == sent

@@ -46,7 +46,7 @@ class Twin:
     """The service without HTTP and without estimation, on a thread of its own."""
 
     def __init__(self, at: Broker, store: Store) -> None:
-        self.metrics, self.store = Metrics(), store
+        self.metrics, self.store, self.wrong_tokens = Metrics(), store, list[str]()
         self.commits = GroupCommit(store)
         self._broker, self._began, self._thread = at, threading.Event(), threading.Thread(target=self._run)
         self._thread.start()
@@ -91,7 +91,9 @@ class Twin:
         )
         self.views = LiveViews(self._loop.time, lambda _: None, 5, 5)
         live = LiveIntake(claims, self.views, self._loop.time)
-        handler = MqttRequestHandler(gate, ingest, self.polls, claims, live, lambda: None, self.metrics)
+        handler = MqttRequestHandler(
+            gate, ingest, self.polls, claims, live, lambda: None, self.metrics, self.wrong_tokens.append
+        )
         server = MqttServer(self._broker, handler, "twins")
         await server.start()
         while not server.connected:

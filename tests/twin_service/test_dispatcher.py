@@ -178,18 +178,24 @@ def test_a_servo_waits_until_its_share_of_a_worker_is_not_exceeded():
     assert WorkPace(0.25).hold(0.01) == WorkPace(1.0).hold(60.0) == 0.0
 
 
-def test_a_store_that_is_away_is_said_once_and_again_when_it_is_back(monkeypatch, caplog):
-    lease, faults = Lender.lease, iter(["the disk is full", "the disk is full", "read-only"])
+def test_a_dispatcher_knows_why_it_gets_no_work_and_when_the_store_is_back(monkeypatch):
+    lease, rest = Lender.lease, Dispatcher._rest
+    faults, known = iter(["the disk is full", "the disk is full", "read-only"]), []
+    resting_ones = []
 
     def away(self, *args, **more):
         for fault in faults:
             raise StoreUnavailable(fault)
         return lease(self, *args, **more)
 
+    async def resting(self, seconds):
+        known.append(self.away)
+        resting_ones.append(self)
+        await rest(self, seconds)
+
     monkeypatch.setattr(Lender, "lease", away)
+    monkeypatch.setattr(Dispatcher, "_rest", resting)
     monkeypatch.setattr(dispatching, "_RETRY_S", 1e-3)
-    caplog.set_level("INFO")
     through([[claim("ax-1")]])
-    said = [(record.message, getattr(record, "why", "")) for record in caplog.records if "available" in record.message]
-    away_twice = [("store not available", "the disk is full"), ("store not available", "read-only")]
-    assert said == [*away_twice, ("store available again", "")]
+    assert known[:3] == ["the disk is full", "the disk is full", "read-only"]
+    assert resting_ones[-1].away == ""

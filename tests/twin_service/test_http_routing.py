@@ -14,6 +14,7 @@ from service_system import OPERATOR, OTHER, TOKEN, served, twin_file, window
 from servotwin.messages import encode
 from servotwin.twin_service.http_app import HttpApp
 from servotwin.twin_service.monitoring import Metrics
+from servotwin.twin_service.refusals import Refusals
 
 NAMES = ("ax-1", "ax-2", "ax-9", "b", "a/b", "..", "%2F", "ax-1\n", "é", "\0", "a" * 70, "", "0", "1", "01", "-1", "٣")
 QUERIES = (
@@ -128,6 +129,6 @@ def test_a_service_that_does_not_start_reports_it_to_the_server(tmp_path):
             await app({"type": "lifespan"}, receive, send)
         return sent
 
-    good = HttpApp([], Metrics(), contextlib.nullcontext)
+    good = HttpApp([], Refusals(Metrics()), contextlib.nullcontext)
     assert asyncio.run(events(good)) == ["lifespan.startup.complete", "lifespan.shutdown.complete"]
-    assert asyncio.run(events(HttpApp([], Metrics(), broken))) == ["lifespan.startup.failed"]
+    assert asyncio.run(events(HttpApp([], Refusals(Metrics()), broken))) == ["lifespan.startup.failed"]

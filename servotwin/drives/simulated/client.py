@@ -5,6 +5,7 @@ import sys
 from array import array
 from dataclasses import dataclass
 from math import nan
+from pathlib import Path
 
 from servotwin.drives.simulated import wire
 from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
@@ -44,6 +45,9 @@ class _MachineConnection:
         self._socket = wire.new_socket(self._address)
         wire.set_timeout(self._socket, self._silence)
         wire.disable_nagle(self._socket)
+        if _is_linked(self._address):
+            self.close()
+            raise DriveLost(f"machine {self._address}: is a hard link to the socket of another folder; remove it")
         try:
             self._socket.connect(wire.socket_address(self._address))
             self._socket.sendall(wire.HELLO.pack(wire.MAGIC, wire.VERSION, wire.ROLES[self._role]))
@@ -85,6 +89,8 @@ class _MachineConnection:
         """Close the connection, and return the error to raise."""
         self.close()
         reason = f"silent for {self._silence:g} s" if isinstance(error, BlockingIOError) else str(error)
+        if isinstance(error, ConnectionRefusedError) and self._address.path is not None:
+            reason = "nobody listens at this socket: its machine does not run, or the file was copied"
         return DriveLost(f"machine {self._address}: {reason}")
 
     def close(self) -> None:
@@ -92,6 +98,14 @@ class _MachineConnection:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+
+def _is_linked(address: wire.Address) -> bool:
+    """True for a socket with a second name: a folder copied by hard links would lead to the first one's machine."""
+    try:
+        return address.path is not None and Path(address.path).stat().st_nlink > 1
+    except OSError:  # connecting says why
+        return False
 
 
 class SimulatedControl:

@@ -1,0 +1,76 @@
+"""Health of the store, as the last reads and writes found it; told when they begin to fail, and when that is over."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+from collections.abc import Callable
+
+from servotwin.store.group_commit import AwaitedCommits
+from servotwin.twin_service.store_executor import StoreExecutor
+
+log = logging.getLogger(__name__)
+
+_UNHEALTHY_S = 60.0
+"""s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
+_LOOK_S, _LASTS_S, _OVER_S = 1.0, 5.0, 10.0
+"""s between two looks; after which trouble is no moment's, and posted; without trouble after which it is over: on a
+full disk reads succeed between writes that fail."""
+
+
+class StoreHealth:
+    """Health of a store that is not damaged.
+
+    Parameters
+    ----------
+    executor : StoreExecutor
+    writes : AwaitedCommits
+    leases : callable
+        Why the dispatcher cannot take work from the store; empty: it can.
+    damage : callable
+        Damage of the store, which is told elsewhere; empty: none.
+    monotonic : callable
+        s.
+    """
+
+    def __init__(
+        self,
+        executor: StoreExecutor,
+        writes: AwaitedCommits,
+        leases: Callable[[], str],
+        damage: Callable[[], str],
+        monotonic: Callable[[], float],
+    ) -> None:
+        self._executor, self._writes, self._now = executor, writes, monotonic
+        self._leases, self._damage = leases, damage
+        self._logged, self._posted, self._since, self._seen = "", False, 0.0, -math.inf
+
+    @property
+    def trouble(self) -> str:
+        """Why the last read or write failed; empty: it did not, or that write failed long ago: none was tried since."""
+        if self._damage():
+            return ""
+        failed = self._writes.failure if self._now() - self._writes.failed_at < _UNHEALTHY_S else ""
+        return self._leases() or failed or self._executor.fault
+
+    def look(self, announce: Callable[[str, str], None]) -> None:
+        """Log trouble, each reason once, since a log fills a full disk too; announce it once it lasts."""
+        trouble, now = self.trouble, self._now()
+        if trouble:
+            self._since, self._seen = self._since if self._logged else now, now
+            if trouble != self._logged:
+                self._logged = trouble
+                log.error("store not available", extra={"why": trouble})
+            if not self._posted and now - self._since >= _LASTS_S:
+                self._posted = True
+                announce("store not available", f"{trouble}; windows are refused meanwhile, and edges keep them")
+        elif self._logged and not self._writes.failure and now - self._seen >= _OVER_S:
+            self._logged, self._posted = "", False
+            log.info("store available again")
+
+    async def watch(self, announce: Callable[[str, str], None]) -> None:
+        """Look again and again."""
+        while True:
+            self.look(announce)
+            await asyncio.sleep(_LOOK_S)
