@@ -153,7 +153,11 @@ class Scenario:
             scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))
             table.done()
             scenario.servo.check_loop(scenario.law)
-            scenario.agent_settings()
+            try:
+                scenario.agent_settings()
+            except InvalidInput as error:
+                hint = "; without a twin it can be simulated: enabled = false in [twin], and no policy"
+                raise InvalidInput(f"{error}{hint}") from None
             return scenario
 
     def replace(self, **changes: Any) -> Scenario:

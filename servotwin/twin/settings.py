@@ -140,7 +140,13 @@ class TwinSettings:
         another method or policy.
     """
 
-    enabled: Annotated[bool, key(help="Answer the edge's windows.")] = True
+    enabled: Annotated[
+        bool,
+        key(
+            help="Answer the edge's windows. A scenario of a twin that does not, and that states no policy, runs with "
+            "the servo's own controller."
+        ),
+    ] = True
     method: Annotated[str, key(choices=tuple(METHODS), help="Estimator; the table [estimator] has its settings.")] = (
         whitened.METHOD
     )
