@@ -20,18 +20,13 @@ from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined, unseen_error
-from servotwin.redesign.certified.certificate import (
-    BeyondResult,
-    Certificate,
-    Demands,
-    LongResult,
-    LoopMargins,
-    RampResult,
-)
+from servotwin.redesign.certified.certificate import BeyondResult, Certificate, LongResult, LoopMargins, RampResult
+from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.machines import SimulatedMachines, draw_independently
 from servotwin.redesign.certified.margins import margins_in_every_zone, own_static_gain, slow_response, widened
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 # Where the band of measurement noise begins and ends, in units of 1 / Tf: well above the crossover, and where a sampled
