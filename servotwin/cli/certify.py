@@ -13,6 +13,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from servotwin.cli.own_options import option_of, own_option
 from servotwin.config.table import Table, did_you_mean, read_toml
 from servotwin.config.toml import attribute
 from servotwin.config.units import unit_of
@@ -99,23 +100,17 @@ class GridOptions:
         """
         if self.finest_deg is not None and not 0.0 < self.finest_deg < math.inf:
             raise InvalidInput(f"--finest-deg {self.finest_deg:g} deg: must be finite and above 0")
-        own = own_units(policy.servo)
+        units = own_units(policy.servo)
         return Grid.of(
             policy,
             None if self.finest_deg is None else math.radians(self.finest_deg),
-            _rising(name, own.key("bias_mv"), self.biases, above=True),
-            _rising(name, own.key("noise_um"), self.noises, above=False),
+            _rising(units.key("bias_mv"), own_option(self.biases, "bias_mv", f"model {name!r}", units), above=True),
+            _rising(units.key("noise_um"), own_option(self.noises, "noise_um", f"model {name!r}", units), above=False),
         )
 
 
-def _rising(model: str, own: str, given: Mapping[str, str | None], above: bool) -> tuple[float, ...] | None:
-    """Values of the option in a model's own unit, in SI; None: not given."""
-    for key, text in given.items():
-        if text is not None and key != own:
-            raise InvalidInput(
-                f"{_option(key)} {text}: of model {model!r} it is in {unit_of(own).name}; give {_option(own)}"
-            )
-    text = given.get(own)
+def _rising(key: str, text: str | None, above: bool) -> tuple[float, ...] | None:
+    """Values of an option, in SI; None: not given."""
     if text is None:
         return None
     try:
@@ -125,12 +120,8 @@ def _rising(model: str, own: str, given: Mapping[str, str | None], above: bool) 
     rising = all(low < high for low, high in pairwise(values))
     if not values or not rising or not (values[0] > 0.0 or (values[0] == 0.0 and not above)) or math.inf in values:
         allowed = "above 0" if above else "0 or more"
-        raise InvalidInput(f"{_option(own)} {text!r}: give VALUE,VALUE,... in {unit_of(own).name}, rising, {allowed}")
-    return tuple(map(unit_of(own).to_si, values))
-
-
-def _option(key: str) -> str:
-    return f"--{key.replace('_', '-')}"
+        raise InvalidInput(f"{option_of(key)} {text!r}: give VALUE,VALUE,... in {unit_of(key).name}, rising, {allowed}")
+    return tuple(map(unit_of(key).to_si, values))
 
 
 def _jobs(file: Path, model: str | None, out: Path | None) -> list[_TableJob]:

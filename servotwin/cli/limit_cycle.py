@@ -15,8 +15,10 @@ from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
 from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.analysis.limit_cycles.shaft import Prediction
+from servotwin.cli.own_options import own_option
 from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, position_unit
+from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant, resolve_plant
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
@@ -68,7 +70,7 @@ def print_limit_cycle(
     """Print a table, or one JSON object, on the standard output; `positions`: tolerance and step by their unit."""
     servo = resolve_plant(name)
     unit = position_unit(servo)
-    tolerance_shown, step_shown = _in_unit(unit, positions)
+    tolerance_shown, step_shown = _in_unit(name, servo, positions)
     # The exact orbit is that of the continuous-time loop.
     servo = servo.replace(sample_rate=None)
     servo = servo if enter is None else servo.replace(enter=enter)
@@ -129,17 +131,14 @@ def _orbit(orbit: Orbit | None, unit: DisplayUnit) -> dict[str, Any] | None:
 
 
 def _in_unit(
-    unit: DisplayUnit, positions: Mapping[str, tuple[float | None, float | None]]
+    name: str, servo: Plant, positions: Mapping[str, tuple[float | None, float | None]]
 ) -> tuple[float | None, float]:
     """Tolerance and step, in the unit of a machine; refused in another."""
-    for other, given in positions.items():
-        for option, value in zip(("tolerance", "step"), given, strict=True):
-            if value is not None and other != unit.name:
-                raise InvalidInput(
-                    f"--{option}-{other} {value:g}: positions of this machine are in {unit.name}; "
-                    f"give --{option}-{unit.name}"
-                )
-    tolerance, step = positions[unit.name]
+    unit, units = position_unit(servo), own_units(servo)
+    tolerance, step = (
+        own_option({f"{option}_{each}": given[place] for each, given in positions.items()}, f"{option}_mm", name, units)
+        for place, option in enumerate(("tolerance", "step"))
+    )
     if step is not None and not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(
             f"--step-{unit.name} {step:g} {unit.name}: must be finite and not 0, or the loop never leaves its rest"

@@ -52,6 +52,8 @@ def test_hysteresis_is_passed_on():
         (("telescope", "--step-deg", "inf"), "--step-deg inf deg: must be finite and not 0"),
         (("--tolerance-mm", -1), "--tolerance-mm -1 mm: must be finite and 0 or more"),
         (("telescope", "--tolerance-deg", -1), "--tolerance-deg -1 deg: must be finite and 0 or more"),
+        (("telescope", "--step-mm", 2), "--step-mm 2: telescope has it in deg; give --step-deg"),
+        (("gantry", "--tolerance-deg", 2), "--tolerance-deg 2: gantry has it in mm; give --tolerance-mm"),
         (("--tolerance-mm", 1, "--enter", 2), "leave = 1.0 tolerances"),
     ],
 )
