@@ -15,6 +15,7 @@ from servotwin.estimation.output_error.models import (
     ShaftModel,
     Unknown,
     independent,
+    usual_sizes,
 )
 from servotwin.estimation.output_error.problem import LARGEST, delayed
 from servotwin.hybrid.exponential import expm1
@@ -127,15 +128,8 @@ class MotorProblem:
 
     def sizes(self) -> Array:
         """(u,) usual sizes of the unknowns."""
-        sizes = {
-            "load": self.range,
-            "speed": self.range / self.duration,
-            "time": self.interval,
-            "factor": 1.0,
-            "damping": 1.0,
-            "command": float(np.std(self.command)) or 1.0,
-        }
-        return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
+        command = float(np.std(self.command)) or 1.0
+        return usual_sizes(self.model.unknowns, self.range, self.duration, self.interval, command=command)
 
     def limits(self) -> Array:
         """(u,) largest sizes of the unknowns."""

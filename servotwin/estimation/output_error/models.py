@@ -294,6 +294,12 @@ class ShaftModel:
         return self.simulate(drive, measured, interval, values, rate).position
 
 
+def usual_sizes(unknowns: Sequence[Unknown], travel: float, duration: float, interval: float, **more: float) -> Array:
+    """(u,) usual sizes of unknowns on a window of a travel (m or rad at the load); `more`: those of other units."""
+    sizes = {"load": travel, "speed": travel / duration, "time": interval, "factor": 1.0, "damping": 1.0, **more}
+    return np.array([sizes[unknown.unit] for unknown in unknowns])
+
+
 def gains(rate: float, interval: float) -> tuple[float, float]:
     """Of an observer of a free mass that is measured at intervals (s): both errors fade at the rate (1/s)."""
     faded = -math.expm1(-rate * interval)

@@ -183,13 +183,8 @@ class Attempt:
 
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
-        question, setting, loop = self.question, self.setting, self._loop
-        demands, known, members, law = (
-            question.demands,
-            question.uncertainty,
-            self._members,
-            law_for_margins(setting.controller),
-        )
+        question, setting, loop, members = self.question, self.setting, self._loop, self._members
+        known, law = question.uncertainty, law_for_margins(setting.controller)
         measures = self._measured(members.count)
         settled = int(measures.settled.sum())
         friction = np.array(known.friction) + np.array(known.own_friction_of(question.servo))
@@ -217,8 +212,8 @@ class Attempt:
             saturated=bool(measures.saturated.any()),
             looked_at=0,
             seconds=0.0,
-            settled_least=share_at_least(settled, members.count, demands.confidence),
-            confidence=demands.confidence,
+            settled_least=share_at_least(settled, members.count, question.demands.confidence),
+            confidence=question.demands.confidence,
             loop=loop,
             beyond=self._beyond,
             ramp=self._ramp,
