@@ -56,7 +56,8 @@ def findings(servo: Plant, gap: float, tolerance: float | None, step: float) -> 
         predicted = predictions(servo, gap)
     except InvalidInput as error:
         return Findings(result, (), str(error))
-    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in predicted), "")
+    none = "" if predicted else "it predicts no limit cycle"
+    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in predicted), none)
 
 
 def print_limit_cycle(
@@ -175,7 +176,9 @@ def _print(console: Console, computed: Findings, unit: DisplayUnit) -> None:
     if orbit is not None:
         _print_orbit(console, orbit)
     if computed.no_prediction:
-        console.print(f"no describing function: {computed.no_prediction}", style="dim", highlight=False)
+        console.print(
+            f"no prediction by the describing function: {computed.no_prediction}", style="dim", highlight=False
+        )
 
 
 def _cells(orbit: Orbit, unit: DisplayUnit) -> tuple[str, ...]:

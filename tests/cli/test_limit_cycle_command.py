@@ -41,6 +41,11 @@ def test_hysteresis_is_passed_on():
     assert plain != wide
 
 
+def test_a_describing_function_that_predicts_nothing_is_said() -> None:
+    shown = run("stepper-stage").output
+    assert "no prediction by the describing function: it predicts no limit cycle" in " ".join(shown.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
