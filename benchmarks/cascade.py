@@ -17,7 +17,7 @@ from servotwin.commissioning.edge_settings import Recording
 from servotwin.cosim.driver import Cosimulation
 from servotwin.cosim.machine import SimulatedMachine, simulation_of
 from servotwin.estimation.learning.trend_settings import TrendSettings
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.twin.settings import TwinSettings
 

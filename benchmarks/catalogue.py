@@ -17,7 +17,7 @@ from benchmarks.workloads import UNIT, NoisyWorkload, SweepWorkload, WearWorkloa
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 
 MILLIMETRE = "/ 1 mm"
 

@@ -22,7 +22,8 @@ from servotwin.control.retuning import scaled
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import PiecewiseCubic
-from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
+from servotwin.redesign.certified.machines import SimulatedMachines, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
 
 NAME, SCHEMA = "compensation", "servotwin-bench-compensation/1"

@@ -10,8 +10,9 @@ import numpy as np
 from benchmarks.contest import Contestant
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 

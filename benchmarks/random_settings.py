@@ -18,10 +18,12 @@ from benchmarks.batch import Batch
 from benchmarks.random_axes import BLOCKS, AxisTask, axis_tasks, random_axis
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.certificate import Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 NAME = "settings-random"

@@ -14,7 +14,7 @@ _HOMES = {
     "Controller": "servotwin.control",
     "CycleResult": "servotwin.analysis.limit_cycles.cycle",
     "DcMotor": "servotwin.plant.actuator",
-    "Demands": "servotwin.redesign.certified.certificate",
+    "Demands": "servotwin.redesign.certified.demands",
     "GapEstimate": "servotwin.estimation.estimate",
     "GapStatus": "servotwin.estimation.estimate",
     "InvalidInput": "servotwin.errors",
@@ -78,8 +78,9 @@ if TYPE_CHECKING:
     from servotwin.plant.servo import Servo
     from servotwin.plant.signals import PiecewiseCubic, Samples, SCurve, SquareWave, Step
     from servotwin.plant.transmission import Transmission
-    from servotwin.redesign.certified.certificate import Certificate, Demands
+    from servotwin.redesign.certified.certificate import Certificate
     from servotwin.redesign.certified.certify import certify
+    from servotwin.redesign.certified.demands import Demands
     from servotwin.redesign.certified.uncertainty import Uncertainty
     from servotwin.simulation import Simulation, simulate
     from servotwin.simulation.run import Run

@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
-from typing import TypeAlias
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from servotwin.cli.own_options import option_of, own_option
 from servotwin.config.table import Table, did_you_mean, read_toml
 from servotwin.config.toml import attribute
+from servotwin.config.units import unit_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
+from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
@@ -25,8 +27,6 @@ from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.registry import certified_policy
 from servotwin.twin.model_registry import models_of
 from servotwin.twin.settings import TwinSettings
-
-GridOf: TypeAlias = Callable[[CertifiedPolicy], Grid]
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def certify(
     file: Path,
     model: str | None = None,
     out: Path | None = None,
-    grid: Grid | GridOf | None = None,
+    grid: Grid | GridOptions | None = None,
     console: Console | None = None,
 ) -> tuple[CertifiedTable, ...]:
     """Verify the tables that a twin's file or a scenario names, or continue an interrupted verification.
@@ -54,8 +54,8 @@ def certify(
         Only this model of a twin's file; None: all that have a key `table`.
     out : Path, optional
         File of the table of one model; None: the one that `table` names.
-    grid : Grid or callable, optional
-        For all models, or CertifiedPolicy -> Grid; `Grid.of` by default.
+    grid : Grid or GridOptions, optional
+        For all models; `Grid.of` each by default.
     console : Console, optional
         Where progress and summary are shown.
 
@@ -68,32 +68,60 @@ def certify(
         Its message says how many cells are finished and how to continue.
     """
     console = console or Console()
-    grid_for = grid or Grid.of
-    return tuple(
-        _verify(job, grid_for if isinstance(grid_for, Grid) else grid_for(job.policy), console)
-        for job in _jobs(file, model, out)
-    )
+    given = grid or GridOptions()
+    pairs = [
+        (job, given if isinstance(given, Grid) else given.grid(job.name, job.policy)) for job in _jobs(file, model, out)
+    ]
+    return tuple(_verify(job, grid, console) for job, grid in pairs)
 
 
-def grid_of(finest_deg: float | None, bias_mv: str | None, noise_um: str | None) -> GridOf:
-    """The grid of the command's options, for any model; None: the default.
+@dataclass(frozen=True)
+class GridOptions:
+    """Options of the command that make the grid; those that are left out have their default.
 
-    Raises
-    ------
-    InvalidInput
-        An option is no number, or they make no grid.
+    Attributes
+    ----------
+    finest_deg : float, optional
+    biases, noises : mapping
+        VALUE,VALUE,... by key, such as `bias_mv` or `noise_mdeg`: in the units of the model's command and position.
     """
-    finest = None if finest_deg is None else math.radians(finest_deg)
-    biases = None if bias_mv is None else _numbers("--bias-mv", bias_mv, 1e-3)
-    noises = None if noise_um is None else _numbers("--noise-um", noise_um, 1e-6)
-    return partial(Grid.of, finest=finest, biases=biases, noises=noises)
+
+    finest_deg: float | None = None
+    biases: Mapping[str, str | None] = field(default_factory=dict)
+    noises: Mapping[str, str | None] = field(default_factory=dict)
+
+    def grid(self, name: str, policy: CertifiedPolicy) -> Grid:
+        """The grid of a model of that name.
+
+        Raises
+        ------
+        InvalidInput
+            A value is outside its range, or in a unit that the model does not have.
+        """
+        if self.finest_deg is not None and not 0.0 < self.finest_deg < math.inf:
+            raise InvalidInput(f"--finest-deg {self.finest_deg:g} deg: must be finite and above 0")
+        units = own_units(policy.servo)
+        return Grid.of(
+            policy,
+            None if self.finest_deg is None else math.radians(self.finest_deg),
+            _rising(units.key("bias_mv"), own_option(self.biases, "bias_mv", f"model {name!r}", units), above=True),
+            _rising(units.key("noise_um"), own_option(self.noises, "noise_um", f"model {name!r}", units), above=False),
+        )
 
 
-def _numbers(option: str, text: str, unit: float) -> tuple[float, ...]:
+def _rising(key: str, text: str | None, above: bool) -> tuple[float, ...] | None:
+    """Values of an option, in SI; None: not given."""
+    if text is None:
+        return None
     try:
-        return tuple(unit * float(part) for part in text.split(","))
+        values = tuple(map(float, text.split(",")))
     except ValueError:
-        raise InvalidInput(f"{option} {text!r}: give VALUE,VALUE,...") from None
+        values = ()
+    rising = all(low < high for low, high in pairwise(values))
+    if not values or not rising or not (values[0] > 0.0 or (values[0] == 0.0 and not above)) or math.inf in values:
+        allowed = "above 0" if above else "0 or more"
+        raise InvalidInput(f"{option_of(key)} {text!r}: give VALUE,VALUE,... in {unit_of(key).name}, rising, {allowed}")
+    return tuple(map(unit_of(key).to_si, values))
 
 
 def _jobs(file: Path, model: str | None, out: Path | None) -> list[_TableJob]:
@@ -160,10 +188,10 @@ def _verify(job: _TableJob, grid: Grid, console: Console) -> CertifiedTable:
 
 def _summary(job: _TableJob, table: CertifiedTable) -> str:
     shares = Counter(cell is not None for cell in table.cells.values())
-    settings = {cell.setting for cell in table.cells.values() if cell is not None}
+    different = {cell.setting for cell in table.cells.values() if cell is not None}
     low, high = (math.degrees(gap) for gap in table.stated)
     others = "; in the others the twin sends the fallback set" if shares[False] else ""
     return (
         f"written: {job.path}: {shares[True]} of {len(table.cells)} cells of gaps from {low:g} to {high:g} deg are"
-        f" verified, with {len(settings)} different settings{others}"
+        f" verified, with {len(different)} different setting{'s' * (len(different) != 1)}{others}"
     )

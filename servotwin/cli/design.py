@@ -161,22 +161,27 @@ def certify(
     bias_mv: Annotated[
         str | None,
         typer.Option(
-            help="Largest input bias that the feedforward leaves: VALUE,VALUE,...; by default 1,10,50 in the servo's "
-            "own volts, or less: the largest is at most half of the stated bias.",
+            help="Largest input bias that the feedforward leaves, mV: VALUE,VALUE,...; by default 1,10,50 in the "
+            "servo's own volts, or less: the largest is at most half of the stated bias.",
             show_default=False,
         ),
     ] = None,
+    bias_mn_m: Annotated[str | None, typer.Option(help="The same of an axis that commands a torque, mN m.")] = None,
+    bias_mrad_per_s: Annotated[str | None, typer.Option(help="The same of one that commands a speed, mrad/s.")] = None,
+    bias_mrad: Annotated[str | None, typer.Option(help="The same of a stepper, mrad.")] = None,
     noise_um: Annotated[
         str | None,
         typer.Option(
-            help="Rms noise for which settings are ranked: VALUE,...; by default none, and a tenth of the smallest "
+            help="Rms noise for which settings are ranked, um: VALUE,...; by default none, and a tenth of the smallest "
             "stated step.",
             show_default=False,
         ),
     ] = None,
+    noise_mdeg: Annotated[str | None, typer.Option(help="The same of a rotary axis, thousandths of a degree.")] = None,
 ) -> None:
     """Verify a table of settings, for twins that look them up. The same command continues an interrupted run."""
+    from servotwin.cli.certify import GridOptions
     from servotwin.cli.certify import certify as run
-    from servotwin.cli.certify import grid_of
 
-    run(file, model, out, grid_of(finest_deg, bias_mv, noise_um))
+    biases = {"bias_mv": bias_mv, "bias_mn_m": bias_mn_m, "bias_mrad_per_s": bias_mrad_per_s, "bias_mrad": bias_mrad}
+    run(file, model, out, GridOptions(finest_deg, biases, {"noise_um": noise_um, "noise_mdeg": noise_mdeg}))

@@ -15,8 +15,10 @@ from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
 from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.analysis.limit_cycles.shaft import Prediction
+from servotwin.cli.own_options import own_option
 from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, position_unit
+from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant, resolve_plant
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
@@ -54,7 +56,8 @@ def findings(servo: Plant, gap: float, tolerance: float | None, step: float) -> 
         predicted = predictions(servo, gap)
     except InvalidInput as error:
         return Findings(result, (), str(error))
-    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in predicted), "")
+    none = "" if predicted else "it predicts no limit cycle"
+    return Findings(result, tuple((one, limit_cycle_near(servo, gap, one)) for one in predicted), none)
 
 
 def print_limit_cycle(
@@ -68,7 +71,7 @@ def print_limit_cycle(
     """Print a table, or one JSON object, on the standard output; `positions`: tolerance and step by their unit."""
     servo = resolve_plant(name)
     unit = position_unit(servo)
-    tolerance_shown, step_shown = _in_unit(unit, positions)
+    tolerance_shown, step_shown = _in_unit(name, servo, positions)
     # The exact orbit is that of the continuous-time loop.
     servo = servo.replace(sample_rate=None)
     servo = servo if enter is None else servo.replace(enter=enter)
@@ -129,17 +132,14 @@ def _orbit(orbit: Orbit | None, unit: DisplayUnit) -> dict[str, Any] | None:
 
 
 def _in_unit(
-    unit: DisplayUnit, positions: Mapping[str, tuple[float | None, float | None]]
+    name: str, servo: Plant, positions: Mapping[str, tuple[float | None, float | None]]
 ) -> tuple[float | None, float]:
     """Tolerance and step, in the unit of a machine; refused in another."""
-    for other, given in positions.items():
-        for option, value in zip(("tolerance", "step"), given, strict=True):
-            if value is not None and other != unit.name:
-                raise InvalidInput(
-                    f"--{option}-{other} {value:g}: positions of this machine are in {unit.name}; "
-                    f"give --{option}-{unit.name}"
-                )
-    tolerance, step = positions[unit.name]
+    unit, units = position_unit(servo), own_units(servo)
+    tolerance, step = (
+        own_option({f"{option}_{each}": given[place] for each, given in positions.items()}, f"{option}_mm", name, units)
+        for place, option in enumerate(("tolerance", "step"))
+    )
     if step is not None and not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(
             f"--step-{unit.name} {step:g} {unit.name}: must be finite and not 0, or the loop never leaves its rest"
@@ -176,7 +176,9 @@ def _print(console: Console, computed: Findings, unit: DisplayUnit) -> None:
     if orbit is not None:
         _print_orbit(console, orbit)
     if computed.no_prediction:
-        console.print(f"no describing function: {computed.no_prediction}", style="dim", highlight=False)
+        console.print(
+            f"no prediction by the describing function: {computed.no_prediction}", style="dim", highlight=False
+        )
 
 
 def _cells(orbit: Orbit, unit: DisplayUnit) -> tuple[str, ...]:

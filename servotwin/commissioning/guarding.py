@@ -27,7 +27,7 @@ from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Setti
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors

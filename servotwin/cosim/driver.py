@@ -176,10 +176,7 @@ class Cosimulation:
         self.clock = VirtualClock()
         self.machine = machine
         self.store = EvidenceLog()
-        start = Setting.of(scenario.start_tolerance, gains_of(scenario.start_law))
-        self.twin = twin or Twin(
-            scenario.name, TwinModel.of(scenario.model, scenario.twin, start, estimator), self.store
-        )
+        self.twin = None if not scenario.twin.enabled else twin or self._described_twin(estimator)
         self.link = SimulatedLink(
             scenario.name,
             self.clock,
@@ -193,6 +190,12 @@ class Cosimulation:
         self._reference = as_pieces(scenario.reference, scenario.duration)
         self._letters: set[bytes] = set()
         self._wake: Event | None = None
+
+    def _described_twin(self, estimator: Estimator | None) -> Remote:
+        scenario = self.scenario
+        start = Setting.of(scenario.start_tolerance, gains_of(scenario.start_law))
+        model = TwinModel.of(scenario.model, scenario.twin, start, estimator)
+        return Twin(scenario.name, model, self.store)
 
     @property
     def done(self) -> bool:
@@ -253,12 +256,12 @@ class Cosimulation:
         return math.ceil(time * self.scenario.recording.sample_rate - _ROUNDING)
 
     def _at_twin(self, data: bytes) -> None:
-        """Receive bytes at the twin; a twin that is switched off ignores them."""
-        if not self.scenario.twin.enabled:
+        """Receive bytes at the twin, if there is one."""
+        if self.twin is None:
             return
         message = decode(data)
         if isinstance(message, WindowMessage) or self._is_new_letter(message, data):
-            self._answer(self.twin.receive(message, self.clock.now))
+            self._answer(self.twin, self.twin.receive(message, self.clock.now))
 
     def _is_new_letter(self, message: Message, data: bytes) -> bool:
         """Acknowledge a letter, as the deployed twin does once it is stored; False for one that came before."""
@@ -268,19 +271,20 @@ class Cosimulation:
         self.link.down.send(encode(LetterAcknowledge(message.servo, digest)))
         return new
 
-    def _wake_twin(self) -> None:
+    def _wake_twin(self, twin: Remote) -> None:
         self._wake = None
-        self._answer(self.twin.wake(self.clock.now))
+        self._answer(twin, twin.wake(self.clock.now))
 
-    def _answer(self, messages: Iterable[Message]) -> None:
+    def _answer(self, twin: Remote, messages: Iterable[Message]) -> None:
         """Send the twin's messages, updates after its processing time, and schedule its next wake."""
         for message in messages:
             delay = self.scenario.twin.processing if isinstance(message, Update | Request) else 0.0
             self.clock.schedule(self.clock.now + delay, partial(self.link.down.send, encode(message)))
         if self._wake is not None:
             self.clock.cancel(self._wake)
-        due = self.twin.next_wake()
-        self._wake = None if due is None else self.clock.schedule(max(due, self.clock.now), self._wake_twin)
+        due = twin.next_wake()
+        wake = partial(self._wake_twin, twin)
+        self._wake = None if due is None else self.clock.schedule(max(due, self.clock.now), wake)
 
     def _transmissions(self) -> Iterable[MessageCopy]:
         for direction, line in (("up", self.link.up), ("down", self.link.down)):

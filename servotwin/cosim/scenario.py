@@ -28,6 +28,7 @@ from servotwin.plant.own_units import INPUT_BIAS_KEYS, own_units
 from servotwin.plant.plants import PLANT_KEY, Plant
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
+from servotwin.simulation.inputs import whole_ratio
 from servotwin.twin.settings import TwinSettings
 
 BOOT = "boot-1"
@@ -153,7 +154,11 @@ class Scenario:
             scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))
             table.done()
             scenario.servo.check_loop(scenario.law)
-            scenario.agent_settings()
+            try:
+                scenario.agent_settings()
+            except InvalidInput as error:
+                hint = "; without a twin it can be simulated: enabled = false in [twin], and no policy"
+                raise InvalidInput(f"{error}{hint}") from None
             return scenario
 
     def replace(self, **changes: Any) -> Scenario:
@@ -235,8 +240,7 @@ class Scenario:
             if self.law.rate_limit is not None:
                 raise InvalidInput("a rate limit needs a sampled controller: give the controller a sample rate in Hz")
             return
-        ratio = max(rate, law) / min(rate, law)
-        if abs(ratio - round(ratio)) > 1e-9 * ratio:
+        if not whole_ratio(rate, law):
             raise InvalidInput(
                 f"recording sample_rate = {rate!r} Hz: it and the controller's {law!r} Hz must be whole multiples of "
                 "one another"

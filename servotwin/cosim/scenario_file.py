@@ -31,6 +31,8 @@ CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
 )
 EDGE, UP, DOWN = "edge", "up", "down"
 """Tables of the file, beside those that `Scenario` declares."""
+PAPER = "paper"
+"""Policy that begins with the servo's own controller, and needs nothing verified."""
 
 _TURN = 2.0 * math.pi
 
@@ -136,8 +138,14 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
         "recording": replace(_recording(table, controller or servo.controller), probe=probe, novelty=novelty),
         "uplink": uplink,
         "downlink": downlink,
-        "twin": read_inner(table, TWIN, lambda inner: read_twin_settings(inner, folder, servo)),
+        "twin": read_inner(table, TWIN, lambda inner: _twin(inner, folder, servo)),
     }
+
+
+def _twin(table: Table, folder: Path, servo: Plant) -> TwinSettings:
+    """Read [twin]; one that is switched off and has no policy leaves the servo its own controller."""
+    twin = read_twin_settings(table, folder, servo)
+    return twin if twin.enabled or "policy" in table.values else twin.replace(policy=PAPER)
 
 
 def _recording(table: Table, controller: AnyController) -> Recording:

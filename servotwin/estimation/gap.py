@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side, output_error, paper, whitened
 from servotwin.estimation.axis_model import has_servo, servo_of
@@ -46,7 +44,6 @@ METHODS: Mapping[str, Method] = {
 }
 """The methods for a servo, those of a twin."""
 
-_SAME = 1e-9  # of the motion: rounding
 _ALLOWED, _ROUNDED = 0.6, 0.5  # of a count
 _ALL = {
     **METHODS,
@@ -157,10 +154,7 @@ def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.Wh
 
 def is_motors_position(window: Window, axis: Axis) -> bool:
     """True where a window's position is the motor's own, of an axis whose controller reads the motor's encoder."""
-    if not window.has_position or window.theta_m is None or not axis.at_motor:
-        return False
-    lead = window.position - axis.p * window.theta_m
-    return bool(np.ptp(lead) <= axis.p * axis.encoder_resolution + _SAME * np.ptp(window.position))
+    return axis.at_motor and window.follows_motor(axis.p, within=axis.p * axis.encoder_resolution)
 
 
 def _check_position(window: Window, axis: Axis) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 MINIMUM_SAMPLES = 16
 CHANNELS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
 _OTHERS = tuple(name for name in CHANNELS if name != "position")
+_ROUNDING = 1e-9  # of the motion
 _JITTER = 0.05  # of a sample interval: largest deviation of (rounded) time stamps from a uniform grid
 
 
@@ -131,6 +132,13 @@ class Window:
         part = _samples("run: ", begin, rate, run.time.size, start, duration)
         channels: dict[str, Any] = {name: run.measured(name)[part] for name in CHANNELS}
         return cls(**channels, sample_rate=rate, start=begin + part.start / rate)
+
+    def follows_motor(self, ratio: float, within: float = 0.0) -> bool:
+        """True where position less ratio (m/rad) times theta_m is constant, but for `within` (m) and rounding."""
+        if self.measured_position is None or self.theta_m is None:
+            return False
+        lead = self.measured_position - ratio * self.theta_m
+        return bool(np.ptp(lead) <= within + _ROUNDING * np.ptp(self.measured_position))
 
     def slice(self, start: float, duration: float) -> Window:
         """Cut the part of `duration` (s) from the sample nearest to `start` (s, on the window's own clock)."""

@@ -75,13 +75,8 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             table = table[kept]
 
     keep(np.isfinite(table.sum(axis=1)), "samples without a number in some column")
-    if first and len(table) > 2:
-        intervals = np.diff(table[:, 0])
-        usual = float(np.median(np.abs(intervals)))
-        stale = int(intervals[0] > _STALE * usual) if usual > 0.0 else 0
-        kept = np.ones(len(table), dtype=np.bool_)
-        kept[:stale] = False
-        keep(kept, "stale samples, long before all others")
+    if first:
+        keep(~_long_before(table[:, 0]), "stale samples, long before all others")
     keep(in_order(table[:, 0]), OUT_OF_ORDER)
     keep(~_alone_at_the_end(table[:, 0]), "samples with a time stamp far behind all others")
     table[:, 0], shared = spread(table)
@@ -91,11 +86,9 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     parted: list[float] = []
     for place, name in enumerate(names, 1):
         if name in turns:
-            table[:, place], count = unwrapped(table[:, place], turns[name])
+            table[:, place], count, lost = _turned_on(name, table[:, 0], table[:, place], turns[name])
+            parted += lost
             if count:
-                check_followed(name, table[:, place], turns[name])
-                table[:, place], lost = with_turns_in_pauses(table[:, 0], table[:, place], turns[name])
-                parted += lost
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
         # A command may have pulses, such as the kick of a derivative: what is left out need not be wrong.
@@ -112,6 +105,26 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     if gaps := pauses(table[:, 0]):
         found["pauses longer than five intervals"] = len(gaps)
     return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found, parted)
+
+
+def _turned_on(name: str, time: Array, angle: Array, turn: float) -> tuple[Array, int, list[float]]:
+    """An angle beyond its full turn, the number of turns, and the times of pauses in which turns may be lost."""
+    angle, count = unwrapped(angle, turn)
+    if not count:
+        return angle, 0, []
+    check_followed(name, angle, turn)
+    angle, lost = with_turns_in_pauses(time, angle, turn)
+    return angle, count, lost
+
+
+def _long_before(time: Array) -> _Mask:
+    """True for a first sample long before the others."""
+    result = np.zeros(time.size, dtype=np.bool_)
+    if time.size > 2:
+        intervals = np.diff(time)
+        usual = float(np.median(np.abs(intervals)))
+        result[0] = 0.0 < _STALE * usual < intervals[0]
+    return result
 
 
 def _alone_at_the_end(time: Array) -> _Mask:

@@ -13,6 +13,7 @@ from servotwin.plant.basis import Basis, GuardRow, input_names, plant_names
 from servotwin.plant.flow import mechanical_flow
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
+from servotwin.plant.zones import saturations
 
 
 @dataclass(frozen=True)
@@ -111,13 +112,9 @@ def _limited(zone: LawZone, law: LinearLaw, basis: Basis) -> list[LawZone]:
     if "voltage limit" not in basis or not zone.voltage.any():
         return [zone]
     limit, unlimited = basis.row("voltage limit"), zone.voltage
-    ends = tuple(
-        GuardRow(side * unlimited - limit, zone.name + suffix, None, "saturate", side)
-        for side, suffix in ((1, " high"), (-1, " low"))
-    )
-    zones = [replace(zone, guards=(*zone.guards, *ends))]
-    for side, suffix in ((1, " high"), (-1, " low")):
-        back = GuardRow(limit - side * unlimited, zone.name, None, "saturate", 0)
-        rates = zone.rates + np.outer(law.windup, side * limit - unlimited)
-        zones.append(LawZone(zone.name + suffix, side * limit, rates, (*zone.guards, back)))
+    ends = saturations(zone.name, unlimited, limit)
+    zones = [replace(zone, guards=(*zone.guards, *(end.enter for end in ends)))]
+    for end in ends:
+        rates = zone.rates + np.outer(law.windup, end.side * limit - unlimited)
+        zones.append(LawZone(end.enter.target, end.side * limit, rates, (*zone.guards, end.leave)))
     return zones

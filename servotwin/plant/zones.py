@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 
@@ -127,13 +127,33 @@ def _saturated(zone: Zone, basis: Basis, rate: float | Array) -> list[Zone]:
     if "voltage limit" not in basis:
         return [zone]
     limit, unlimited = basis.row("voltage limit"), zone.voltage
-    ends = tuple(
-        GuardRow(side * unlimited - limit, zone.name + suffix, None, "saturate", side)
+    ends = saturations(zone.name, unlimited, limit)
+    zones = [replace(zone, guards=(*zone.guards, *(end.enter for end in ends)))]
+    for end in ends:
+        integral = zone.integral + rate * (end.side * limit - unlimited)
+        leave = (*zone.guards, end.leave)
+        zones.append(Zone(end.enter.target, end.side * limit, zone.pidf, integral, zone.derivative, leave))
+    return zones
+
+
+class Saturation(NamedTuple):
+    """One end of the limit of a zone's command: its side, and the guards into it and back."""
+
+    side: int
+    enter: GuardRow
+    leave: GuardRow
+
+
+def saturations(zone: str, unlimited: Array, limit: Array) -> tuple[Saturation, ...]:
+    """Both ends of the limit of a zone (by name), of the rows (s,) of its command without the limit, and of the limit.
+
+    The zone of an end has the name that the guard into it leads to.
+    """
+    return tuple(
+        Saturation(
+            side,
+            GuardRow(side * unlimited - limit, zone + suffix, None, "saturate", side),
+            GuardRow(limit - side * unlimited, zone, None, "saturate", 0),
+        )
         for side, suffix in ((1, " high"), (-1, " low"))
     )
-    zones = [replace(zone, guards=(*zone.guards, *ends))]
-    for side, suffix in ((1, " high"), (-1, " low")):
-        leave = (*zone.guards, GuardRow(limit - side * unlimited, zone.name, None, "saturate", 0))
-        integral = zone.integral + rate * (side * limit - unlimited)
-        zones.append(Zone(zone.name + suffix, side * limit, zone.pidf, integral, zone.derivative, leave))
-    return zones

@@ -12,7 +12,7 @@ from servotwin.control.retuning import static_gain
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
 from servotwin.plant.plants import Plant, check_gap_in_loop, check_homogeneous
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.lookup import TablePolicy
 from servotwin.redesign.certified.lookup_file import load
 from servotwin.redesign.certified.policy import CertifiedPolicy

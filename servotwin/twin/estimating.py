@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -94,27 +94,15 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         own, model = motor_side.METHOD, None
     options = options_for(servo, settings.method, settings.estimator)
     new = known_machine(servo, settings)
-
-    def fitted(window: Window, expected: Expectation, machine: FactorPrior | None, afresh: bool) -> GapEstimate:
-        prior = None if afresh else expected.prior
-        if model is None:
-            # The methods that settings name are those of a servo.
-            chosen = _worn(own, expected, settings)
-            if machine is None:
-                return estimate_gap(window, servo, own, prior, chosen)
-            assert isinstance(chosen, output_error.OutputErrorSettings)
-            return output_error.estimate(window, servo, prior, chosen, machine)
-        assert isinstance(options, whitened.WhitenedSettings)
-        growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
-        offset = None if afresh else expected.offset
-        return whitened.estimate_carrying(window, model, prior, growing, offset, machine)
+    # The methods that settings name are those of a servo.
+    fitted = _fits_of_axis(servo, own, settings) if model is None else _fits_of_servo(model, options, settings)
 
     def of_model(window: Window, expected: Expectation) -> GapEstimate:
         if model is not None and not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
         if new is None or expected.machine is None:
-            return fitted(window, expected, new, afresh=False)
-        made = fitted(window, expected, expected.machine, afresh=False)
+            return fitted(window, expected, new)
+        made = fitted(window, expected, expected.machine)
         if made.status is not GapStatus.MODEL_MISMATCH:
             return made
         # The machine may have been exchanged: its new numbers are then worth knowing, and nothing else yet.
@@ -125,6 +113,43 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         return replace(of_model(window, expected), model_version=servo.version)
 
     return of_model if model is servo else estimate
+
+
+class _Fits(Protocol):
+    """Estimate of a window with what is known of the machine; `afresh`: without what is expected of the gap."""
+
+    def __call__(
+        self, window: Window, expected: Expectation, machine: FactorPrior | None, *, afresh: bool = False
+    ) -> GapEstimate: ...
+
+
+def _fits_of_axis(servo: Plant, method: str, settings: TwinSettings) -> _Fits:
+    """Estimates of an axis that no servo stands for."""
+
+    def fitted(
+        window: Window, expected: Expectation, machine: FactorPrior | None, *, afresh: bool = False
+    ) -> GapEstimate:
+        prior, chosen = None if afresh else expected.prior, _worn(method, expected, settings)
+        if machine is None:
+            return estimate_gap(window, servo, method, prior, chosen)
+        assert isinstance(chosen, output_error.OutputErrorSettings)
+        return output_error.estimate(window, servo, prior, chosen, machine)
+
+    return fitted
+
+
+def _fits_of_servo(model: Servo, options: object, settings: TwinSettings) -> _Fits:
+    """Whitened estimates of a servo, or of an axis that it stands for."""
+
+    def fitted(
+        window: Window, expected: Expectation, machine: FactorPrior | None, *, afresh: bool = False
+    ) -> GapEstimate:
+        assert isinstance(options, whitened.WhitenedSettings)
+        growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
+        prior, offset = (None, None) if afresh else (expected.prior, expected.offset)
+        return whitened.estimate_carrying(window, model, prior, growing, offset, machine)
+
+    return fitted
 
 
 def own_fit(window: Window, servo: Axis, settings: TwinSettings, expected: Expectation) -> Search:

@@ -20,7 +20,7 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.redesign.registry import POLICIES
@@ -140,7 +140,13 @@ class TwinSettings:
         another method or policy.
     """
 
-    enabled: Annotated[bool, key(help="Answer the edge's windows.")] = True
+    enabled: Annotated[
+        bool,
+        key(
+            help="Answer the edge's windows. A scenario of a twin that does not, and that states no policy, runs with "
+            "the servo's own controller."
+        ),
+    ] = True
     method: Annotated[str, key(choices=tuple(METHODS), help="Estimator; the table [estimator] has its settings.")] = (
         whitened.METHOD
     )

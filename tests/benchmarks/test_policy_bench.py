@@ -25,7 +25,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Step
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Beyond, Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design

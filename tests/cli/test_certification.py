@@ -11,10 +11,13 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from servotwin.cli.app import app
-from servotwin.cli.certify import certify, grid_of
+from servotwin.cli.certify import GridOptions, certify
 from servotwin.errors import InvalidInput
+from servotwin.plant.plants import resolve_plant
 from servotwin.redesign.certified.lookup import Grid
+from servotwin.redesign.registry import certified_policy
 from servotwin.twin.model_registry import ModelRegistry
+from servotwin.twin.settings import TwinSettings
 
 COARSE = Grid(math.radians(60.0), (1e-2,), (0.0,))
 MODEL = """
@@ -113,10 +116,57 @@ def test_an_interrupt_says_what_is_finished(tmp_path: Path, monkeypatch) -> None
         certify(twin_file(tmp_path, ("one", "one.table")), grid=COARSE, console=quiet())
 
 
-@pytest.mark.parametrize(("options", "why"), [(("x", "0"), "--bias-mv 'x'"), (("1", "0,y"), "--noise-um '0,y'")])
-def test_options_that_are_no_numbers_are_named(options: tuple[str, str], why: str) -> None:
+@pytest.mark.parametrize(
+    ("servo", "options", "why"),
+    [
+        ("paper", {"finest_deg": -1.0}, "--finest-deg -1 deg: must be finite and above 0"),
+        ("paper", {"biases": {"bias_mv": "x"}}, r"--bias-mv 'x': give VALUE,VALUE,\.\.\. in mV, rising, above 0"),
+        ("paper", {"biases": {"bias_mv": "10,1"}}, "--bias-mv '10,1': give .* rising"),
+        ("paper", {"biases": {"bias_mv": "0,1"}}, "--bias-mv '0,1': give .* above 0"),
+        ("paper", {"noises": {"noise_um": "0,y"}}, r"--noise-um '0,y': give .* in µm, rising, 0 or more"),
+        ("paper", {"noises": {"noise_um": "0,nan"}}, "--noise-um '0,nan'"),
+        ("robot-joint", {"noises": {"noise_mdeg": "-1"}}, "--noise-mdeg '-1': give .* in mdeg"),
+        ("paper", {"noises": {"noise_mdeg": "1"}}, "--noise-mdeg 1: model 'one' has it in µm; give --noise-um"),
+        ("paper", {"biases": {"bias_mrad": "1"}}, "--bias-mrad 1: model 'one' has it in mV; give --bias-mv"),
+        ("robot-joint", {"noises": {"noise_um": "0"}}, "has it in mdeg; give --noise-mdeg"),
+        ("robot-joint", {"biases": {"bias_mv": "1,9"}}, "--bias-mv 1,9: .* has it in mN m; give --bias-mn-m"),
+        ("two-mass-drive", {"biases": {"bias_mv": "1"}}, "has it in mN m; give --bias-mn-m"),
+        ("telescope", {"noises": {"noise_um": "1"}}, "has it in mdeg; give --noise-mdeg"),
+        ("stepper-stage", {"biases": {"bias_mv": "1"}}, "has it in mrad; give --bias-mrad"),
+    ],
+)
+def test_a_grid_is_stated_in_the_units_of_its_model(servo: str, options, why: str) -> None:
+    policy = certified_policy(resolve_plant(servo), TwinSettings())
     with pytest.raises(InvalidInput, match=why):
-        grid_of(4.0, *options)
+        GridOptions(**options).grid("one", policy)
+
+
+def test_the_units_of_a_grid_are_converted() -> None:
+    policy = certified_policy(resolve_plant("robot-joint"), TwinSettings())
+    options = GridOptions(2.0, {"bias_mv": None, "bias_mn_m": "5,20"}, {"noise_um": None, "noise_mdeg": "0,90"})
+    grid = options.grid("one", policy)
+    assert grid.finest == math.radians(2.0)
+    assert grid.biases == pytest.approx((5e-3, 2e-2))
+    assert grid.noises == pytest.approx((0.0, math.radians(0.09)))
+
+
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [
+        ("--bias-mv", "give --bias-mn-m"),
+        ("--bias-mrad-per-s", "give --bias-mn-m"),
+        ("--bias-mrad", "give --bias-mn-m"),
+        ("--bias-mn-m", r"in mN m, rising"),
+        ("--noise-um", "give --noise-mdeg"),
+        ("--noise-mdeg", r"in mdeg, rising"),
+    ],
+)
+def test_every_option_of_the_command_reaches_its_grid(tmp_path: Path, option: str, why: str) -> None:
+    path = twin_file(tmp_path, ("one", "one.table"))
+    path.write_text(path.read_text().replace('"paper"', '"robot-joint"'), encoding="utf-8")
+    shown = CliRunner().invoke(app, ["certify", str(path), option, "2,1"])
+    assert shown.exit_code == 2
+    assert why in shown.output
 
 
 @pytest.mark.slow

@@ -41,6 +41,11 @@ def test_hysteresis_is_passed_on():
     assert plain != wide
 
 
+def test_a_describing_function_that_predicts_nothing_is_said() -> None:
+    shown = run("stepper-stage").output
+    assert "no prediction by the describing function: it predicts no limit cycle" in " ".join(shown.split())
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -52,6 +57,8 @@ def test_hysteresis_is_passed_on():
         (("telescope", "--step-deg", "inf"), "--step-deg inf deg: must be finite and not 0"),
         (("--tolerance-mm", -1), "--tolerance-mm -1 mm: must be finite and 0 or more"),
         (("telescope", "--tolerance-deg", -1), "--tolerance-deg -1 deg: must be finite and 0 or more"),
+        (("telescope", "--step-mm", 2), "--step-mm 2: telescope has it in deg; give --step-deg"),
+        (("gantry", "--tolerance-deg", 2), "--tolerance-deg 2: gantry has it in mm; give --tolerance-mm"),
         (("--tolerance-mm", 1, "--enter", 2), "leave = 1.0 tolerances"),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 
 import servotwin as st
 from servotwin.commissioning.edge_settings import Recording
-from servotwin.redesign.certified.certificate import Beyond, Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.twin.settings import TwinSettings
 
 PAPER = st.Servo.preset("paper")

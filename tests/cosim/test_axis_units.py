@@ -82,5 +82,8 @@ def test_limits_and_watch_of_a_rotary_axis_count_in_its_units(tmp_path: Path) ->
 def test_a_map_of_a_rotary_axis_has_its_steps_in_degrees() -> None:
     rotary = MapOptions("two-mass-drive", gap_deg="1,2", amplitude_deg="10")
     assert rotary.settings().axes.amplitude == pytest.approx([math.radians(10.0)])  # type: ignore[union-attr]
-    with pytest.raises(InvalidInput, match="--amplitude-mm: two-mass-drive counts its position in deg"):
+    with pytest.raises(InvalidInput, match="--amplitude-mm 10: two-mass-drive has it in deg; give --amplitude-deg"):
         MapOptions("two-mass-drive", gap_deg="1,2", amplitude_mm="10").settings()
+    with pytest.raises(InvalidInput, match="--still-um 3: two-mass-drive has it in mdeg; give --still-mdeg"):
+        MapOptions("two-mass-drive", still_um=3.0).settings()
+    assert MapOptions("two-mass-drive", still_mdeg=3.0).settings().still == pytest.approx(math.radians(3e-3))

@@ -9,7 +9,7 @@ from servotwin.control.gains import with_gains
 from servotwin.control.running_law import RunningLaw, command_of
 from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.messages import CascadeGains, Update, decode
-from servotwin.redesign.certified.certificate import Beyond, Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.twin.settings import TwinSettings
 

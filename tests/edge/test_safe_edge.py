@@ -19,8 +19,8 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.candidates import candidates_of
+from servotwin.redesign.certified.machines import draw as members_of
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.certified.uncertainty import draw as members_of
 from servotwin.simulation import Simulation
 from servotwin.twin.settings import TwinSettings
 

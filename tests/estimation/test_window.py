@@ -101,3 +101,15 @@ def test_replacing_a_channel_validates_again():
     assert np.array_equal(window.replace(position=RAMP + 1.0).position, RAMP + 1.0)
     with pytest.raises(InvalidInput, match="finite"):
         window.replace(position=RAMP * np.nan)
+
+
+def test_a_position_that_is_the_motor_s_angle_times_the_ratio_follows_it() -> None:
+    angle = np.sin(np.linspace(0.0, 20.0, 4000))
+    own = Window(1e-3 * angle + 0.02, angle, sample_rate=1000.0)
+    counted = Window(1e-3 * angle + 1e-6 * (np.arange(4000) % 2), angle, sample_rate=1000.0)
+    assert own.follows_motor(1e-3)
+    assert not own.follows_motor(1.001e-3)
+    assert not counted.follows_motor(1e-3)
+    assert counted.follows_motor(1e-3, within=1e-6)
+    assert not Window(1e-3 * angle, sample_rate=1000.0).follows_motor(1e-3)
+    assert not Window(theta_m=angle, sample_rate=1000.0).follows_motor(1e-3)

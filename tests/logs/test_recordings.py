@@ -28,6 +28,7 @@ def seen(path, made, columns=None):
     log = read_recording(path, columns or RecordingColumns())
     assert np.allclose(log.recording.motor, made.motor, atol=1e-8)
     assert np.allclose(log.recording.load, made.load, atol=1e-8)
+    assert np.allclose(np.diff(log.recording.time), np.diff(made.time), atol=1e-6)
     return log
 
 

@@ -11,7 +11,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import disturbance
 from servotwin.plant.axis import Axis
 from servotwin.plant.scales import scales
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.registry import policy_of
 from servotwin.twin.settings import TwinSettings
 

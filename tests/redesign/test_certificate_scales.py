@@ -10,12 +10,11 @@ import pytest
 from scaling import scaled
 
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import (
-    Uncertainty,
-)
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import decoded_part
 
 DEG = math.pi / 180.0

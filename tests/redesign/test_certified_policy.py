@@ -16,7 +16,7 @@ from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Beyond, Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty

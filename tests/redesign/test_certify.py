@@ -22,11 +22,13 @@ from servotwin.redesign.certified import certify as certify_module
 from servotwin.redesign.certified.assess import assess, costs_to_and_fro, joined, nearness, stillness
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Beyond, Demands
+from servotwin.redesign.certified.machines import draw, draw_independently, drawn_plants
 from servotwin.redesign.certified.margins import loop_margins, margins_in_every_zone, widened
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently, drawn_plants
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.simulation import simulate
 

@@ -11,7 +11,8 @@ import pytest
 from servotwin import Axis, Servo
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified import fallback
-from servotwin.redesign.certified.certificate import BeyondResult, Certificate, Demands, LoopMargins, NotVerified
+from servotwin.redesign.certified.certificate import BeyondResult, Certificate, LoopMargins, NotVerified
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.fallback import cached_certificate, fallback_certificate
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty

@@ -13,8 +13,9 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.redesign.certified.attempt import Question
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify, confirm
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.margins import loop_margins
 from servotwin.redesign.certified.screening import Screening
 from servotwin.redesign.certified.trial import trial_for

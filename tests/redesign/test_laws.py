@@ -16,12 +16,14 @@ from servotwin.messages import Setting
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import _lag
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.fallback import CertificateFile, _decoder, _encoder
+from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence
 from servotwin.redesign.registry import policy_of

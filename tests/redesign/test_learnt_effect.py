@@ -19,11 +19,13 @@ from servotwin.messages import Setting, Update
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
-from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.lookup import CellIndex, CertifiedTable, Grid, TablePolicy, certify_cell
+from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.policy import Evidence
 from servotwin.simulation import simulate
 from servotwin.twin.lookups import Lookups, LookupState, VerificationRequest, decode_request, encode_request

@@ -19,7 +19,8 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import PRESETS, Servo
-from servotwin.redesign.certified.certificate import Beyond, Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.lookup import (
     CellIndex,
     CertifiedTable,

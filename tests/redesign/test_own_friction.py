@@ -14,11 +14,12 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import arrival_error, assess, nearness
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Beyond, Demands
 from servotwin.redesign.certified.certify import confirm
+from servotwin.redesign.certified.demands import Beyond, Demands
+from servotwin.redesign.certified.machines import draw, draw_independently, extreme_plants
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw, draw_independently, extreme_plants
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.simulation import simulate
 

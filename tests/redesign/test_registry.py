@@ -14,7 +14,7 @@ from servotwin.messages import Gains
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Beyond, Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy, MarginPolicy

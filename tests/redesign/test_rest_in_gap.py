@@ -12,12 +12,14 @@ from servotwin.control.cascade import Cascade
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.certificate import Certificate, Demands
+from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.rest_in_gap import coasting_time
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import Uncertainty, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.registry import policy_of
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled

@@ -15,11 +15,12 @@ from servotwin.redesign.certified import screening as module
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Demands
 from servotwin.redesign.certified.certify import _shortlist
+from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.machines import SimulatedMachines, draw
 from servotwin.redesign.certified.screening import Screening, exceeds_error_limit, has_widest_integral_zone, is_plain
 from servotwin.redesign.certified.trial import trial_for
-from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 SERVO, DEMANDS = Servo.preset("paper"), Demands()

@@ -14,7 +14,7 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.messages import Acknowledge, Gains, Setting, Update, pack_channel
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.certified.verification import verification_of

@@ -14,7 +14,7 @@ from servotwin.messages import Setting
 from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Beyond, Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.twin.model_registry import ModelRegistry, ServoModel, models_of
 from servotwin.twin.settings import TwinSettings
 

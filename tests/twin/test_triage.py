@@ -29,7 +29,7 @@ from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.evidence import GlanceRecord
 from servotwin.twin.evidence_log import EvidenceLog

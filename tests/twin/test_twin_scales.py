@@ -16,7 +16,7 @@ from servotwin.estimation.learning.trend_settings import TrendSettings
 from servotwin.messages import Setting
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import PRESETS, Servo
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings, long_enough
 from servotwin.twin.model import TwinModel

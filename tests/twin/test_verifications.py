@@ -17,7 +17,8 @@ from servotwin.messages import Cause, Fallback, Reason, Receipt, Setting, Update
 from servotwin.messages.acts import Act, ActKind, encode_act
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as certified_module
-from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.lookup import Grid, TablePolicy
 from servotwin.redesign.certified.lookup_file import build
 from servotwin.redesign.registry import certified_policy

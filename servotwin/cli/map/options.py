@@ -10,10 +10,12 @@ import numpy as np
 
 from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
+from servotwin.cli.own_options import option_of, own_option
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import DisplayUnit, position_unit
-from servotwin.plant.plants import resolve_plant
+from servotwin.plant.own_units import own_units
+from servotwin.plant.plants import Plant, resolve_plant
 
 _MAX_VALUES = 4096
 _MAX_PANELS = 36
@@ -60,7 +62,7 @@ class MapOptions:
         enter = own.enter if self.enter is None else self.enter
         leave = own.leave if self.leave is None else self.leave
         law = own.replace(sample_rate=None, rate_limit=None, enter=enter, leave=leave)
-        axes = self._axes(position_unit(servo))
+        axes = self._axes(servo)
         _check_drawable(axes.shape)
         return MapSettings(
             servo,
@@ -71,36 +73,30 @@ class MapOptions:
             seed=self.seed,
             duration=self.duration,
             window=self.window,
-            still=self._still(position_unit(servo).small),
+            still=self._still(servo),
         )
 
-    def _still(self, unit: DisplayUnit) -> float | None:
+    def _still(self, servo: Plant) -> float | None:
         """Largest half peak-to-peak of a rest, m or rad."""
-        given = {"um": self.still_um, "mdeg": self.still_mdeg}
-        for name, value in given.items():
-            if value is not None and name != unit.name:
-                raise InvalidInput(
-                    f"--still-{name} {value:g}: {self.servo} rests in {unit.name}; give --still-{unit.name}"
-                )
-        value = given[unit.name]
-        return None if value is None else unit.si_of(value)
+        value = own_option(
+            {"still_um": self.still_um, "still_mdeg": self.still_mdeg}, "still_um", self.servo, own_units(servo)
+        )
+        return None if value is None else position_unit(servo).small.si_of(value)
 
-    def _axes(self, position: DisplayUnit) -> Axes:
+    def _axes(self, servo: Plant) -> Axes:
+        units = own_units(servo)
         ratios = {"--tolerance": self.tolerance, "--amplitude": self.amplitude}
         physical = {"--gap-deg": self.gap_deg, "--estimate-deg": self.estimate_deg, "--k-dz": self.k_dz}
-        steps = {"--amplitude-mm": self.amplitude_mm, "--amplitude-deg": self.amplitude_deg}
-        own = f"--amplitude-{position.name}"
-        for name, text in steps.items():
-            if text is not None and name != own:
-                raise InvalidInput(f"{name}: {self.servo} counts its position in {position.name}; give {own}")
-        physical[own] = steps[own]
+        steps = {"amplitude_mm": self.amplitude_mm, "amplitude_deg": self.amplitude_deg}
+        own = option_of(units.key("amplitude_mm"))
+        physical[own] = own_option(steps, "amplitude_mm", self.servo, units)
         given = [[name for name, text in group.items() if text is not None] for group in (ratios, physical)]
         if all(given):
             raise InvalidInput(
                 f"{given[0][0]} is in units of p b and {given[1][0]} is not: give axes of one kind, {', '.join(ratios)}"
                 f" or {', '.join(physical)}"
             )
-        return self._physical(own, steps[own] or "1", position) if given[1] else self._ratios()
+        return self._physical(own, physical[own] or "1", position_unit(servo)) if given[1] else self._ratios()
 
     def _ratios(self) -> RatioAxes:
         tolerance = parsed("--tolerance", self.tolerance or TOLERANCE)

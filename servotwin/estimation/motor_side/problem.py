@@ -14,10 +14,11 @@ from servotwin.estimation.output_error.models import (
     Flags,
     ShaftModel,
     Unknown,
-    exponential,
     independent,
+    usual_sizes,
 )
 from servotwin.estimation.output_error.problem import LARGEST, delayed
+from servotwin.hybrid.exponential import expm1
 from servotwin.plant.actuator import Actuator
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
@@ -127,15 +128,8 @@ class MotorProblem:
 
     def sizes(self) -> Array:
         """(u,) usual sizes of the unknowns."""
-        sizes = {
-            "load": self.range,
-            "speed": self.range / self.duration,
-            "time": self.interval,
-            "factor": 1.0,
-            "damping": 1.0,
-            "command": float(np.std(self.command)) or 1.0,
-        }
-        return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
+        command = float(np.std(self.command)) or 1.0
+        return usual_sizes(self.model.unknowns, self.range, self.duration, self.interval, command=command)
 
     def limits(self) -> Array:
         """(u,) largest sizes of the unknowns."""
@@ -241,7 +235,7 @@ def _steps(motor: Actuator, p: float, interval: float) -> tuple[Array, Array, Ar
     flow = np.zeros((size + 2, size + 2))
     flow[:size, :size] = unit[:, None] * shaft.A / unit
     flow[:size, size], flow[:size, size + 1] = unit * shaft.B, p * unit * shaft.E
-    step = exponential(flow * interval)
+    step = np.eye(len(flow)) + expm1(flow, interval)
     held = np.zeros(size)
     if size > 2:
         held[:-2] = -np.linalg.solve(shaft.A[:-2, :-2], shaft.B[:-2])
@@ -266,7 +260,7 @@ def _gains(axis: Axis, interval: float, rate: float) -> Array:
     flow[1, 2:] = -links.reaction / inertia
     flow[2:, 2:] = links.A
     flow[2:, 0], flow[2:, 1] = links.B_position, links.B_velocity
-    step = exponential(flow * interval)
+    step = np.eye(len(flow)) + expm1(flow, interval)
     noise = np.zeros((2 * n + 2, 2 * n + 2))
     shaken = [1, *range(2 + n, 2 + 2 * n)]
     noise[shaken, shaken] = rate**4 * interval * interval

@@ -42,7 +42,6 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
-_SAME = 1e-12  # of the motion: rounding
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -87,7 +86,7 @@ def estimate(
     still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
     if still:
         return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
-    if np.ptp(window.position - axis.p * theta_m) <= _SAME * np.ptp(window.position):
+    if window.follows_motor(axis.p):
         words = "position is the motor's angle times the ratio, exactly: there is no gap, or it is not the load's own"
         return replace(blank, reasons=(words,))
     found, noise = _fit(window, theta_m, axis, prior, settings, machine)

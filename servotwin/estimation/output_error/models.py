@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.estimation.output_error.shaft import run_shaft
+from servotwin.hybrid.exponential import expm1
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
@@ -22,7 +23,6 @@ _FINE, _CONVERGES = 0.4, 1.2
 _PARTS = 3  # of a sample with friction, whose sign changes between parts only
 _OWN = (1.0,) * 6  # factors of the model's own numbers
 _KNOWN = 0.5  # of a damping's usual spread: below it windows told of it
-_EXPONENTIAL = 20  # terms of the series, for a norm below one
 
 
 Flags: TypeAlias = NDArray[np.bool_]
@@ -294,6 +294,12 @@ class ShaftModel:
         return self.simulate(drive, measured, interval, values, rate).position
 
 
+def usual_sizes(unknowns: Sequence[Unknown], travel: float, duration: float, interval: float, **more: float) -> Array:
+    """(u,) usual sizes of unknowns on a window of a travel (m or rad at the load); `more`: those of other units."""
+    sizes = {"load": travel, "speed": travel / duration, "time": interval, "factor": 1.0, "damping": 1.0, **more}
+    return np.array([sizes[unknown.unit] for unknown in unknowns])
+
+
 def gains(rate: float, interval: float) -> tuple[float, float]:
     """Of an observer of a free mass that is measured at intervals (s): both errors fade at the rate (1/s)."""
     faded = -math.expm1(-rate * interval)
@@ -307,7 +313,7 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
     flows, push, fading = _flows(axis, factors)
     kept = len(push) - 3
     parts = max(_least_parts(axis, interval), math.ceil(_fastest(flows) * interval / _CONVERGES))
-    steps = np.array([exponential(flow * interval / parts) for flow in flows])
+    steps = np.eye(flows.shape[-1]) + np.array([expm1(flow, interval / parts) for flow in flows])
     left = math.exp(-fading * interval / parts)
     steps[0, kept] = steps[0, 0]
     steps[0, kept, [0, kept]] += -left, left
@@ -342,16 +348,3 @@ def _flows(axis: Axis, factors: tuple[float, ...]) -> tuple[Array, Array, float]
     push[:kept], push[kept : kept + 2] = links.reaction, (k_d, c_d)
     flows[:, kept - 1, kept + 2] = force * load.force / masses[-1]
     return flows, push, k_d / c_d if c_d > 0.0 else 0.0
-
-
-def exponential(matrix: Array) -> Array:
-    """Exponential of a small matrix by its series, scaled and squared: scipy's starts threads for it."""
-    halvings = max(0, math.ceil(math.log2(max(1e-300, float(np.abs(matrix).sum(axis=1).max())))))
-    part = matrix / 2.0**halvings
-    term = result = np.eye(len(matrix))
-    for k in range(1, _EXPONENTIAL):
-        term = term @ part / k
-        result = result + term
-    for _ in range(halvings):
-        result = result @ result
-    return result

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel
+from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel, usual_sizes
 from servotwin.estimation.output_error.motor_angle import noise_of
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.hybrid.compiled import bare
@@ -74,14 +74,7 @@ class Problem:
 
     def sizes(self) -> Array:
         """(u,) usual sizes of the unknowns."""
-        sizes = {
-            "load": self.range,
-            "speed": self.range / self.duration,
-            "time": self.interval,
-            "factor": 1.0,
-            "damping": 1.0,
-        }
-        return np.array([sizes[unknown.unit] for unknown in self.model.unknowns])
+        return usual_sizes(self.model.unknowns, self.range, self.duration, self.interval)
 
     def limits(self) -> Array:
         """(u,) largest sizes of the unknowns."""

@@ -209,12 +209,12 @@ def estimate_noise(
 
     With `restore`, the noise that the fit may have taken away is restored.
     """
-    residual = reduction.residual(noise, table)
+    rows = reduction.prepared(noise, table, CONSTANT)
+    residual = reduction.residual(table, rows)
     if not np.any(residual):
         return Autoregression.white(1.0)
     if not restore:
         return burg(residual[None], order).at_least(reduction.rounding)
-    rows = reduction.prepared(noise, table, CONSTANT)
     root = least_squares(rows[GAP:], rows[RESIDUAL]).root
     return burg(with_noise_restored(residual, table[GAP:], root), order).at_least(reduction.rounding)
 

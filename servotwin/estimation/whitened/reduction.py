@@ -235,12 +235,11 @@ class Reduction:
         `order` is the noise's largest. Sines near the structure's own frequencies stay: they may be its motion.
         """
         fastest = float(np.abs(self.response.poles).max()) * self.response.interval * self.decimation.factor
-        rest = self.residual(noise, table)
+        rest = self.residual(table, self.prepared(noise, table, CONSTANT))
         return replace(self, hum=(*self.hum, *hum(rest, order, _ABOVE * fastest)))
 
-    def residual(self, noise: Autoregression, table: Array) -> Array:
-        """(m,) what nuisances leave of a table's residual in a noise."""
-        rows = self.prepared(noise, table, CONSTANT)
+    def residual(self, table: Array, rows: Array) -> Array:
+        """(m,) what nuisances leave of a table's residual in the noise that its `rows` are whitened with."""
         shares = least_squares(rows[CONSTANT:], rows[RESIDUAL]).coefficients
         return np.asarray(table[RESIDUAL] - shares @ table[CONSTANT:])
 

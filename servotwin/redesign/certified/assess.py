@@ -21,8 +21,8 @@ from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
+from servotwin.redesign.certified.machines import SimulatedMachines
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import SimulatedMachines
 from servotwin.redesign.design import Design
 from servotwin.simulation.ensemble import Cases, summarise_members
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled

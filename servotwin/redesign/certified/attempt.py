@@ -20,18 +20,13 @@ from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 from servotwin.redesign.certified.assess import COUNTS, MachineMeasures, arrival_error, assess, joined, unseen_error
-from servotwin.redesign.certified.certificate import (
-    BeyondResult,
-    Certificate,
-    Demands,
-    LongResult,
-    LoopMargins,
-    RampResult,
-)
+from servotwin.redesign.certified.certificate import BeyondResult, Certificate, LongResult, LoopMargins, RampResult
+from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.machines import SimulatedMachines, draw_independently
 from servotwin.redesign.certified.margins import margins_in_every_zone, own_static_gain, slow_response, widened
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw_independently
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 
 # Where the band of measurement noise begins and ends, in units of 1 / Tf: well above the crossover, and where a sampled
@@ -188,13 +183,8 @@ class Attempt:
 
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
-        question, setting, loop = self.question, self.setting, self._loop
-        demands, known, members, law = (
-            question.demands,
-            question.uncertainty,
-            self._members,
-            law_for_margins(setting.controller),
-        )
+        question, setting, loop, members = self.question, self.setting, self._loop, self._members
+        known, law = question.uncertainty, law_for_margins(setting.controller)
         measures = self._measured(members.count)
         settled = int(measures.settled.sum())
         friction = np.array(known.friction) + np.array(known.own_friction_of(question.servo))
@@ -222,8 +212,8 @@ class Attempt:
             saturated=bool(measures.saturated.any()),
             looked_at=0,
             seconds=0.0,
-            settled_least=share_at_least(settled, members.count, demands.confidence),
-            confidence=demands.confidence,
+            settled_least=share_at_least(settled, members.count, question.demands.confidence),
+            confidence=question.demands.confidence,
             loop=loop,
             beyond=self._beyond,
             ramp=self._ramp,

@@ -11,7 +11,7 @@ from servotwin.control.retuning import integrates, only_integrates, static_gain
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import COUNTS
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.margins import (
     has_slow_integral,
     integral_shares,

@@ -25,8 +25,9 @@ from msgspec import Struct
 from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import position_unit
 from servotwin.plant.plants import Plant
-from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty, in_words
 from servotwin.redesign.design import decoded_part

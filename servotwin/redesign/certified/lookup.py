@@ -50,9 +50,9 @@ class Grid:
     finest : float
         rad, width of the narrowest cells; others are twice, four times ... as wide, up to the whole stated range.
     biases : tuple of float
-        V, rising: largest input bias that the feedforward leaves uncancelled.
+        Unit of the command, rising: largest input bias that the feedforward leaves uncancelled.
     noises : tuple of float
-        m rms, rising: noise for which candidates are ranked; the verification does not depend on it.
+        m (rotary: rad) rms, rising: noise for which candidates are ranked; the verification does not depend on it.
 
     Raises
     ------
@@ -67,11 +67,11 @@ class Grid:
     def __post_init__(self) -> None:
         if not 0.0 < self.finest < math.inf:
             raise InvalidInput(f"table finest = {self.finest!r} rad: must be finite and above 0")
-        for name, unit, least in (("biases", "V", 1e-300), ("noises", "m", 0.0)):
+        for name, least in (("biases", 1e-300), ("noises", 0.0)):
             values = getattr(self, name)
             rising = all(a < b for a, b in itertools.pairwise(values))
             if not values or not rising or not (least <= values[0] and values[-1] < math.inf):
-                raise InvalidInput(f"table {name} = {values!r} {unit}: must be finite, rising and not negative")
+                raise InvalidInput(f"table {name} = {values!r} in SI units: must be finite, rising and not negative")
 
     @classmethod
     def of(

@@ -29,8 +29,10 @@ from servotwin.plant.law_set import LawSet
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
 from servotwin.plant.plants import Plant
-from servotwin.redesign.certified.certificate import Demands, LoopMargins
-from servotwin.redesign.certified.uncertainty import Uncertainty, extreme_plants, parameters_of
+from servotwin.redesign.certified.certificate import LoopMargins
+from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.machines import extreme_plants, parameters_of
+from servotwin.redesign.certified.uncertainty import Uncertainty
 
 # Shares of an integral action that may act as a whole: that of a cascade and of a linear law, and that of a filtered
 # PID whose corner Ki / Kp is below this share of the crossover. A faster one swings in every gap: only the small shares

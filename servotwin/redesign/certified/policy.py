@@ -15,8 +15,9 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import NEAR
-from servotwin.redesign.certified.certificate import Certificate, Demands, NotVerified
+from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.evidence_ranges import SAME_FEEDFORWARD, EvidenceRanges
 from servotwin.redesign.certified.fallback import fallback_certificate
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed

@@ -18,7 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.margins import nominal_margins
 from servotwin.redesign.certified.uncertainty import Uncertainty
 

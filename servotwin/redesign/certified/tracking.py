@@ -11,8 +11,9 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array, PiecewiseCubic
 from servotwin.redesign.certified.assess import nearness, stillness
 from servotwin.redesign.certified.certificate import RampResult
+from servotwin.redesign.certified.machines import SimulatedMachines, draw
 from servotwin.redesign.certified.trial import Trial
-from servotwin.redesign.certified.uncertainty import SimulatedMachines, Uncertainty, draw
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.simulation.ensemble import samples_of
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled

@@ -11,7 +11,7 @@ from servotwin.control.laws import AnyController
 from servotwin.control.retuning import law_for_margins, strength
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant
-from servotwin.redesign.certified.certificate import Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.margins import (
     delays_of,
     integral_shares,
