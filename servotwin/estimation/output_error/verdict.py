@@ -111,7 +111,7 @@ def judge(
         _rival(found, half, total, unit),
         _hidden(found, half),
         _of_friction(friction, allowed, unit),
-        _of_slow_motion(left, allowed, unit),
+        _of_slow_motion(left, half, allowed, unit),
         _of_jitter(times, allowed, unit),
     )
     doubts = tuple(filter(None, found_doubts))
@@ -146,13 +146,14 @@ def _of_friction(friction: float, allowed: float, unit: float) -> str:
     )
 
 
-def _of_slow_motion(left: float, allowed: float, unit: float) -> str:
-    """Sentence for slow motion that hides so much of a half gap (m or rad at the load)."""
-    if left <= allowed:
+def _of_slow_motion(left: float, half: float, allowed: float, unit: float) -> str:
+    """Sentence for slow motion whose interval contains every smaller half gap (m or rad at the load): no news."""
+    hidden = NORMAL_95 * _DOUBT * left
+    if hidden <= max(half, NORMAL_95 * _DOUBT * allowed):
         return ""
     return (
-        f"the model leaves slow motion that may hide {_deg(unit * left)} of the gap, and {_deg(unit * allowed)} are "
-        "allowed: friction, shaft or a sensor are of another kind"
+        f"the model leaves slow motion that may hide {_deg(unit * hidden)}, and the gap would be {_deg(unit * half)}: "
+        "friction, shaft or a sensor are of another kind"
     )
 
 
