@@ -199,7 +199,8 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
 
 _EXPLAINS, _BETTER = 0.05, 0.2  # share left that counts as a fit; of what the channels as given leave
 _POSITION_UNITS = {"mm": 1e-3, "micrometres": 1e-6, "units of 1000 m": 1e3}
-_ANGLE_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi, "units of 57.3 rad": 180.0 / math.pi}
+_ROTARY_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi}
+_ANGLE_UNITS = _ROTARY_UNITS | {"units of 57.3 rad": 180.0 / math.pi}
 _PITCHES = (0.5, 2.0)
 _RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
 
@@ -250,7 +251,7 @@ def _candidates(window: Window, theta_m: Array, motion: str) -> Iterator[tuple[s
     position, rate = window.position, window.sample_rate
     yield "position and theta_m seem to be swapped", position, theta_m, rate
     yield "position or theta_m seems to have the wrong sign", theta_m, -position, rate
-    si, units = ("m", _POSITION_UNITS) if motion == LINEAR else ("rad", _ANGLE_UNITS)
+    si, units = ("m", _POSITION_UNITS) if motion == LINEAR else ("rad", _ROTARY_UNITS)
     for unit, factor in units.items():
         yield f"position seems to be in {unit}, not in {si}", theta_m, factor * position, rate
     for unit, factor in _ANGLE_UNITS.items():
