@@ -45,6 +45,17 @@ def test_a_sensor_that_errs_with_its_way_widens_the_interval_and_nothing_else_do
     assert wrong.interval[0] <= gap <= wrong.interval[1]
 
 
+def test_slow_motion_that_may_hide_all_of_the_gap_is_refused() -> None:
+    axis = Axis.preset("ball-screw")
+    gap = 2e-5 / axis.p
+    run = simulate(axis, 1.2, reference=SquareWave(3e-4, 0.8), gap=gap, sample_rate=2000.0)
+    clean = Window.from_run(run, 0.78, 0.2)
+    error = 1e-5 * np.sin(2.0 * math.pi * clean.position / 8e-4 + 1.0)
+    estimate = estimate_gap(clean.replace(position=clean.position + error), axis)
+    assert estimate.status is GapStatus.UNIDENTIFIABLE
+    assert "the model leaves slow motion that may hide" in estimate.reasons[0]
+
+
 CREEPING = """
 [actuator]
 kind = "velocity"

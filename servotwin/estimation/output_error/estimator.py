@@ -28,9 +28,11 @@ from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.taught import taught
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
+from servotwin.estimation.whitened.channels import corrected, faults, refused
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
+from servotwin.plant.backlash import play
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.load import LINEAR
 from servotwin.plant.servo import Servo
@@ -42,6 +44,8 @@ METHOD = "output_error"
 SHORTEST = 400  # samples
 _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channels
 _SAMPLES_LATE = 3.0
+_GAPS = np.linspace(0.0, 0.3, 16)  # of the motor's travel; with wider ones a gap looks like another ratio
+_COASTS = 0.1  # of the position's motion: what play leaves of a load that coasts in the gap, and no wrong ratio does
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -83,15 +87,17 @@ def estimate(
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     if slow := too_slow(axis, window.sample_rate):
         return replace(blank, reasons=(slow,))
-    still = [name for name, value in (("theta_m", theta_m), ("position", window.position)) if np.ptp(value) == 0.0]
-    if still:
-        return replace(blank, reasons=(f"{still[0]} is constant: nothing moved, or the sensor is dead",))
+    if broken := _broken(window, axis):
+        return refused(blank, broken)
     if window.follows_motor(axis.p):
         words = "position is the motor's angle times the ratio, exactly: there is no gap, or it is not the load's own"
         return replace(blank, reasons=(words,))
     found, noise = _fit(window, theta_m, axis, prior, settings, machine)
     unit, possible = 2.0 / axis.p, possible_half(found)
-    stated = _stated(blank, found, judge(found, settings, unit, possible, axis.p * noise), unit)
+    verdict = judge(found, settings, unit, possible, axis.p * noise)
+    if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
+        verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
+    stated = _stated(blank, found, verdict, unit)
     if machine is None or not stated.ok:
         return stated
     if possible is None:
@@ -101,6 +107,24 @@ def estimate(
     if stated.std > settings.largest_share * stated.gap:
         return stated
     return replace(stated, machine=taught(machine, found, possible, settings.calibration))
+
+
+def _broken(window: Window, axis: Axis) -> tuple[str, ...]:
+    """Faults of the channels; of a rigid transmission dead ones only: it stops its load as abruptly as others do."""
+    sentences = faults(window, axis.load.motion)
+    free = axis.backlash_kind is BacklashKind.FREE
+    return sentences if free else tuple(sentence for sentence in sentences if "constant" in sentence)
+
+
+def _wrong_channel(window: Window, theta_m: Array, axis: Axis) -> tuple[str, ...]:
+    """Sentence for channels that would be one motion, with any gap, in another unit or with another sign or ratio."""
+
+    def left(angle: Array, position: Array, _rate: float = 0.0) -> float:
+        tried = [(gap, place) for gap in np.ptp(angle) * _GAPS for place in (-0.5, 0.5)]
+        errors = (position - axis.p * play(angle, gap, angle[0] + place * gap) for gap, place in tried)
+        return min(float(np.std(error)) for error in errors) / float(np.std(position))
+
+    return corrected(window, theta_m, left, left(theta_m, window.position), axis.load.motion, _COASTS)
 
 
 def fit(

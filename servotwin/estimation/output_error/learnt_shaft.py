@@ -3,7 +3,8 @@
 The fit weighs what was known of them against the window's noise. Errors of rounding are no such noise: they do not
 average out within a window, and they repeat with the motion. So the window's own information is taken out of the fit,
 weakened by them, and joined to what was known anew; and it counts only in those combinations of the numbers that it
-tells much better than they were known. Many windows alike tell no more than one.
+tells much better than they were known. Many windows alike tell no more than one. Slow motion that the fit leaves
+weakens it too: a machine of another kind has no numbers of this one's.
 
 The transmission's ratio is not learnt: a load that friction holds rests anywhere on its wind-up, so that windows of a
 ball screw read ratios that were up to 0.2 % off, and wrongly by 18 of their standard deviations.
@@ -23,6 +24,7 @@ from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.models import LEARNT, ShaftModel
 from servotwin.estimation.output_error.rounding import per_count
 from servotwin.estimation.output_error.settings import OutputErrorSettings
+from servotwin.estimation.output_error.unexplained import left_open, slow_error
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
@@ -40,6 +42,7 @@ _TOGETHER = 5.0  # standard deviations between a window's numbers and those that
 _LEAST_INFORMATION = 1e-2  # of what was known: where a window tells less, it shows nothing
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _SINGULAR = 1e-12
+_NOTHING = 1e3  # standard deviation of a logarithm of which nothing is known
 _DAMPING = LEARNT["shaft damping"]
 
 
@@ -100,7 +103,8 @@ def shaft_reading(found: Search, machine: FactorPrior, calibration: float) -> Sh
     assert isinstance(model, ShaftModel)
     which, places = (np.array(each) for each in zip(*model.places, strict=True))
     known = machine.covariance[np.ix_(which, which)]
-    told, score = _own_information(found, places, calibration, _unmodelled(model.axis)[which])
+    unmodelled = np.hypot(_unmodelled(model.axis)[which], _by_slow_error(found, places))
+    told, score = _own_information(found, places, calibration, unmodelled)
     # In units of what was known the prior is white.
     lower = np.linalg.cholesky(known)
     gains, axes = np.linalg.eigh(lower.T @ told @ lower)
@@ -124,6 +128,14 @@ def _unmodelled(axis: Axis) -> Array:
         critical = 2.0 * math.sqrt(shaft.k_d * axis.load.m[0])
         spreads[_DAMPING] = math.hypot(spreads[_DAMPING], _DAMPED * critical / shaft.c_d)
     return spreads
+
+
+def _by_slow_error(found: Search, places: NDArray[np.intp]) -> Array:
+    """(f,) standard deviations of unknowns at places (f,) by slow motion that the fit leaves: another machine's."""
+    error = slow_error(found)
+    if error == 0.0:
+        return np.zeros(places.size)
+    return np.minimum(left_open(found, error, places.tolist()), _NOTHING)
 
 
 def _own_information(

@@ -8,6 +8,7 @@ halves shows what they do to the gap: of accepted gaps some were a fifth off, an
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -27,25 +28,35 @@ def slow(raw: Array, size: int) -> float:
     return math.sqrt(max(0.0, left - _CHANCE * 0.5 * float(np.mean(np.diff(raw) ** 2)) / size))
 
 
-def unexplained(found: Search) -> float:
-    """Standard deviation of the half gap (m or rad at the load) by motion that neither model nor noise explains.
+def slow_error(found: Search) -> float:
+    """rms (m or rad at the load) of slow motion that neither model nor noise explains.
 
-    All of that motion counts as one error, whatever the samples: the gap may hide as much as it leaves. 0 where
-    rounding and white noise explain it, and of a motion without dynamics, whose misfits are judged otherwise.
+    0 where rounding and white noise explain it, and of a motion without dynamics, whose misfits are judged otherwise.
     """
-    problem, best = found.problem, found.best
+    problem, raw = found.problem, found.best.raw
     if problem.model.speed == 0.0:
         return 0.0
     averaged = round(_AVERAGED / (problem.model.speed * problem.interval))
-    left = slow(best.raw, max(1, min(averaged, best.raw.size // 100)))
-    error = math.sqrt(max(0.0, left**2 - (_EVENLY * problem.count) ** 2))
-    return max(error, _half_gap_of(found, error)) if error > 0.0 else 0.0
+    left = slow(raw, max(1, min(averaged, raw.size // 100)))
+    return math.sqrt(max(0.0, left**2 - (_EVENLY * problem.count) ** 2))
 
 
-def _half_gap_of(found: Search, error: float) -> float:
-    """Standard deviation of the half gap if the residual's rms is a single normal error, beside the other unknowns."""
+def unexplained(found: Search) -> float:
+    """Standard deviation of the half gap (m or rad at the load) by the slow error: the gap may hide as much as it
+    leaves.
+    """
+    error = slow_error(found)
+    return max(error, *left_open(found, error, [HALF])) if error > 0.0 else 0.0
+
+
+def left_open(found: Search, error: float, places: Sequence[int]) -> list[float]:
+    """Standard deviations of unknowns at places (f,), beside the other ones, if an error's rms is one normal error.
+
+    It is alike in every contact, so that it counts once, whatever the samples.
+    """
     best, problem = found.best, found.problem
     noise = Autoregression.white(error * math.sqrt(best.raw.size))
     rate = problem.model.slowing[-1] * problem.model.speed
     residual, rows, raw = whitened_rows(problem, best.values, noise, found.free, rate)
-    return Fit(best.values, residual, rows, 0.0, raw, 0).std(HALF, found.free)
+    single = Fit(best.values, residual, rows, 0.0, raw, 0)
+    return [single.std(place, found.free) for place in places]

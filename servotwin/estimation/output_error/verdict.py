@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Search, one_flank
+from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
 from servotwin.estimation.output_error.rounding import per_count
@@ -104,15 +105,18 @@ def judge(
     allowed = _allowed(found, half, settings)
     model = problem.model
     friction = model.hidden_friction(best.values) if isinstance(model, ShaftModel) else 0.0
+    left, times = unexplained(found), time_jitter(found)
     found_doubts = (
         _wide(std, allowed, unit),
         _rival(found, half, total, unit),
         _hidden(found, half),
         _of_friction(friction, allowed, unit),
+        _of_slow_motion(left, half, allowed, unit),
+        _of_jitter(times, allowed, unit),
     )
     doubts = tuple(filter(None, found_doubts))
     if not doubts:
-        return JudgedFit(GapStatus.OK, half, std, math.hypot(total, friction, _DOUBT * unexplained(found)))
+        return JudgedFit(GapStatus.OK, half, std, math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half))
     ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
     reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
     return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
@@ -139,6 +143,27 @@ def _of_friction(friction: float, allowed: float, unit: float) -> str:
     return (
         f"with the stated load friction the gap would be {_deg(unit * friction)} off, and {_deg(unit * allowed)} are "
         "allowed: slow motion does not tell friction from a gap"
+    )
+
+
+def _of_slow_motion(left: float, half: float, allowed: float, unit: float) -> str:
+    """Sentence for slow motion whose interval contains every smaller half gap (m or rad at the load): no news."""
+    hidden = NORMAL_95 * _DOUBT * left
+    if hidden <= max(half, NORMAL_95 * _DOUBT * allowed):
+        return ""
+    return (
+        f"the model leaves slow motion that may hide {_deg(unit * hidden)}, and the gap would be {_deg(unit * half)}: "
+        "friction, shaft or a sensor are of another kind"
+    )
+
+
+def _of_jitter(times: TimeJitter, allowed: float, unit: float) -> str:
+    """Sentence for times of the samples that jitter too much for a half gap (m or rad at the load)."""
+    if times.half <= allowed:
+        return ""
+    return (
+        f"the times of the samples jitter by {1e3 * times.time:.2g} ms: that moves the gap by "
+        f"{_deg(unit * times.half)}, and {_deg(unit * allowed)} are allowed"
     )
 
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.core.visible import counted
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.fit import gaps_to_try
 from servotwin.estimation.whitened.gate import slow
@@ -19,10 +22,13 @@ from servotwin.estimation.whitened.reduction import CONSTANT, RESIDUAL, Reductio
 from servotwin.estimation.whitened.search import search
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import Window
+from servotwin.plant.load import LINEAR
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-_FLAT, _RUN, _STEEP = 20, 6, 0.05  # samples at the extreme, and before it; share of the fastest motion there
+# Samples at the extreme, at a time (a swing in counts that moves in each sample before has fewer at its crest), and
+# before it; share of the fastest motion there.
+_FLAT, _CREST, _RUN, _STEEP = 20, 10, 6, 0.05
 _JUMP = 50.0  # times the usual fastest motion
 _SPIKE, _SHOWN, _SPIKE_COUNTS = 8.0, 0.01, 2.0  # of the median step, of the motion's range; counts
 # Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
@@ -32,12 +38,21 @@ _QUIET, _LOUD = math.radians(0.002), math.radians(0.03)  # noise of the encoder:
 _HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3  # of the servo's own seconds
 
 
-def faults(window: Window) -> tuple[str, ...]:
-    """List the faults of theta_m and position, one sentence each."""
+def faults(window: Window, motion: str = LINEAR) -> tuple[str, ...]:
+    """List the faults of theta_m and position, one sentence each; `motion` as in `servotwin.plant.load.Load`."""
     assert window.theta_m is not None
-    channels = {"theta_m": (window.theta_m, math.degrees(1.0), "deg"), "position": (window.position, 1e3, "mm")}
+    degrees = (math.degrees(1.0), "deg")
+    units = {"theta_m": degrees, "position": (1e3, "mm") if motion == LINEAR else degrees}
+    channels = {name: (window.channels[name], *unit) for name, unit in units.items()}
     sentences = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
     return tuple(sentence for sentence in sentences if sentence)
+
+
+def refused(blank: GapEstimate, sentences: tuple[str, ...]) -> GapEstimate:
+    """A blank estimate that says with which faults its channels are of no use; a dead one shows nothing."""
+    dead = any("constant" in sentence for sentence in sentences)
+    status = GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH
+    return replace(blank, status=status, reasons=sentences)
 
 
 def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
@@ -53,7 +68,7 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
         )
     return (
         _saturation(name, samples, steps, factor, unit)
-        or _repeating(name, steps)
+        or _repeating(name, np.diff(samples))
         or _spike(name, samples, factor, unit)
     )
 
@@ -61,11 +76,13 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
 def _spike(name: str, samples: Array, factor: float, unit: str) -> str:
     """Describe a sample that leaves its neighbours and comes back at once; empty without one.
 
-    No motion does: at its crests both steps are small. Noise does by a few of its standard deviations, which the median
-    step is, and a counter by one count.
+    No motion does: at its crests both steps are smaller than those beside them. Noise does by a few of its standard
+    deviations, which the median step is, and a counter by one count.
     """
     steps, span = np.diff(samples), float(np.ptp(samples))
-    back = np.where(steps[1:] * steps[:-1] < 0.0, np.minimum(np.abs(steps[1:]), np.abs(steps[:-1])), 0.0)
+    sizes = np.pad(np.abs(steps), 1)
+    back, beside = np.minimum(sizes[2:-1], sizes[1:-2]), np.maximum(sizes[3:], sizes[:-3])
+    back[(steps[1:] * steps[:-1] >= 0.0) | (back <= beside)] = 0.0
     index = int(np.argmax(back))
     size, least = float(back[index]), max(_SPIKE * float(np.median(np.abs(steps))), _SHOWN * span)
     if size <= least or size <= _SPIKE_COUNTS * counted(samples):
@@ -88,42 +105,50 @@ def _repeating(name: str, steps: Array) -> str:
     leap, was held: samples are missing. A count more or less is no motion, and a channel that is
     recorded more often than measured repeats most values: nothing is said of it.
     """
-    still = np.concatenate([[False], steps == 0.0, [False]])
-    begins, ends = np.flatnonzero(still[1:] & ~still[:-1]), np.flatnonzero(still[:-1] & ~still[1:])
+    begins, ends = _runs(steps == 0.0)
     long = ends - begins >= _REPEATED - 1
     if not np.any(long):
         return ""
-    moving = np.flatnonzero(steps > 0.0)
+    moving, sizes = np.flatnonzero(steps), np.abs(steps)
     if moving.size < 2 or np.median(np.diff(moving)) > 1.0:
         return ""
-    least = max(_ABRUPT * float(np.min(steps[steps > 0.0])), _STEEP * float(np.max(steps)))
+    least = max(_ABRUPT * float(np.min(sizes[moving])), _STEEP * float(np.max(sizes)))
     for begin, end in zip(begins[long], ends[long], strict=True):
         before, after = steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]
-        leaps = _abrupt(after, least) and after[0] > _LEAP * float(np.max(after[1:]))
+        leaps = _abrupt(after, least) and abs(after[0]) > _LEAP * float(np.max(np.abs(after[1:])))
         if leaps or _abrupt(before, least):
             repeats = f"{name} repeats one value in full motion, in samples {begin} to {end}"
             return f"{repeats}: it was held while samples were missing"
     return ""
 
 
+def _runs(true: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Begins and ends (k,) of the stretches in which something is true."""
+    padded = np.concatenate([[False], true, [False]])
+    return np.flatnonzero(padded[1:] & ~padded[:-1]), np.flatnonzero(padded[:-1] & ~padded[1:])
+
+
 def _abrupt(side: Array, least: float) -> bool:
     """True where the first of some steps is beyond `least` and beyond the change of speed in the others."""
-    return side.size == _RUN and bool(side[0] > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
+    return side.size == _RUN and bool(abs(side[0]) > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
 
 
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
-    """Describe samples that stay at an extreme value which was reached at speed; empty without them."""
+    """Describe samples that stay at an extreme value which was reached at speed; empty without them.
+
+    The crests of an even swing may all be at one count, each for few samples.
+    """
     for extreme in (float(samples.max()), float(samples.min())):
-        at = np.flatnonzero(samples == extreme)
-        if at.size < _FLAT:
+        begins, ends = _runs(samples == extreme)
+        if (size := int(np.sum(ends - begins))) < _FLAT:
             continue
         run = np.abs(samples[_RUN:] - samples[:-_RUN])
         fastest = float(np.partition(run, -5)[-5])
-        entries = at[(at >= _RUN) & ~np.isin(at - 1, at)]
+        entries = begins[(begins >= _RUN) & (ends - begins >= _CREST)]
         reached = [entry for entry in entries if np.all(steps[entry - _RUN : entry] > 0.0)]
         if any(run[entry - _RUN] > _STEEP * fastest for entry in reached):
             value = f"{factor * extreme:.6g} {unit}"
-            return f"{name} stays at its extreme of {value} for {at.size} samples: it is saturated"
+            return f"{name} stays at its extreme of {value} for {size} samples: it is saturated"
     return ""
 
 
@@ -174,28 +199,61 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
 
 _EXPLAINS, _BETTER = 0.05, 0.2  # share left that counts as a fit; of what the channels as given leave
 _POSITION_UNITS = {"mm": 1e-3, "micrometres": 1e-6, "units of 1000 m": 1e3}
-_ANGLE_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi, "units of 57.3 rad": 180.0 / math.pi}
+_ROTARY_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi}
+_ANGLE_UNITS = _ROTARY_UNITS | {"units of 57.3 rad": 180.0 / math.pi}
 _PITCHES = (0.5, 2.0)
 _RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
 
 
 def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: float, second: float) -> tuple[str, ...]:
     """Find the first fault whose correction lets the model explain the window; empty where none does or is needed."""
-    if unexplained <= _EXPLAINS:
+
+    def left(angle: Array, position: Array, rate: float) -> float:
+        return _unexplained_share(angle, position, rate, servo, second)
+
+    return corrected(window, theta_m, left, unexplained)
+
+
+def corrected(
+    window: Window,
+    theta_m: Array,
+    left: Callable[[Array, Array, float], float],
+    unexplained: float,
+    motion: str = LINEAR,
+    explains: float = _EXPLAINS,
+) -> tuple[str, ...]:
+    """Find the first fault whose correction explains the window; empty where none does or is needed.
+
+    Parameters
+    ----------
+    window : Window
+    theta_m : (n,) array
+        rad.
+    left : callable
+        Share of the position's motion that a model leaves of a corrected angle (n,), position (n,) and rate (Hz).
+    unexplained : float
+        The same of the channels as given.
+    motion : str
+        As in `servotwin.plant.load.Load`.
+    explains : float
+        Share left that counts as a fit.
+    """
+    if unexplained <= explains:
         return ()
-    for sentence, angle, position, rate in _candidates(window, theta_m):
-        if _unexplained_share(angle, position, rate, servo, second) < min(_EXPLAINS, _BETTER * unexplained):
+    for sentence, angle, position, rate in _candidates(window, theta_m, motion):
+        if left(angle, position, rate) < min(explains, _BETTER * unexplained):
             return (sentence,)
     return ()
 
 
-def _candidates(window: Window, theta_m: Array) -> Iterator[tuple[str, Array, Array, float]]:
+def _candidates(window: Window, theta_m: Array, motion: str) -> Iterator[tuple[str, Array, Array, float]]:
     """Yield possible faults, each with the corrected angle, position and rate."""
     position, rate = window.position, window.sample_rate
     yield "position and theta_m seem to be swapped", position, theta_m, rate
     yield "position or theta_m seems to have the wrong sign", theta_m, -position, rate
-    for unit, factor in _POSITION_UNITS.items():
-        yield f"position seems to be in {unit}, not in m", theta_m, factor * position, rate
+    si, units = ("m", _POSITION_UNITS) if motion == LINEAR else ("rad", _ROTARY_UNITS)
+    for unit, factor in units.items():
+        yield f"position seems to be in {unit}, not in {si}", theta_m, factor * position, rate
     for unit, factor in _ANGLE_UNITS.items():
         yield f"theta_m seems to be in {unit}, not in rad", factor * theta_m, position, rate
     for factor in _PITCHES:

@@ -15,7 +15,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
-from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle
+from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle, refused
 from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior, adapted
@@ -252,8 +252,7 @@ def _unfitted(
     blank = _nothing(window, servo, prior)
     broken = faults(window)
     if broken:
-        dead = any("constant" in sentence for sentence in broken)
-        blank = replace(blank, status=GapStatus.UNIDENTIFIABLE if dead else GapStatus.MODEL_MISMATCH, reasons=broken)
+        blank = refused(blank, broken)
     angle = window.theta_m if broken else motor_angle(window, servo.encoder_resolution, settings, second)
     return WindowFit(window, servo, prior, settings, blank, angle, bool(broken), second)
 

@@ -1,0 +1,73 @@
+"""Windows of free shafts whose channels are not what they should be: refused by name."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.axis_faults import faulty_windows
+from benchmarks.random_axes import random_axis, step_window
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.whitened.channels import faults
+from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import ROTARY
+
+SCREW = Axis.preset("ball-screw")
+
+
+@cache
+def screw(kind: str = "none") -> tuple[float, Window]:
+    """Total gap (rad) and a window of a ball screw with a kind of fault."""
+    machine, gap, window = next(faulty_windows("ball-screw", kind, 1, 5))
+    assert machine.model == SCREW
+    return gap, window
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("position held", "position repeats one value in full motion"),
+        ("angle held", "theta_m repeats one value in full motion"),
+        ("position stuck", "position stays at its extreme"),
+        ("angle stuck", "theta_m stays at its extreme"),
+        ("angle spiked", "theta_m leaves its neighbours by"),
+        ("position doubled", "the pitch seems to be 2 times the model's"),
+        ("position halved", "the pitch seems to be 0.5 times the model's"),
+        ("position in mm or degrees", "position seems to be in mm, not in m"),
+        ("angle reversed", "position or theta_m seems to have the wrong sign"),
+    ],
+)
+def test_a_wrong_channel_of_a_free_shaft_is_refused_by_name(kind: str, words: str) -> None:
+    estimate = estimate_gap(screw(kind)[1], SCREW)
+    assert estimate.status is GapStatus.MODEL_MISMATCH
+    assert words in estimate.reasons[0]
+
+
+def test_a_rotary_position_is_named_in_its_own_units() -> None:
+    _, window = screw()
+    spiked = window.position.copy()
+    spiked[350] += 0.1 * np.ptp(spiked)
+    (sentence,) = faults(window.replace(position=spiked), ROTARY)
+    assert " deg in sample 350 alone" in sentence
+
+
+def test_a_light_motor_that_its_load_throws_back_within_few_samples_is_no_spike() -> None:
+    drawn = random_axis("torque", 777, 32)
+    for step in (1, 2, 3):
+        assert faults(step_window(drawn, step), drawn.model.load.motion) == ()
+
+
+def test_an_even_swing_whose_crests_are_at_one_count_is_not_saturated() -> None:
+    swing = np.round(60.0 * np.sin(0.2 * math.pi * np.arange(4000) / 4.0))
+    assert np.sum(swing == swing.max()) > 20
+    assert faults(Window(1e-6 * swing, 1e-3 * swing, sample_rate=1000.0)) == ()
+
+
+def test_noise_of_few_counts_that_repeats_by_chance_was_not_held() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        noisy = np.round(rng.normal(0.0, 2.0, (2, 2000)) + 20.0 * np.sin(np.arange(2000) / 300.0))
+        assert faults(Window(*noisy, sample_rate=1000.0)) == ()

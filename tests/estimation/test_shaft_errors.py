@@ -1,0 +1,78 @@
+"""Jitter of the samples' times and slow motion that the model of a free shaft leaves: wider intervals, no lessons."""
+
+import math
+from functools import cache
+
+import numpy as np
+import pytest
+
+from benchmarks.axis_faults import faulty_windows
+from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.output_error import OutputErrorSettings, fit
+from servotwin.estimation.output_error.jitter import _DEPENDENT, _GAIN, _regressed, time_jitter
+from servotwin.estimation.output_error.learnt_shaft import shaft_reading
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
+
+SCREW = Axis.preset("ball-screw")
+KNOWN = FactorPrior(np.zeros(4), np.diag(np.square([0.08, 0.5, 0.005, 0.05])))
+
+
+@cache
+def screw(kind: str = "none") -> tuple[float, Window]:
+    """Total gap (rad) and a window of a ball screw with a kind of fault."""
+    _, gap, window = next(faulty_windows("ball-screw", kind, 1, 5))
+    return gap, window
+
+
+def test_jitter_of_the_times_is_measured_and_widens_the_interval_or_is_refused() -> None:
+    for kind, samples in (("position jitters by 0.1", 0.1), ("position jitters by 0.3", 0.3)):
+        gap, window = screw(kind)
+        jitter = time_jitter(fit(window, SCREW, None, OutputErrorSettings()))
+        assert jitter.time * window.sample_rate == pytest.approx(samples, rel=0.5)
+        estimate = estimate_gap(window, SCREW)
+        low, high = estimate.interval
+        assert not estimate.ok or low <= gap <= high
+        assert not estimate.ok or high - low >= 4.0 * (2.0 / SCREW.p) * jitter.half
+
+
+def test_a_window_without_jitter_shows_none() -> None:
+    gap, window = screw()
+    jitter = time_jitter(fit(window, SCREW, None, OutputErrorSettings()))
+    assert jitter == (0.0, 0.0)
+    estimate = estimate_gap(window, SCREW)
+    assert estimate.ok
+    assert abs(estimate.gap - gap) < 0.01 * gap
+
+
+def test_the_statistic_of_jitter_has_the_stated_distribution_in_white_noise() -> None:
+    """Chi-square with one degree of freedom, of which the half is seen that grows with the speed."""
+    rng, speed = np.random.default_rng(2), np.sin(np.arange(3000) / 200.0) ** 3
+    tests = []
+    for noise in rng.normal(size=(2000, speed.size)):
+        squares = (noise[1:-1] - 0.5 * (noise[2:] + noise[:-2])) ** 2 / _GAIN
+        tests.append(_regressed(squares, speed[1:-1] ** 2)[0] / _DEPENDENT)
+    assert np.mean(np.greater(tests, 0.0)) == pytest.approx(0.5, abs=0.05)
+    for quantile, value in ((0.90, 1.642), (0.95, 2.706), (0.99, 5.412)):  # of chi-square at 0.8, 0.9, 0.98
+        assert np.mean(np.greater(tests, value)) == pytest.approx(1.0 - quantile, rel=0.35)
+
+
+def erring(window: Window, gap: float, share: float) -> Window:
+    """The window with a position sensor that errs by a share of the gap (peak to peak) with its way."""
+    at_load = gap * SCREW.p
+    wave = 0.5 * share * at_load * np.sin(2.0 * math.pi * window.position / (40.0 * at_load) + 1.0)
+    return window.replace(position=window.position + wave)
+
+
+def test_a_window_with_slow_motion_that_the_model_leaves_teaches_less_or_nothing() -> None:
+    gap, window = screw()
+    spreads = []
+    for share in (0.0, 0.25, 0.5):
+        found = fit(erring(window, gap, share), SCREW, None, OutputErrorSettings(), KNOWN)
+        reading = shaft_reading(found, KNOWN, 1.1).machine
+        spreads.append(math.sqrt(np.reshape(reading.covariance, (4, 4))[0, 0]))
+    known = math.sqrt(KNOWN.covariance[0, 0])
+    assert spreads[0] < 0.2 * known
+    assert spreads[1] > 0.9 * known
+    assert spreads[2] == pytest.approx(known)
