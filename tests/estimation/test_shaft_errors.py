@@ -58,6 +58,23 @@ def test_the_statistic_of_jitter_has_the_stated_distribution_in_white_noise() ->
         assert np.mean(np.greater(tests, value)) == pytest.approx(1.0 - quantile, rel=0.35)
 
 
+@pytest.mark.parametrize("step", [1e-9, 1e-7, 1e-5])
+def test_friction_leaves_the_motion_smooth_in_every_number(step: float) -> None:
+    """A load that was held, or was not, by rounding made jumps of a thousandth of the gap: derivatives were up to a
+    hundred times too large, and gaps better known than they were."""
+    gap, window = screw()
+    found = fit(erring(window, gap, 0.25), SCREW, None, OutputErrorSettings(), KNOWN)
+    problem, best = found.problem, found.best
+    usual, here = problem.sizes(), problem.misfit(best.values)
+    for i in np.flatnonzero(found.free)[:-2]:  # all but the motion before the window
+        slopes = []
+        for side in (-step, step, 1e-4):
+            moved = best.values.copy()
+            moved[i] += side * usual[i]
+            slopes.append(float(np.linalg.norm(problem.misfit(moved) - here)) / abs(side))
+        assert slopes == pytest.approx([slopes[-1]] * 3, rel=0.1), problem.model.unknowns[i].name
+
+
 def erring(window: Window, gap: float, share: float) -> Window:
     """The window with a position sensor that errs by a share of the gap (peak to peak) with its way."""
     at_load = gap * SCREW.p
@@ -75,4 +92,4 @@ def test_a_window_with_slow_motion_that_the_model_leaves_teaches_less_or_nothing
     known = math.sqrt(KNOWN.covariance[0, 0])
     assert spreads[0] < 0.2 * known
     assert spreads[1] > 0.9 * known
-    assert spreads[2] == pytest.approx(known)
+    assert spreads[2] > 0.99 * known

@@ -220,13 +220,18 @@ def through_sample(
 
 
 @inlined
-def slow_down(state: Array, place: float, speed: float, friction: float) -> None:
-    """Apply friction after a step that the last mass began at a place with a speed: it rests on where it is held."""
+def slow_down(state: Array, place: float, unused: float, friction: float) -> None:
+    """Apply friction after a part that the last mass began at a place: `friction` and what is left of that before.
+
+    A mass that friction holds rests where it is. All is continuous in every number: a mass that stopped in the half
+    before is taken for one that rested as far as friction was left.
+    """
     n = (state.size - 3) // 2
-    if speed == 0.0 and abs(state[2 * n - 1]) <= 2.0 * friction:
-        state[n - 1], state[2 * n - 1] = place, 0.0
-    else:
-        state[2 * n - 1] = slowed(state[2 * n - 1], friction)
+    speed = state[2 * n - 1]
+    if unused > 0.0:
+        share = 1.0 - 2.0 * unused / abs(speed) if abs(speed) > 2.0 * unused else 0.0
+        state[n - 1] = place + share * (state[n - 1] - place)
+    state[2 * n - 1] = slowed(speed, friction + unused)
 
 
 @inlined
@@ -282,8 +287,7 @@ def run_shaft(
         Shares of the measured position less the simulated one that are added to the last mass's position, and to its
         speed (1/s); 0: none.
     friction : float
-        Speed that Coulomb friction takes off the last mass in half a part at most: before each, and after it. A mass
-        that it would stop at once stays where it rests.
+        Speed that Coulomb friction takes off the last mass in half a part at most: before each, and after it.
     work : (18, size) array
         Scratch.
     state : (size,) array
@@ -310,8 +314,8 @@ def run_shaft(
         for k in range(parts):
             end = between(drive, i, (k + 1.0) / parts)
             drive_to(state, side, begin, (end - begin) / interval, half, kept)
-            place, speed = state[n - 1], slowed(state[2 * n - 1], friction)
-            state[2 * n - 1] = speed
+            place, speed = state[n - 1], state[2 * n - 1]
+            state[2 * n - 1] = slowed(speed, friction)
             side = through_sample(side, begin, end, interval, half, flows, steps, push, fading, work, state)
-            slow_down(state, place, speed, friction)
+            slow_down(state, place, max(0.0, friction - abs(speed)), friction)
             begin = end
