@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from servotwin.estimation.output_error.shaft import drive_to, guard, slow_down, slowed, through_sample
+from servotwin.estimation.output_error.shaft import drive_to, guard, slow_after, slow_before, through_sample
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
@@ -91,14 +91,13 @@ def step_load(by: LoadStep, side: int, begin: float, rate: float, work: Array, s
     for k in range(by.parts):
         now, then = begin + k * by.interval * rate, begin + (k + 1) * by.interval * rate
         drive_to(state, side, now, rate, by.half, kept)
-        place, speed = state[n - 1], slowed(state[2 * n - 1], by.friction)
-        state[2 * n - 1] = speed
+        place, unused = state[n - 1], slow_before(state, by.friction)
         impulse -= momentum(by.momentum, state) - 0.5 * by.interval * by.ground[0] * state[0]
         side = through_sample(
             side, now, then, by.interval, by.half, by.flows, by.steps, by.push, by.fading, work, state
         )
         impulse += momentum(by.momentum, state) + by.interval * (0.5 * by.ground[0] * state[0] - by.ground[1])
-        slow_down(state, place, speed, by.friction)
+        slow_after(state, place, unused, by.friction)
     return side, impulse / (by.parts * by.interval)
 
 

@@ -220,7 +220,16 @@ def through_sample(
 
 
 @inlined
-def slow_down(state: Array, place: float, unused: float, friction: float) -> None:
+def slow_before(state: Array, friction: float) -> float:
+    """Apply friction to the last mass before a part; return what is left of it where it stops the mass."""
+    last = state.size - 4
+    speed = state[last]
+    state[last] = slowed(speed, friction)
+    return max(0.0, friction - abs(speed))
+
+
+@inlined
+def slow_after(state: Array, place: float, unused: float, friction: float) -> None:
     """Apply friction after a part that the last mass began at a place: `friction` and what is left of that before.
 
     A mass that friction holds rests where it is. All is continuous in every number: a mass that stopped in the half
@@ -314,8 +323,7 @@ def run_shaft(
         for k in range(parts):
             end = between(drive, i, (k + 1.0) / parts)
             drive_to(state, side, begin, (end - begin) / interval, half, kept)
-            place, speed = state[n - 1], state[2 * n - 1]
-            state[2 * n - 1] = slowed(speed, friction)
+            place, unused = state[n - 1], slow_before(state, friction)
             side = through_sample(side, begin, end, interval, half, flows, steps, push, fading, work, state)
-            slow_down(state, place, max(0.0, friction - abs(speed)), friction)
+            slow_after(state, place, unused, friction)
             begin = end
