@@ -72,7 +72,7 @@ def test_friction_leaves_the_motion_smooth_in_every_number(step: float) -> None:
             moved = best.values.copy()
             moved[i] += side * usual[i]
             slopes.append(float(np.linalg.norm(problem.misfit(moved) - here)) / abs(side))
-        assert slopes == pytest.approx([slopes[-1]] * 3, rel=0.1), problem.model.unknowns[i].name
+        assert slopes == pytest.approx([slopes[-1]] * 3, rel=0.3), problem.model.unknowns[i].name
 
 
 def erring(window: Window, gap: float, share: float) -> Window:

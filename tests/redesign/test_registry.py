@@ -130,7 +130,8 @@ def test_a_range_without_a_verified_setting_is_refused_before_anything_runs(tmp_
     reason = r"no fallback set for the servo's stated range: none of \d+ candidates "
     ranges = "steps of 0.1 to 2.5 mm from rest, gaps of 0 to 60 deg, input bias of -0.1 to 0.1 V, friction of 0 to 0"
     words = rf"{reason}.* by default are {ranges} N m; if gaps or steps of this machine "
-    words += r"are smaller, state them \(gap_deg and step_mm\)$"
+    words += r"are smaller, state them \(gap_deg and step_mm\); without a twin it can be simulated: "
+    words += r"enabled = false in \[twin\], and no policy$"
     with pytest.raises(InvalidInput, match=words):
         load(tmp_path, "[twin.demands]\nsettled_percent = 100\nvelocity_feedforward = false\nMs = 1.2")
 

@@ -16,6 +16,7 @@ from servotwin.plant.signals import Array
 
 LARGEST = 4.0  # standard deviations by which an unknown may move
 _LARGEST_DELAY = 0.03  # of the window
+_HARDLY_KNOWN = math.log(100.0)  # of dampings: no data sheet states that of a shaft
 _HALVES = (0.5, 0.4, 0.3, 0.22, 0.15, 0.1, 0.06, 0.03, 0.015, 0.005)  # of the lead's range
 _PLACES = tuple(0.1 * step for step in range(-5, 6))  # of the lead's range
 _WIDE = 5.0  # of the lead's range
@@ -80,6 +81,8 @@ class Problem:
         """(u,) largest sizes of the unknowns."""
         limits = np.array([LARGEST * unknown.std for unknown in self.model.unknowns])
         limits[DELAY] = self.largest_delay
+        dampings = ["damping" in unknown.name for unknown in self.model.unknowns]
+        limits[dampings] = np.maximum(limits[dampings], _HARDLY_KNOWN)
         return limits
 
     def motion(self, values: Array, rate: float = 0.0) -> Motion:
