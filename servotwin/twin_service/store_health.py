@@ -48,7 +48,7 @@ class StoreHealth:
 
     @property
     def trouble(self) -> str:
-        """Why the last read or write failed; empty: it did not, or that write failed long ago: none was tried since."""
+        """Reason for which the last read or write failed; empty: none did, or the last failed write is long ago."""
         if self._damage():
             return ""
         failed = self._writes.failure if self._now() - self._writes.failed_at < _UNHEALTHY_S else ""
