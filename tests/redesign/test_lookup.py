@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 from exploration import examples
 from hypothesis import given
@@ -19,6 +20,7 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import PRESETS, Servo
+from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.lookup import (
@@ -32,6 +34,7 @@ from servotwin.redesign.certified.lookup import (
     table_of,
 )
 from servotwin.redesign.certified.lookup_file import build, load
+from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Region, Uncertainty
@@ -162,13 +165,23 @@ def test_a_feedforward_counts_by_what_it_leaves_of_the_bias() -> None:
     """A cell that is verified without a feedforward holds for all."""
     setting = table().fallback.setting
     fed = replace(setting, controller=setting.controller.replace(feedforward=0.07))
-    plain = POLICY.confirm(region(left=5e-3), setting)
-    other = POLICY.confirm(region(feedforward=0.07, left=5e-3), fed)
-    assert isinstance(plain, Certificate)
-    assert isinstance(other, Certificate)
-    assert other.tail == pytest.approx(plain.tail, rel=1e-6)
-    assert other.overshoot == pytest.approx(plain.overshoot, rel=1e-6)
-    assert other.cost == pytest.approx(plain.cost, rel=1e-6)
+    known, biased = (region(feedforward=volts, left=5e-3).within(POLICY.uncertainty) for volts in (0.0, 0.07))
+    members = draw_independently(SERVO, known, 16, 5)
+    other = replace(draw_independently(SERVO, biased, 16, 5), direction=members.direction)
+    (plain,), (shifted,) = assess([setting], members, POLICY.trial), assess([fed], other, POLICY.trial)
+    np.testing.assert_allclose(shifted.tail, plain.tail, rtol=1e-6)
+    np.testing.assert_allclose(shifted.overshoot, plain.overshoot, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(shifted.cost, plain.cost, rtol=1e-6)
+
+
+def test_a_looked_up_setting_may_hold_what_it_feeds_forward() -> None:
+    requested = region(feedforward=0.07, left=5e-3)
+    found = table().find(requested)
+    assert isinstance(found, Certificate)
+    exact = POLICY.confirm(requested, found.setting)
+    assert isinstance(exact, Certificate)
+    assert exact.effort > 0.06
+    assert exact.effort <= found.effort
 
 
 @pytest.mark.slow

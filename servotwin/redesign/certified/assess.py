@@ -99,7 +99,7 @@ def joined(first: MachineMeasures, second: MachineMeasures) -> MachineMeasures:
 def assess(
     settings: Sequence[Design], members: SimulatedMachines, trial: Trial, largest: float | None = None
 ) -> list[MachineMeasures]:
-    """Simulate every setting on every machine, exactly; the reference steps once from rest.
+    """Simulate every setting on every machine, exactly; the reference steps once from rest, up or down.
 
     Parameters
     ----------
@@ -217,7 +217,8 @@ def _figures(
     trial: Trial,
 ) -> dict[str, Figures]:
     tolerance = tolerances[:, None, None]
-    cases = Cases(members.step, members.gap, tolerance, members.theta_d0, members.input_bias, members.friction)
+    moved = members.direction * members.step
+    cases = Cases(moved, members.gap, tolerance, members.theta_d0, members.input_bias, members.friction)
     outputs, limits = ("error", "voltage"), {"error": near}
     if laws[0, 0, 0].sample_rate is None:
         return summarise_members(
@@ -288,13 +289,14 @@ def _measures(
     near: Array,
 ) -> MachineMeasures:
     """Measures from (P, C) figures."""
-    step = members.step
+    step, up = members.step, members.direction > 0.0
+    beyond = np.where(up, error.last_mean - error.lowest, error.highest - error.last_mean)
     return MachineMeasures(
         ripple=0.5 * (error.last_highest - error.last_lowest),
         tail=np.maximum(error.last_highest, -error.last_lowest),
         error_rms=np.sqrt(error.last_mean_square),
         effort=np.sqrt(voltage.last_mean_square),
-        overshoot=np.maximum(error.last_mean - error.lowest, 0.0) / (step + 2.0 * np.abs(error.last_mean)),
+        overshoot=np.maximum(beyond, 0.0) / (step + 2.0 * np.abs(error.last_mean)),
         settling=error.outside / trial.rate,
         cost=error.mean_size * trial.duration / step,
         saturated=np.maximum(voltage.highest, -voltage.lowest) >= limit,

@@ -331,5 +331,6 @@ def _with_feedforward(certificate: Certificate, feedforward: float) -> Certifica
     """Certificate with a feedforward, and with the range of input biases that the cell then covers."""
     low, high = certificate.input_bias
     law = certificate.setting.controller.replace(feedforward=feedforward)
-    setting = replace(certificate.setting, controller=law)
-    return replace(certificate, setting=setting, input_bias=(low - feedforward, high - feedforward))
+    setting, biases = replace(certificate.setting, controller=law), (low - feedforward, high - feedforward)
+    # What is fed forward is held at rest too.
+    return replace(certificate, setting=setting, input_bias=biases, effort=certificate.effort + abs(feedforward))

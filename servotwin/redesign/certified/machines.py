@@ -19,8 +19,8 @@ from servotwin.redesign.certified.uncertainty import PARAMETERS, Range, Uncertai
 # Drawn after the parameters, where a model states friction.
 _FRICTIONS = ("motor_friction", "load_friction")
 _LEAST_GAP = 1e-6  # of the smallest step
-_CONDITION_NAMES = ("gap", "step", "input_bias", "theta_d0", "friction", "delay")
-_CONDITIONS = len(_CONDITION_NAMES)
+_DRAWN_CONDITIONS = 6  # all but the direction, which takes turns
+_CONDITION_NAMES = ("gap", "step", "input_bias", "theta_d0", "friction", "delay", "direction")
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +32,8 @@ class SimulatedMachines:
     plants : tuple of P Servo or Axis
     gap, step, input_bias, theta_d0, friction, delay : (P, C) array
         rad, m, V, rad, N m, samples.
+    direction : (P, C) array
+        Of the step: 1, or by turns 1 and -1 where a bias or a force pushes one way.
     whole : SimulatedMachines, optional
         Those that these are a part of.
     """
@@ -43,6 +45,7 @@ class SimulatedMachines:
     theta_d0: Array
     friction: Array
     delay: Array
+    direction: Array
     whole: SimulatedMachines | None = None
 
     @property
@@ -78,7 +81,7 @@ def draw(servo: Plant, uncertainty: Uncertainty, plants: int, conditions: int, s
     The first plant is the model itself. The first two conditions of every plant have the largest and the smallest gap
     and input bias: the ends of an estimate's interval are where a setting fails first.
     """
-    places = _sobol(_CONDITIONS, plants * conditions, seed + 1).reshape(plants, conditions, _CONDITIONS)
+    places = _sobol(_DRAWN_CONDITIONS, plants * conditions, seed + 1).reshape(plants, conditions, _DRAWN_CONDITIONS)
     if conditions > 1:
         places[:, 0, :3:2], places[:, 1, :3:2] = 1.0, 0.0
     return _machines(drawn_plants(servo, uncertainty, plants, seed), uncertainty, places)
@@ -91,7 +94,7 @@ def draw_independently(servo: Plant, uncertainty: Uncertainty, count: int, seed:
     """
     rng = np.random.default_rng(seed)
     factors = _factors(uncertainty, rng.random((count, len(_drawn(servo)))))
-    return _machines(_scaled_plants(servo, factors), uncertainty, rng.random((count, 1, _CONDITIONS)))
+    return _machines(_scaled_plants(servo, factors), uncertainty, rng.random((count, 1, _DRAWN_CONDITIONS)))
 
 
 def drawn_plants(servo: Plant, uncertainty: Uncertainty, count: int, seed: int) -> tuple[Plant, ...]:
@@ -165,7 +168,16 @@ def _machines(plants: tuple[Plant, ...], uncertainty: Uncertainty, places: Array
         (places[..., 3] - 0.5) * gap,
         _spread(uncertainty.friction, places[..., 4]),
         np.minimum(np.floor(places[..., 5] * (uncertainty.delay + 1)), uncertainty.delay),
+        _directions(plants[0], uncertainty, gap.shape),
     )
+
+
+def _directions(model: Plant, uncertainty: Uncertainty, shape: tuple[int, ...]) -> Array:
+    """Directions of the steps: one stands for both where nothing tells them apart."""
+    low, high = uncertainty.input_bias
+    if low == -high and model.guide.force == 0.0:
+        return np.ones(shape)
+    return np.asarray(1.0 - 2.0 * (np.indices(shape).sum(axis=0) % 2))
 
 
 def _scaled_plants(servo: Plant, factors: Array) -> tuple[Plant, ...]:
