@@ -132,7 +132,7 @@ class Loop:
 
     def __repr__(self) -> str:
         """Scenario, windows, updates and the newest trend in one line."""
-        counts = f"{len(self.windows)} windows, {len(self.updates)} updates, {len(self.applied)} applied"
+        counts = f"windows: {len(self.windows)}, updates: {len(self.updates)} sent, {len(self.applied)} applied"
         return f"<Loop {self.scenario.name!r}: {self.scenario.duration:g} s, {counts}, {self.trend!r}>"
 
     def _repr_html_(self) -> str:
