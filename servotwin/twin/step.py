@@ -302,6 +302,7 @@ def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: floa
         None if model.motor is None else model.motor.current(wear.motor, arrived),
         state.rests,
         state.steps,
+        state.failed,
     )
 
 
@@ -359,9 +360,10 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
         return state, Redesign(None, math.nan, evidence.why_not)
     try:
         if model.lookups is None or state.lookups is None:
-            return state, model.policy.redesign(evidence)
-        lookups, redesign = model.lookups.redesign(state.lookups, evidence)
-        return replace(state, lookups=lookups), redesign
+            lookups, redesign = state.lookups, model.policy.redesign(evidence)
+        else:
+            lookups, redesign = model.lookups.redesign(state.lookups, evidence)
+        return replace(state, lookups=lookups, failed=redesign.failed or state.failed), redesign
     except InvalidInput as error:
         return state, Redesign(None, math.nan, str(error))
 

@@ -179,12 +179,15 @@ GANTRY = Axis.preset("gantry")
 OWN, HELD = 1.25, 1.25 * 1.25
 
 
-def _axis_ranges(law: object, *found: float, stated: Range = (0.0, 0.0)) -> tuple[Range, Range]:
+def _axis_ranges(
+    law: object, *found: float, stated: Range = (0.0, 0.0), motor: LearntMotor | None = None
+) -> tuple[Range, Range]:
     """Bias and friction beyond the model's, from these rests of a gantry."""
     axis = GANTRY if law is None else GANTRY.replace(controller=law)
     policy = CertifiedPolicy(axis, Uncertainty(gap=(0.0, 0.3), step=(1.5e-3, 1e-2), input_bias=stated))
     last = Disturbance(found[-1], 1e-4, 0.0, 0.3, 0.0)
-    seen = Evidence(ESTIMATE, last, None, Setting(0.0, gains_of(axis.controller)), 0.01, rests=found[:-1])
+    setting = Setting(0.0, gains_of(axis.controller))
+    seen = Evidence(ESTIMATE, last, None, setting, 0.01, motor=motor, rests=found[:-1])
     return policy.ranges.input_bias(seen)[1], policy.ranges.friction(seen)
 
 
@@ -193,17 +196,31 @@ def test_rests_that_the_models_friction_explains_show_neither_bias_nor_more_fric
     calm = GANTRY.controller.replace(Ki=0.0)
     for found in [(-1.2, -1.23, -1.21), (-1.2, 1.2), (1.5,), (0.0, 0.0)]:
         (low, high), friction = _axis_ranges(calm, *found)
-        assert -0.01 < low < 0.0 < high < 0.01
+        assert -0.01 < low <= 0.0 <= high < 0.01
         assert friction == (0.0, 0.0)
 
 
 def test_an_integral_may_hold_what_the_models_friction_does() -> None:
     """The next move begins with it, as if the bias changed by as much: that friction may be a quarter more."""
-    (low, high), friction = _axis_ranges(None, -0.4, 0.2)
+    known = LearntMotor((0.0, 0.0, OWN, 0.0), (*[0.0] * 10, 1e-6, *[0.0] * 4, 1e-6), 0.0)
+    (low, high), friction = _axis_ranges(None, -0.4, 0.2, stated=(-3.0, 3.0), motor=known)
     assert (low, high) == pytest.approx((-0.5, 0.5))
-    assert friction == (0.0, 0.0)
-    assert _axis_ranges(None, -1.2, 1.2)[0] == pytest.approx((-1.5, 1.5))
-    assert _axis_ranges(None, -1.3, 1.3)[0] == pytest.approx((-1.25 * OWN, 1.25 * OWN))
+    assert friction == (0.0, pytest.approx(0.0, abs=0.01))
+    assert _axis_ranges(None, -1.2, 1.2, stated=(-3.0, 3.0), motor=known)[0] == pytest.approx((-1.5, 1.5))
+    assert _axis_ranges(None, -1.3, 1.3, stated=(-3.0, 3.0), motor=known)[0] == pytest.approx((-1.25 * OWN, 1.25 * OWN))
+
+
+@pytest.mark.parametrize("most", [0.0, 0.1, 0.3])
+def test_rests_within_the_stated_ranges_make_no_question_harder(most: float) -> None:
+    """The fallback set, too, is verified from an integral of zero."""
+    for found in [(-0.4, 0.2), (-1.2, 1.2), (0.0, 0.0), (1.5,)]:
+        low, high = _axis_ranges(None, *found, stated=(-most, most))[0]
+        assert -most <= low <= high <= most
+
+
+def test_rests_that_contradict_the_stated_bias_count_with_what_an_integral_may_hold() -> None:
+    (low, high), _ = _axis_ranges(None, -3.0, -3.1, stated=(-0.1, 0.1))
+    assert low < -3.1 < high < -0.1
 
 
 def test_a_stated_bias_counts_as_far_as_the_rests_allow_it() -> None:
@@ -214,7 +231,7 @@ def test_a_stated_bias_counts_as_far_as_the_rests_allow_it() -> None:
 
 def test_rests_that_no_bias_explains_show_friction_beyond_the_models() -> None:
     calm = GANTRY.controller.replace(Ki=0.0)
-    (low, high), friction = _axis_ranges(calm, -2.0, 2.4)
+    (low, high), friction = _axis_ranges(calm, -2.0, 2.4, stated=(-3.0, 3.0))
     assert low < 0.2 < high
     assert friction == pytest.approx((0.0, (1.25 * 2.2 - OWN) * GANTRY.torque_of(1.0)))
     # One bias explains these.

@@ -14,12 +14,17 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.messages import Acknowledge, Gains, Setting, Update, pack_channel
 from servotwin.plant.servo import Servo
+from servotwin.redesign.certified import policy as policies
+from servotwin.redesign.certified.certificate import NotVerified
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.certified.verification import verification_of
 from servotwin.redesign.registry import certified_policy, policy_of
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
+from servotwin.twin.state import decode_state, encode_state
+from servotwin.twin.twin import Twin
 
 PAPER = Servo.preset("paper")
 FEW = Demands(machines=16, screened=2, scales=(0.5, 0.7), settled=0.8)
@@ -134,3 +139,33 @@ def test_nothing_is_proposed_that_may_leave_the_fallback_sets_band():
         assert isinstance(sent[0].setting.gains, Gains)
         assert redesign.certificate.tail <= fallback_certificate.tail
         assert sent[0].setting.tolerance * sent[0].setting.gains.leave <= band_of(fallback_certificate).error
+
+
+def test_a_search_that_found_nothing_is_not_repeated_by_a_twin_that_was_restored(monkeypatch):
+    """The state carries the question and its result: the second window is answered as the first one."""
+    searches = []
+
+    def nothing(*question):
+        searches.append(question)
+        return NotVerified("nothing found")
+
+    monkeypatch.setattr(policies, "certify", nothing)
+    gap = GapEstimate(math.radians(5.0), 0.0, 0.0, (math.radians(4.9), math.radians(5.1)), GapStatus.OK, 21.0)
+    model = TwinModel(
+        lambda _window, _expected: gap,
+        policy_of(PAPER, SETTINGS),
+        SETTINGS,
+        observer=lambda _window: disturbed(0.05),
+        start=Setting(0.0, gains_of(PAPER.controller)),
+    )
+    first = Twin("axis", model)
+    first._state = msgspec.structs.replace(first._state, rests=(0.05, 0.05))
+    _, sent = first.receive(window(), 0.0)
+    again = Twin("axis", model, state=first.state())
+    _, repeated = again.receive(window(1, 40.0), 20.0)
+    assert len(searches) == 1
+    assert repeated.setting == sent.setting
+    assert again.log.redesigns["axis", "boot-1", 1].reason.startswith("nothing found; the ranges have not become")
+    without = msgspec.structs.replace(decode_state("axis", first.state()), failed=None)
+    Twin("axis", model, state=encode_state(without)).receive(window(1, 40.0), 20.0)
+    assert len(searches) == 2

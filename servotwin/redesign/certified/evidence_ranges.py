@@ -12,6 +12,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate
 from servotwin.estimation.learning.motor import BIAS, FRICTION, LearntMotor
 from servotwin.estimation.learning.trend import Trend
 from servotwin.plant.basis import BacklashKind
+from servotwin.plant.display_units import command_unit
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.learnt_servo import learnt_servo
 from servotwin.redesign.certified.margins import own_static_gain
@@ -113,13 +114,34 @@ class EvidenceRanges:
         fed = gains.feedforward if gains is not None else 0.0
         if not math.isfinite(spread):
             return fed, self.uncertainty.input_bias
-        limit, spread = self.feedforward_limit, max(spread, self.bias_floor, self._wound(evidence, bias))
+        limit, most = self.feedforward_limit, max(spread, self.bias_floor, self._wound(evidence, bias))
         if self._may_be_friction(evidence):
-            return fed, (min(bias, -fed) - spread, max(bias, -fed) + spread)
+            return fed, self._as_stated(min(bias, -fed), max(bias, -fed), spread, most)
         # Only a significant change: every new feedforward is an update at the edge.
-        if abs(bias + fed) > spread:
+        if abs(bias + fed) > most:
             fed = min(max(-bias, -limit), limit)
-        return fed, (bias - spread, bias + spread)
+        return fed, self._as_stated(bias, bias, spread, most)
+
+    def _as_stated(self, low: float, high: float, spread: float, most: float) -> Range:
+        """Range of input biases (V), `most` beyond both ends, as far as it is stated: evidence makes no question harder
+        than it is without any, unless the range with its spread alone contradicts what is stated."""
+        stated = self.uncertainty.input_bias
+        if high + spread < stated[0] or stated[1] < low - spread:
+            return low - most, high + most
+        return max(low - most, stated[0]), min(high + most, stated[1])
+
+    def contradiction(self, region: Region) -> str:
+        """Say which ranges of a region are beyond the stated ones; empty where none is."""
+        known = self.uncertainty
+        shown = (
+            ("an input bias", command_unit(self.servo), region.input_bias, known.input_bias),
+            ("friction", "N m", region.friction, known.friction),
+        )
+        return "".join(
+            f"; the windows show {name} of {low:.3g} to {high:.3g} {unit}, and {least:.3g} to {most:.3g} are stated"
+            for name, unit, (low, high), (least, most) in shown
+            if low < least or most < high
+        )
 
     def _usual_step(self, evidence: Evidence) -> Range | None:
         """Range of the steps in the last windows (m), as far as it lies within the stated one; None: none was seen."""

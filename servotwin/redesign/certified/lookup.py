@@ -283,6 +283,9 @@ class TablePolicy:
             return self.policy.redesign(evidence)
         return self.policy.decide(evidence, self)
 
+    def asked(self, _region: Region) -> None:
+        """None: a table makes no search."""
+
     def verify(self, region: Region, running: Setting | None) -> Certificate | NotVerified:
         """Look up the certificate for a region."""
         return self.table.find(region, running)
@@ -303,6 +306,9 @@ class _WithdrawnTable:
     certificate: Certificate
     why: str
     provisional: ClassVar[bool] = False
+
+    def asked(self, _region: Region) -> None:
+        return None
 
     def verify(self, _region: Region, _running: Setting | None) -> NotVerified:
         return NotVerified(self.why)

@@ -19,10 +19,11 @@ from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.evidence_ranges import SAME_FEEDFORWARD, EvidenceRanges
+from servotwin.redesign.certified.failed_search import Asked, FailedSearch, digest_of, learnt_ranges, ranges_of
 from servotwin.redesign.certified.fallback import fallback_certificate
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.trial import Trial, trial_for
-from servotwin.redesign.certified.uncertainty import LearntFactors, Region, Uncertainty
+from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.redesign.policy import Evidence, Redesign
 
@@ -41,6 +42,10 @@ class Verifier(Protocol):
 
     @property
     def provisional(self) -> bool: ...
+
+    def asked(self, region: Region) -> Asked | None:
+        """Question of the search that `verify` makes for a region; None: it makes none."""
+        ...
 
     def verify(self, region: Region, running: Setting | None) -> Certificate | NotVerified:
         """Find a verified setting for a region; `running` is in force, where that is known."""
@@ -107,7 +112,10 @@ class CertifiedPolicy:
         the window's own estimate is unusable, its input bias still counts, with the gap of the trend.
         """
         learnt = learnt_servo(self.servo, self.uncertainty, evidence.machine, evidence.motor)
-        return self.decide(evidence, self if learnt is None else _LearntVerifier(self, *learnt))
+        if learnt is None:
+            return self.decide(evidence, self)
+        ranges = dict(learnt_ranges(learnt[1], evidence.machine, evidence.motor))
+        return self.decide(evidence, _LearntVerifier(self, *learnt, ranges))
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
@@ -118,9 +126,14 @@ class CertifiedPolicy:
         region = self.ranges.region(evidence)
         if too_wide := self._too_wide(region):
             return self._for_growth(evidence, verifier.fallback(), region) or Redesign(None, math.nan, too_wide)
+        asked, past = verifier.asked(region), evidence.failed
+        if asked is not None and past is not None and asked.contains(past.asked):
+            reason = f"{past.reason}; the ranges have not become noticeably narrower since that search"
+            return _fallback_redesign(verifier.fallback(), region, reason)
         result = verifier.verify(region, evidence.setting)
         if isinstance(result, NotVerified):
-            return _fallback_redesign(verifier.fallback(), region, result.reason)
+            made = _fallback_redesign(verifier.fallback(), region, result.reason + self.ranges.contradiction(region))
+            return made if asked is None else replace(made, failed=FailedSearch(asked, result.reason))
         if _in_force(result.setting, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
             return Redesign(None, best, "the verified setting is in force already", certificate=result)
         redesign = _redesign(result, region.noise, best, "")
@@ -164,6 +177,11 @@ class CertifiedPolicy:
         if isinstance(result, NotVerified):
             return Redesign(None, math.nan, result.reason)
         return _redesign(result, region.noise, evidence.estimate.gap, "")
+
+    def asked(self, region: Region) -> Asked:
+        """Question of a search for a region."""
+        of = digest_of(self.servo, self.uncertainty, self._limited_demands, self.simulations)
+        return Asked(of, ranges_of(self.servo, self.uncertainty, self.demands, region))
 
     def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
         """Find the cheapest setting for a region by simulation, or the running one where it is hardly dearer."""
@@ -229,13 +247,18 @@ class CertifiedPolicy:
 class _LearntVerifier:
     """Verification by simulation on what was learnt of the machine, in place of the model's stated error.
 
-    The fallback set stays that of the stated ranges.
+    The fallback set stays that of the stated ranges. `ranges` are those of the learnt numbers.
     """
 
     policy: CertifiedPolicy
     servo: Plant
     learnt: LearntFactors
+    ranges: dict[str, Range]
     provisional: ClassVar[bool] = False
+
+    def asked(self, region: Region) -> Asked:
+        asked = self.policy.asked(region)
+        return Asked(asked.of, asked.ranges | self.ranges)
 
     def verify(self, region: Region, running: Setting | None = None) -> Certificate | NotVerified:
         known = narrowed(region.within(self.policy.uncertainty), self.learnt)

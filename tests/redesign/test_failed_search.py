@@ -1,0 +1,135 @@
+"""A search that found nothing is remembered, and made again only where another answer is possible."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from servotwin.estimation.disturbance import Disturbance
+from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.messages import Setting
+from servotwin.plant.servo import Servo
+from servotwin.redesign.certified import policy as policies
+from servotwin.redesign.certified.certificate import NotVerified
+from servotwin.redesign.certified.demands import Beyond, Demands
+from servotwin.redesign.certified.failed_search import FailedSearch
+from servotwin.redesign.certified.policy import CertifiedPolicy, alike
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.policy import Evidence, Redesign
+
+DEG = math.pi / 180.0
+SMALL = Demands(machines=16, conditions=4, screened=2, settled=0.8, integral=(0.0,), beyond=Beyond(machines=4))
+POLICY = CertifiedPolicy(Servo.preset("paper"), Uncertainty(input_bias=(-0.1, 0.1)), SMALL)
+
+
+class Searches:
+    """Search that finds nothing, and counts."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    def __call__(self, *_question: object) -> NotVerified:
+        self.count += 1
+        return NotVerified(f"nothing found in search {self.count}")
+
+
+@pytest.fixture
+def searches(monkeypatch: pytest.MonkeyPatch) -> Searches:
+    made = Searches()
+    monkeypatch.setattr(policies, "certify", made)
+    return made
+
+
+def seen(low: float, high: float, bias: float = 0.02, noise: float = 1e-5, **more: object) -> Evidence:
+    """Evidence of a gap within these degrees, of a bias (V) at three rests, and of noise (m)."""
+    estimate = GapEstimate(0.5 * (low + high) * DEG, 0.0, 0.0, (low * DEG, high * DEG), GapStatus.OK, 1.0)
+    rest = Disturbance(bias, 1e-5, noise, 0.3, 0.0)
+    return Evidence(estimate, rest, rests=(bias, bias), **more)  # type: ignore[arg-type]
+
+
+def asked_twice(first: Evidence, then: Evidence, policy: CertifiedPolicy = POLICY) -> tuple[Redesign, Redesign]:
+    made = policy.redesign(first)
+    assert made.failed is not None
+    return made, policy.redesign(replace(then, failed=made.failed))
+
+
+@pytest.mark.parametrize(
+    "then",
+    [seen(9.0, 11.0), seen(9.3, 10.8), seen(8.0, 12.0), seen(9.0, 11.0, noise=3e-5), seen(9.0, 11.0, 0.0201)],
+)
+def test_nearly_the_same_question_or_a_harder_one_is_not_asked_again(searches: Searches, then: Evidence) -> None:
+    made, again = asked_twice(seen(9.0, 11.0), then)
+    assert searches.count == 1
+    assert made.certificate is not None
+    assert alike(made.certificate.setting, again.setting)
+    assert again.failed is None
+    assert made.reason == "nothing found in search 1; the fallback set is sent"
+    assert again.reason.startswith("nothing found in search 1; the ranges have not become noticeably narrower since")
+
+
+@pytest.mark.parametrize(
+    ("first", "then"),
+    [
+        (seen(5.0, 11.0), seen(9.0, 11.0)),
+        (seen(9.0, 11.0), seen(7.0, 9.0)),
+        (seen(9.0, 11.0), seen(9.0, 11.0, steps=(1e-3,))),
+        (seen(9.0, 11.0), seen(9.0, 11.0, noise=0.0)),
+        (replace(seen(9.0, 11.0), rests=()), seen(9.0, 11.0)),
+    ],
+    ids=["narrower", "smaller", "steps seen", "no noise", "bias known"],
+)
+def test_a_question_that_may_have_another_answer_is_asked(searches: Searches, first: Evidence, then: Evidence) -> None:
+    _, again = asked_twice(first, then)
+    assert searches.count == 2
+    assert again.failed is not None
+    assert again.failed.reason == "nothing found in search 2"
+
+
+def test_a_machine_that_was_learnt_anew_is_another_question(searches: Searches) -> None:
+    def learnt(k: float, c: float) -> FactorPrior:
+        return FactorPrior(np.log([k, c, 1.0, 1.0]), np.diag(np.square([5e-3, 2e-2, 1e-4, 1e-2])))
+
+    plain, known = seen(9.0, 11.0), seen(9.0, 11.0, machine=learnt(1.0, 0.8))
+    asked_twice(plain, known)
+    assert searches.count == 2
+    asked_twice(known, seen(9.0, 11.0, machine=learnt(1.01, 0.81)))
+    assert searches.count == 3
+    asked_twice(known, seen(9.0, 11.0, machine=learnt(1.0, 0.5)))
+    assert searches.count == 5
+
+
+def test_other_demands_or_stated_ranges_are_asked_again(searches: Searches) -> None:
+    """The settings of a twin may change while its state stays."""
+    failed = POLICY.redesign(seen(9.0, 11.0)).failed
+    for policy in (
+        replace(POLICY, demands=replace(SMALL, Ms=1.9)),
+        replace(POLICY, uncertainty=replace(POLICY.uncertainty, k=0.1)),
+    ):
+        assert policy.redesign(replace(seen(9.0, 11.0), failed=failed)).failed is not None
+    assert searches.count == 3
+
+
+def test_a_found_setting_leaves_nothing_to_remember() -> None:
+    assert POLICY.redesign(seen(9.9, 10.1)).failed is None
+
+
+def test_the_memory_keeps_every_bit(searches: Searches) -> None:
+    failed = POLICY.redesign(seen(9.0, 11.0, steps=(1e-3 / 3.0,))).failed
+    data = msgspec.msgpack.encode(failed)
+    assert msgspec.msgpack.decode(data, type=FailedSearch) == failed
+    assert len(data) < 500
+    assert searches.count == 1
+
+
+def test_ranges_beyond_the_stated_ones_are_named_with_the_failure(searches: Searches) -> None:
+    failed = POLICY.redesign(seen(9.0, 11.0, bias=0.3))
+    assert "; the windows show an input bias of 0.3 to 0.3 V, and -0.1 to 0.1 are stated" in failed.reason
+    setting = Setting(0.0, None)
+    friction = POLICY.redesign(replace(seen(9.0, 11.0, bias=0.06), rests=(-0.06, 0.06), setting=setting))
+    assert "; the windows show friction of 0 to 0.0" in friction.reason
+    assert searches.count == 2
