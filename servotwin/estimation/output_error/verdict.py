@@ -158,13 +158,16 @@ def _of_slow_motion(left: float, half: float, allowed: float, unit: float) -> st
 
 
 def _of_jitter(times: TimeJitter, allowed: float, unit: float) -> str:
-    """Sentence for times of the samples that jitter too much for a half gap (m or rad at the load)."""
+    """Sentence for errors that grow with the speed too much for a half gap (m or rad at the load)."""
     if times.half <= allowed:
         return ""
-    return (
-        f"the times of the samples jitter by {1e3 * times.time:.2g} ms: that moves the gap by "
-        f"{_deg(unit * times.half)}, and {_deg(unit * allowed)} are allowed"
+    cause = (
+        "what the model leaves grows with the speed, and lasts for more than a sample as no noise does"
+        if times.lasting
+        else f"the position's noise grows with the speed, as where the times of the samples jitter by "
+        f"{1e3 * times.time:.2g} ms"
     )
+    return f"{cause}: that moves the gap by {_deg(unit * times.half)}, and {_deg(unit * allowed)} are allowed"
 
 
 def _hidden(found: Search, half: float) -> str:
