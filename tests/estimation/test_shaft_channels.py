@@ -66,6 +66,19 @@ def test_an_even_swing_whose_crests_are_at_one_count_is_not_saturated() -> None:
     assert faults(Window(1e-6 * swing, 1e-3 * swing, sample_rate=1000.0)) == ()
 
 
+def test_a_motor_that_friction_stops_is_not_saturated_and_one_whose_channel_is_cut_is() -> None:
+    """It slows down by as much in each sample, here from 27 counts a sample by 0.55."""
+    left = 2000.0 - np.arange(4000.0)  # samples to the stop
+    braking = 27.0 / 0.55
+    way = np.where(left > braking, 27.0 * (left - 0.5 * braking), 0.5 * 0.55 * left.clip(0.0) ** 2)
+    counts = np.round(way + 0.4)
+    assert faults(Window(1e-6 * counts, 1e-3 * counts, sample_rate=1000.0)) == ()
+    cut = np.maximum(counts, 60.0)
+    sentences = faults(Window(1e-6 * cut, 1e-3 * cut, sample_rate=1000.0))
+    assert all("stays at its extreme" in sentence for sentence in sentences)
+    assert len(sentences) == 2
+
+
 def test_noise_of_few_counts_that_repeats_by_chance_was_not_held() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):

@@ -20,9 +20,9 @@ KNOWN = FactorPrior(np.zeros(4), np.diag(np.square([0.08, 0.5, 0.005, 0.05])))
 
 
 @cache
-def screw(kind: str = "none") -> tuple[float, Window]:
+def screw(kind: str = "none", seed: int = 5) -> tuple[float, Window]:
     """Total gap (rad) and a window of a ball screw with a kind of fault."""
-    _, gap, window = next(faulty_windows("ball-screw", kind, 1, 5))
+    _, gap, window = next(faulty_windows("ball-screw", kind, 1, seed))
     return gap, window
 
 
@@ -31,6 +31,7 @@ def test_jitter_of_the_times_is_measured_and_widens_the_interval_or_is_refused()
         gap, window = screw(kind)
         jitter = time_jitter(fit(window, SCREW, None, OutputErrorSettings()))
         assert jitter.time * window.sample_rate == pytest.approx(samples, rel=0.5)
+        assert not jitter.lasting
         estimate = estimate_gap(window, SCREW)
         low, high = estimate.interval
         assert not estimate.ok or low <= gap <= high
@@ -40,7 +41,7 @@ def test_jitter_of_the_times_is_measured_and_widens_the_interval_or_is_refused()
 def test_a_window_without_jitter_shows_none() -> None:
     gap, window = screw()
     jitter = time_jitter(fit(window, SCREW, None, OutputErrorSettings()))
-    assert jitter == (0.0, 0.0)
+    assert (jitter.time, jitter.half) == (0.0, 0.0)
     estimate = estimate_gap(window, SCREW)
     assert estimate.ok
     assert abs(estimate.gap - gap) < 0.01 * gap
@@ -80,6 +81,18 @@ def erring(window: Window, gap: float, share: float) -> Window:
     at_load = gap * SCREW.p
     wave = 0.5 * share * at_load * np.sin(2.0 * math.pi * window.position / (40.0 * at_load) + 1.0)
     return window.replace(position=window.position + wave)
+
+
+def test_a_sensor_that_errs_with_its_way_is_not_named_as_jitter() -> None:
+    """Its quick errors grow with the speed too, but they last; a jitter of 3 us was named."""
+    gap, window = screw(seed=6)
+    wrong = erring(window, gap, 0.5)
+    found = time_jitter(fit(wrong, SCREW, None, OutputErrorSettings()))
+    assert found.time > 0.0, "the errors do not grow with the speed: another window is needed"
+    assert found.lasting
+    assert not any("jitter" in reason for reason in estimate_gap(wrong, SCREW).reasons)
+    shaken = estimate_gap(screw("position jitters by 0.3")[1], SCREW)
+    assert any("as where the times of the samples jitter by" in reason for reason in shaken.reasons), shaken.reasons
 
 
 def test_a_window_with_slow_motion_that_the_model_leaves_teaches_less_or_nothing() -> None:

@@ -19,7 +19,7 @@ from servotwin.plant.backlash import play
 from servotwin.plant.load import Load
 from servotwin.plant.signals import SquareWave
 from servotwin.plant.transmission import Transmission
-from servotwin.simulation import simulate
+from servotwin.simulation import Run, simulate
 
 TABLE = Axis(VelocityDrive(5e-3), Transmission(1e-3), Load((20.0,)), Controller(3e4, 1e4, 0.0, 0.1))
 
@@ -54,6 +54,42 @@ def test_slow_motion_that_may_hide_all_of_the_gap_is_refused() -> None:
     estimate = estimate_gap(clean.replace(position=clean.position + error), axis)
     assert estimate.status is GapStatus.UNIDENTIFIABLE
     assert "the model leaves slow motion that may hide" in estimate.reasons[0]
+
+
+def driven(axis: Axis, run: Run, gap: float, softness: float) -> Window:
+    """The load under a run's motor by small steps, behind a shaft that is softer over a tenth of its gap at first."""
+    load, shaft, parts = axis.load, axis.transmission, 50
+    mass, half, length = load.m[0], 0.5 * gap * axis.p, 0.2 * gap * axis.p
+    motor = axis.p * np.interp(np.arange(parts * run.time.size) / parts, np.arange(run.time.size), run.theta_m)
+    step, places, place, speed = run.time[1] / parts, [], run.position[0], 0.0
+    for i in range(motor.size - 1):
+        if i % parts == 0:
+            places.append(place)
+        lead, rate = motor[i] - place, (motor[i + 1] - motor[i]) / step - speed
+        stretch = lead - min(max(lead, -half), half)
+        pull = shaft.k_d * (stretch - softness * length * math.tanh(stretch / length)) + shaft.c_d * rate
+        force = pull if pull * stretch > 0.0 else 0.0
+        speed += step * (force - load.c[0] * speed) / mass
+        rub = step * load.friction / mass
+        speed -= min(max(speed, -rub), rub)
+        place += step * speed
+    count = axis.sensors.position_resolution
+    position = count * np.round(np.array(places) / count)
+    return Window(position, run.theta_m[: position.size], sample_rate=1.0 / run.time[1])
+
+
+@pytest.mark.slow
+def test_a_shaft_that_is_soft_at_first_contact_widens_the_interval_and_a_plain_one_does_not() -> None:
+    axis = Axis.preset("ball-screw")
+    gap = 1e-5 / axis.p
+    run = simulate(axis, 0.8, reference=SquareWave(3e-4, 0.4), gap=gap, sample_rate=2000.0)
+    plain, soft = (estimate_gap(driven(axis, run, gap, softness), axis) for softness in (0.0, 0.2))
+    assert plain.ok, plain.reasons
+    assert abs(plain.gap - gap) < 0.01 * gap
+    assert plain.interval[1] - plain.gap < 0.03 * gap
+    assert soft.ok, soft.reasons
+    assert soft.gap > 1.03 * gap, "the soft shaft does not show in the gap"
+    assert soft.interval[0] <= gap
 
 
 CREEPING = """

@@ -1,7 +1,8 @@
-"""Times of the samples that jitter: noise of the position that grows with the speed.
+"""Errors of the position that grow with the speed, as where the times of the samples jitter.
 
 The noise of a fit is one and the same all over a window. Where the times jitter, a load at rest shows none of it, and a
-moving one much: the samples in motion count too much, and the gap seems better known than it is.
+moving one much: the samples in motion count too much, and the gap seems better known than it is. Quick errors of the
+model do the same, but they last for more than a sample.
 """
 
 from __future__ import annotations
@@ -20,19 +21,31 @@ from servotwin.plant.signals import Array
 # A sample less the mean of its neighbours: variance that white noise gives it, and sum of the squared correlations of
 # these differences, whose squares are the data of the test.
 _GAIN, _DEPENDENT = 1.5, 1.0 + 2.0 * ((2.0 / 3.0) ** 2 + (1.0 / 6.0) ** 2)
+_NEXT = -2.0 / 3.0  # correlation of neighbouring differences of white noise; that of lasting errors is positive
 _SURE = 10.83  # of chi-square with one degree of freedom: in 2000 windows without jitter one is beyond it, uphill
 _COUNTS = 1.0  # in the fastest motion: rounding makes less
 
 
 class TimeJitter(NamedTuple):
-    """Standard deviations of the times (s), and of the half gap (m or rad at the load) by them; 0: none shows."""
+    """Errors that grow with the speed.
+
+    Attributes
+    ----------
+    time : float
+        Standard deviation of the times that would make them, s; 0: none show.
+    half : float
+        Standard deviation of the half gap by them, m or rad at the load.
+    lasting : bool
+        They last for more than a sample, so that no noise makes them.
+    """
 
     time: float = 0.0
     half: float = 0.0
+    lasting: bool = False
 
 
 def time_jitter(found: Search) -> TimeJitter:
-    """Jitter of the times that a fit's residual shows.
+    """Errors that grow with the speed in a fit's residual.
 
     The squares of its differences are regressed on the squared speed (Breusch and Pagan's test, studentised by
     Koenker): the slope is the variance of the times. What it does to the half gap is linearised; and no number is known
@@ -41,14 +54,20 @@ def time_jitter(found: Search) -> TimeJitter:
     problem, raw = found.problem, found.best.raw
     if not isinstance(problem, Problem) or problem.model.speed == 0.0:
         return TimeJitter()
-    speed = _speed(found, problem)
-    test, variance = _regressed((raw[1:-1] - 0.5 * (raw[2:] + raw[:-2])) ** 2 / _GAIN, speed[1:-1] ** 2)
+    speed, differences = _speed(found, problem), raw[1:-1] - 0.5 * (raw[2:] + raw[:-2])
+    test, variance = _regressed(differences**2 / _GAIN, speed[1:-1] ** 2)
     time = math.sqrt(max(0.0, variance))
     if test <= _SURE * _DEPENDENT or time * float(np.max(np.abs(speed))) <= _COUNTS * problem.count:
         return TimeJitter()
     noise = time * speed
     least = float(np.sum(noise**4)) / float(np.linalg.norm(noise)) ** 3
-    return TimeJitter(time, max(least, float(np.linalg.norm(_weights(found) * noise))))
+    half = max(least, float(np.linalg.norm(_weights(found) * noise)))
+    return TimeJitter(time, half, _lasting(speed[1:-1] * differences))
+
+
+def _lasting(differences: Array) -> bool:
+    """Tell errors that last from noise, by the correlation of neighbouring differences."""
+    return float(differences[1:] @ differences[:-1]) > 0.5 * _NEXT * float(differences @ differences)
 
 
 def _speed(found: Search, problem: Problem) -> Array:

@@ -17,9 +17,9 @@ from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.output_error.estimator import problem_of
 from servotwin.estimation.output_error.fit import Fit, Search, descend, noise_in
 from servotwin.estimation.output_error.models import HALF, Flags
+from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.search import SearchProblem
 from servotwin.estimation.output_error.settings import OutputErrorSettings
-from servotwin.estimation.output_error.verdict import rounded
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.quick import QuickFit
 from servotwin.estimation.window import Window

@@ -1,11 +1,17 @@
-"""Effect of the encoders' rounding on a fit: samples that show the same count have the same error."""
+"""What samples and the encoders' rounding do to a fit: samples that show the same count have the same error."""
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numpy.typing import NDArray
 
 from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.models import HALF
 from servotwin.plant.signals import Array
+
+_EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 
 
 def on_samples(found: Search, weights: Array) -> Array:
@@ -21,3 +27,34 @@ def per_count(found: Search, weights: Array) -> Array:
     margin = (position.size - data) // 2
     begins = np.flatnonzero(np.diff(position[margin : margin + data])) + 1
     return np.asarray(np.add.reduceat(on_samples(found, weights), np.concatenate([[0], begins]), axis=1))
+
+
+def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple[float, float, float]:
+    """Change of an unknown that some of the residuals ask for, linearised, its std, and that of rounding.
+
+    Samples that show the same count have the same error: noise averages out over them, rounding does not. The second
+    and third are inf where these residuals do not show it.
+    """
+    fit, problem = found.best, found.problem
+    places = np.flatnonzero(found.free)
+    at, data = int(np.flatnonzero(places == which)[0]), fit.raw.size
+    rows = fit.rows[np.ix_(places, keep)]
+    size = np.linalg.norm(rows, axis=1)
+    size[size == 0.0] = 1.0
+    scaled = rows / size[:, None]
+    inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)
+    if not inverse[at, at] > 0.0:
+        return 0.0, math.inf, math.inf
+    weights = -(inverse[at] @ scaled) / size[at]
+    white = np.zeros(data)
+    seen = keep < data
+    white[keep[seen]] = weights[seen]
+    rounding = problem.count * _EVENLY * float(np.linalg.norm(per_count(found, white[None])))
+    std = math.sqrt(inverse[at, at] * fit.variance()) / size[at]
+    return float(weights @ fit.residual[keep]), std, rounding
+
+
+def rounded(found: Search, which: int = HALF) -> float:
+    """Standard deviation of an unknown that the rounding of the encoders makes."""
+    rounding = influence(found, np.arange(found.best.residual.size), which)[2]
+    return rounding if math.isfinite(rounding) else 0.0

@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
@@ -14,8 +13,9 @@ from servotwin.estimation.output_error.fit import Search, one_flank
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
-from servotwin.estimation.output_error.rounding import per_count
+from servotwin.estimation.output_error.rounding import influence, rounded
 from servotwin.estimation.output_error.settings import OutputErrorSettings
+from servotwin.estimation.output_error.soft_contact import moved_by_contact
 from servotwin.estimation.output_error.unexplained import slow, unexplained
 from servotwin.plant.signals import Array
 
@@ -116,7 +116,9 @@ def judge(
     )
     doubts = tuple(filter(None, found_doubts))
     if not doubts:
-        return JudgedFit(GapStatus.OK, half, std, math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half))
+        contact = moved_by_contact(found)
+        explained = math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
+        return JudgedFit(GapStatus.OK, half, std, explained)
     ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
     reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
     return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
@@ -158,13 +160,16 @@ def _of_slow_motion(left: float, half: float, allowed: float, unit: float) -> st
 
 
 def _of_jitter(times: TimeJitter, allowed: float, unit: float) -> str:
-    """Sentence for times of the samples that jitter too much for a half gap (m or rad at the load)."""
+    """Sentence for errors that grow with the speed too much for a half gap (m or rad at the load)."""
     if times.half <= allowed:
         return ""
-    return (
-        f"the times of the samples jitter by {1e3 * times.time:.2g} ms: that moves the gap by "
-        f"{_deg(unit * times.half)}, and {_deg(unit * allowed)} are allowed"
+    cause = (
+        "what the model leaves grows with the speed, and lasts for more than a sample as no noise does"
+        if times.lasting
+        else f"the position's noise grows with the speed, as where the times of the samples jitter by "
+        f"{1e3 * times.time:.2g} ms"
     )
+    return f"{cause}: that moves the gap by {_deg(unit * times.half)}, and {_deg(unit * allowed)} are allowed"
 
 
 def _hidden(found: Search, half: float) -> str:
@@ -281,37 +286,6 @@ def _outliers(found: Search, least: float) -> tuple[str, ...]:
     if found.problem.model.speed > 0.0 or most <= _OUTLYING * max(rms, found.problem.count, least):
         return ()
     return (f"in a few places the model errs by {most / rms:.2g} times as much as in the others",)
-
-
-def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple[float, float, float]:
-    """Change of an unknown that some of the residuals ask for, linearised, its std, and that of rounding.
-
-    Samples that show the same count have the same error: noise averages out over them, rounding does not. The second
-    and third are inf where these residuals do not show it.
-    """
-    fit, problem = found.best, found.problem
-    places = np.flatnonzero(found.free)
-    at, data = int(np.flatnonzero(places == which)[0]), fit.raw.size
-    rows = fit.rows[np.ix_(places, keep)]
-    size = np.linalg.norm(rows, axis=1)
-    size[size == 0.0] = 1.0
-    scaled = rows / size[:, None]
-    inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)
-    if not inverse[at, at] > 0.0:
-        return 0.0, math.inf, math.inf
-    weights = -(inverse[at] @ scaled) / size[at]
-    white = np.zeros(data)
-    seen = keep < data
-    white[keep[seen]] = weights[seen]
-    rounding = problem.count * _EVENLY * float(np.linalg.norm(per_count(found, white[None])))
-    std = math.sqrt(inverse[at, at] * fit.variance()) / size[at]
-    return float(weights @ fit.residual[keep]), std, rounding
-
-
-def rounded(found: Search, which: int = HALF) -> float:
-    """Standard deviation of an unknown that the rounding of the encoders makes."""
-    rounding = influence(found, np.arange(found.best.residual.size), which)[2]
-    return rounding if math.isfinite(rounding) else 0.0
 
 
 def between_halves(found: Search) -> tuple[float, float]:

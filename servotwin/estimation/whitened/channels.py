@@ -136,7 +136,8 @@ def _abrupt(side: Array, least: float) -> bool:
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
     """Describe samples that stay at an extreme value which was reached at speed; empty without them.
 
-    The crests of an even swing may all be at one count, each for few samples.
+    The crests of an even swing may all be at one count, each for few samples; and a motor that friction stops slows
+    down before it.
     """
     for extreme in (float(samples.max()), float(samples.min())):
         begins, ends = _runs(samples == extreme)
@@ -144,12 +145,21 @@ def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: st
             continue
         run = np.abs(samples[_RUN:] - samples[:-_RUN])
         fastest = float(np.partition(run, -5)[-5])
-        entries = begins[(begins >= _RUN) & (ends - begins >= _CREST)]
+        entries = begins[(begins > _RUN) & (ends - begins >= _CREST)]
         reached = [entry for entry in entries if np.all(steps[entry - _RUN : entry] > 0.0)]
-        if any(run[entry - _RUN] > _STEEP * fastest for entry in reached):
+        if any(min(run[entry - _RUN], _run_ahead(steps, entry)) > _STEEP * fastest for entry in reached):
             value = f"{factor * extreme:.6g} {unit}"
             return f"{name} stays at its extreme of {value} for {size} samples: it is saturated"
     return ""
+
+
+def _run_ahead(steps: Array, entry: int) -> float:
+    """Way of a run of samples at the speed with which a sample is entered.
+
+    By a line through the speeds of the run before it, which leaves out the last step: a limit cuts that.
+    """
+    earlier, later = np.sum(steps[entry - 1 - _RUN : entry - 1].reshape(2, -1), axis=1)
+    return float(2.0 * later + (later - earlier) * (_RUN // 2 + 2) / (_RUN // 2))
 
 
 def _encoder_noise(theta_m: Array) -> float:
