@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from benchmarks import report
 from benchmarks.fleet import runs
 from benchmarks.fleet.processes import check_system
-from benchmarks.fleet.setting import TABLE, FleetScale, build_table
+from benchmarks.fleet.setting import TABLE, FleetScale, build_table, write_file
 from benchmarks.fleet.stock import WindowSource, stock
 from benchmarks.fleet.tables import document, show
 from benchmarks.fleet.watch import ResourceSample
@@ -62,10 +62,10 @@ def fleet(
 
 def _prepared(folder: Path, scale: FleetScale, progress: Progress) -> list[WindowSource]:
     """Make the stock of windows and the table of certificates."""
-    bar = progress.add_task("simulating windows", total=None)
-    places = stock(scale.places, scale.windows)
-    progress.update(bar, description="verifying settings")
+    bar = progress.add_task("verifying settings", total=None)
     build_table(folder, scale)
+    progress.update(bar, description="simulating windows")
+    places = stock(write_file(folder, scale).models[0], scale.places, scale.windows)
     progress.remove_task(bar)
     return places
 

@@ -39,8 +39,8 @@ class LoadEdge:
     Attributes
     ----------
     name : str
-    place : int
-        Index of its gap in the stock.
+    place, tuned : int
+        Index of its gap in the stock, and of the gap that the parameters in force are for.
     version, sequence, serial : int
         Of the parameters in force, of its next window, of the last message that it took.
     receipts : list of Receipt
@@ -49,8 +49,9 @@ class LoadEdge:
 
     name: str
     place: int
+    tuned: int
     version: int
-    sequence: int
+    sequence: int = 0
     serial: int = 0
     receipts: list[Receipt] = field(default_factory=list)
 
@@ -82,10 +83,12 @@ class EdgeLoad:
 
     def __init__(self, load: LoadStart, now: float) -> None:
         self.plan, self.begin = load.plan, now
-        self.places = [[_window(body) for body in bodies] for bodies in load.places]
+        self.places = [[_window(body) for body in place.windows] for place in load.places]
+        self.moved = [_window(place.moved) for place in load.places]
+        self.gaps, versions = [place.gap for place in load.places], [place.version for place in load.places]
         self.chance = random.Random(load.plan.seed)
         plan, count = load.plan, len(self.places)
-        self.edges = [LoadEdge(f"ax-{n:05d}", n % count, plan.version, plan.sequence) for n in range(plan.servos)]
+        self.edges = [LoadEdge(f"ax-{n:05d}", n % count, n % count, versions[n % count]) for n in range(plan.servos)]
         self.counts = LoadCounts()
         self._issued, self._refreshed = 0, False
         self._pending: deque[tuple[LoadEdge, float]] = deque()
@@ -136,11 +139,14 @@ class EdgeLoad:
         self._pending.appendleft((edge, due))
 
     def window(self, edge: LoadEdge, due: float) -> bytes:
-        """Encoded window of the edge's source, readdressed; sometimes of the next source, which shows a changed gap."""
+        """Encoded window of the edge's source, readdressed; sometimes the gap has moved to that of the next source.
+
+        Until the edge applies an update for that gap its windows are of the setting before.
+        """
         if self.plan.news > 0.0 and self.chance.random() < self.plan.news:
             edge.place = (edge.place + 1) % len(self.places)
             self.counts.news += 1
-        made = self.places[edge.place]
+        made = self.places[edge.place] if edge.tuned == edge.place else [self.moved[edge.place - 1]]
         template = made[edge.sequence % len(made)]
         start = self.plan.start + (due - self.begin)
         shift = start - template.start
@@ -165,9 +171,15 @@ class EdgeLoad:
             message = decode(sealed.body)
             if isinstance(message, Update) and message.version > edge.version:
                 edge.version = message.version
+                edge.tuned = self._place_of(message.gap)
                 self.counts.updates += 1
                 receipt = Receipt(edge.name, message.version, True, 1, Reason.APPLIED, message.version, self.plan.boot)
                 edge.receipts.append(receipt)
+
+    def _place_of(self, gap: float | None) -> int:
+        """Index of the place whose gap (rad) is the nearest."""
+        assert gap is not None
+        return min(range(len(self.gaps)), key=lambda n: abs(self.gaps[n] - gap))
 
     def undisturbed(self, now: float) -> bool:
         """Test that no outage has begun by `now`."""

@@ -51,8 +51,8 @@ def leases(
     chance.shuffle(moved)
     for number, new in enumerate(moved):
         index = number % len(places)
-        source = places[(index + new) % len(places)]
-        lease, now = _lease(number, known[index], source.windows[chance.randrange(_FIRST, len(source.windows))], rng)
+        routine = places[index].windows[chance.randrange(_FIRST, len(places[index].windows))]
+        lease, now = _lease(number, known[index], places[index].moved if new else routine, rng)
         result = work(registry, lease, now, _URGENCY)
         yield TimedLease(lease, now, "deferral" if result.deferred else "glance")
         if result.deferred:
@@ -93,7 +93,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder, scale = Path(name), FleetScale()
         build_table(folder, scale)
-        registry, places = write_file(folder, scale), stock(given.places, 8)
+        registry = write_file(folder, scale)
+        places = stock(registry.models[0], given.places, 8)
         turns = list(leases(registry, places, given.glances, given.news, given.seed))
         results = [work(registry, turn.lease, turn.now, _URGENCY) for turn in turns]
         # All of them before the first comes again: caches hold what belongs to the last few.

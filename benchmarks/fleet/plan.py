@@ -25,8 +25,8 @@ class LoadPlan(Struct, frozen=True):
         Share of windows with which the gap has moved to the next place.
     polls : bool
         Whether each servo asks for messages when its turn comes, and answers them.
-    version, sequence, start : int, int, float
-        Of parameters, of the next window, and its sample time, of every servo at first.
+    start : float
+        Sample time of every servo's first window, s.
     outage : (float, float)
         s from the beginning: from when on and until when no request gets through; windows are kept meanwhile.
     seed : int
@@ -40,8 +40,6 @@ class LoadPlan(Struct, frozen=True):
     rate: float = 0.0
     news: float = 0.0
     polls: bool = False
-    version: int = 0
-    sequence: int = 0
     start: float = 0.0
     outage: tuple[float, float] = (0.0, 0.0)
     seed: int = 0
@@ -82,11 +80,32 @@ class LoadReport(Struct, frozen=True):
     waited: int
 
 
+class LoadPlace(Struct, frozen=True):
+    """Windows of one gap.
+
+    Attributes
+    ----------
+    gap : float
+        rad.
+    version : int
+        Of the parameters that are in force at first at the servos of this place.
+    windows : tuple of bytes
+        Under the setting for this gap.
+    moved : bytes
+        Window of the gap of the next place, under the same setting.
+    """
+
+    gap: float
+    version: int
+    windows: tuple[bytes, ...]
+    moved: bytes
+
+
 class LoadStart(Struct, frozen=True):
-    """First message to the process of the edges: the plan, and the windows by source."""
+    """First message to the process of the edges."""
 
     plan: LoadPlan
-    places: tuple[tuple[bytes, ...], ...]
+    places: tuple[LoadPlace, ...]
 
 
 def encode_load(load: LoadStart) -> bytes:

@@ -16,7 +16,7 @@ import msgspec
 
 from benchmarks.fleet import findings
 from benchmarks.fleet.findings import ProcessedWork
-from benchmarks.fleet.plan import LoadPlan, LoadReport, LoadStart, encode_load
+from benchmarks.fleet.plan import LoadPlace, LoadPlan, LoadReport, LoadStart, encode_load
 from benchmarks.fleet.processes import service
 from benchmarks.fleet.setting import STORE, FleetScale, commission, write_file
 from benchmarks.fleet.stock import BOOT, COMMISSIONED, WindowSource
@@ -66,15 +66,15 @@ def ingest(
     write_file(folder, scale, enabled=False)
     open_store(f"sqlite:///{folder / STORE}").close()
     plan = LoadPlan(0, scale.servos, BOOT, scale.connections, scale.ingest, start=COMMISSIONED)
-    return _run(folder, plan, places, tell)
+    return _run(folder, plan, _load(places, [0] * len(places)), tell)
 
 
 def fleet(
     folder: Path, scale: FleetScale, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
 ) -> FleetRun:
     """Run a fleet: steady time, an outage, and time after it."""
-    known = write_file(folder, scale)
-    version = commission(folder, known, scale, places)
+    registry = write_file(folder, scale)
+    known = commission(folder, registry, scale, places)
     begin = scale.steady
     plan = LoadPlan(
         0,
@@ -85,16 +85,22 @@ def fleet(
         scale.rate,
         scale.news,
         polls=True,
-        version=version,
-        sequence=1000,
         start=COMMISSIONED,
         outage=(begin, begin + scale.outage),
     )
-    return _run(folder, plan, places, tell)
+    return _run(folder, plan, _load(places, [one.version for one in known]), tell)
+
+
+def _load(places: Sequence[WindowSource], versions: Sequence[int]) -> tuple[LoadPlace, ...]:
+    """Windows for the process of the edges, and the versions of parameters in force there."""
+    return tuple(
+        LoadPlace(place.gap, version, tuple(map(encode, place.windows)), encode(place.moved))
+        for place, version in zip(places, versions, strict=True)
+    )
 
 
 def _run(
-    folder: Path, plan: LoadPlan, places: Sequence[WindowSource], tell: Callable[[ResourceSample], None]
+    folder: Path, plan: LoadPlan, places: tuple[LoadPlace, ...], tell: Callable[[ResourceSample], None]
 ) -> FleetRun:
     with service(folder) as twin, findings.reading(folder / STORE) as store:
         plan = msgspec.structs.replace(plan, port=twin.port)
@@ -141,9 +147,9 @@ def _watched(
 
 
 @contextmanager
-def _edges(folder: Path, plan: LoadPlan, places: Sequence[WindowSource]) -> Iterator[subprocess.Popen[bytes]]:
+def _edges(folder: Path, plan: LoadPlan, places: tuple[LoadPlace, ...]) -> Iterator[subprocess.Popen[bytes]]:
     """Run the edges' process."""
-    load = LoadStart(plan, tuple(tuple(encode(window) for window in place.windows) for place in places))
+    load = LoadStart(plan, places)
     path = folder / "edges.load"
     path.write_bytes(encode_load(load))
     command = [sys.executable, "-m", "benchmarks.fleet.edges", str(path)]

@@ -39,8 +39,12 @@ log_level = "warning"
 [models.axis]
 servo = "paper"
 
+[models.axis.controller]
+sample_rate_hz = {rate}
+
 [models.axis.twin]
 enabled = {enabled}
+retry_s = {retry}
 table = "{table}"
 
 [models.axis.twin.uncertainty]
@@ -115,20 +119,22 @@ def write_file(folder: Path, scale: FleetScale, enabled: bool = True) -> ModelRe
     return ModelRegistry.loads(text, "twin.toml", folder)
 
 
-def commission(folder: Path, fleet: ModelRegistry, scale: FleetScale, places: Sequence[WindowSource]) -> int:
-    """Fill a store with twins that know their servos; return the version of the parameters that all run.
+def commission(
+    folder: Path, fleet: ModelRegistry, scale: FleetScale, places: Sequence[WindowSource]
+) -> list[CommissionedTwin]:
+    """Fill a store with twins that know their servos.
 
-    One twin of each place learns; the others get a copy of its state.
+    One twin of each place learns, and is returned; the others get a copy of its state.
     """
-    known = [commissioned(fleet, "ax-00000", place) for place in places]
-    version = max(one.version for one in known)
+    zero = time.time() - COMMISSIONED
+    known = [commissioned(fleet, "ax-00000", place, zero) for place in places]
     store = open_store(f"sqlite:///{folder / STORE}")
     try:
         for first in range(0, scale.servos, _TOGETHER):
             _introduce(store, range(first, min(first + _TOGETHER, scale.servos)), scale, known)
     finally:
         store.close()
-    return version
+    return known
 
 
 def _introduce(store: Store, numbers: range, scale: FleetScale, known: Sequence[CommissionedTwin]) -> None:
@@ -179,5 +185,8 @@ def _text(scale: FleetScale, enabled: bool) -> str:
         "workers": scale.workers,
         "verifications": scale.verifications,
         "every": scale.every,
+        "rate": RATE,
+        # A servo polls once in a period: an update that is sent again before is sent in vain.
+        "retry": 1.5 * scale.servos / scale.rate,
     }
     return _FILE.format(**values, enabled=str(enabled).lower())

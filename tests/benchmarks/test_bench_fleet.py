@@ -18,26 +18,31 @@ from typer.testing import CliRunner
 from benchmarks.fleet import findings
 from benchmarks.fleet.edges import EdgeLoad, EdgeTurn
 from benchmarks.fleet.line import HttpConnection
-from benchmarks.fleet.plan import LoadPlan, LoadStart, decode_load, encode_load, shares
+from benchmarks.fleet.plan import LoadPlace, LoadPlan, LoadStart, decode_load, encode_load, shares
 from benchmarks.fleet.processes import ProcessUsage, children, used
 from benchmarks.fleet.runs import FleetRun
 from benchmarks.fleet.setting import QUICK
-from benchmarks.fleet.stock import BOOT, readdressed
+from benchmarks.fleet.stock import BOOT, COMMISSIONED, PERIOD, WindowSource, commissioned, readdressed
 from benchmarks.fleet.tables import lines
 from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, ResourceSample, ResourceWatch
 from servotwin.cli.app import app
+from servotwin.estimation.learning.wear import Wear
 from servotwin.link.seal import TO_EDGE, key_of, seal, verifier_of
 from servotwin.messages import Receipt, Setting, Update, decode, encode
 from servotwin.redesign.certified.lookup import Grid
 from servotwin.store.records import Incoming, MessageKind, WorkResult
 from servotwin.store.store import open_store
+from servotwin.twin.state import TwinState, Versions
 
-PLAN = LoadPlan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, version=3, sequence=100, start=200.0)
+PLAN = LoadPlan(1, 4, "boot-9", 2, duration=2.0, rate=10.0, start=200.0)
 
 
 def load(plan: LoadPlan = PLAN, places: int = 2) -> LoadStart:
-    made = tuple(tuple(encode(window_message(sequence=10 * p + k, start=5.0)) for k in range(2)) for p in range(places))
-    return LoadStart(plan, made)
+    def place(p: int) -> LoadPlace:
+        *usual, moved = (encode(window_message(sequence=10 * p + k, start=5.0)) for k in range(3))
+        return LoadPlace(0.1 * (1 + p), 3, tuple(usual), moved)
+
+    return LoadStart(plan, tuple(place(p) for p in range(places)))
 
 
 def fleet(plan: LoadPlan = PLAN) -> EdgeLoad:
@@ -106,10 +111,43 @@ def test_news_moves_the_gap_to_the_next_place_and_keeps_it_there() -> None:
     edge = edges.edges[0]
     first = decode(edges.window(edge, 0.1))
     assert (edge.place, edges.counts.news) == (1, 1)
-    assert first.channels == edges.places[1][0].channels
+    assert first.channels == edges.moved[0].channels
     quiet = fleet()
     assert decode(quiet.window(quiet.edges[0], 0.1)).channels == quiet.places[0][0].channels
-    assert (first.start, first.sequence, first.parameter_version) == (pytest.approx(200.1), 100, 3)
+    assert (first.start, first.sequence, first.parameter_version) == (pytest.approx(200.1), 0, 3)
+
+
+def test_windows_are_of_the_setting_before_until_an_update_is_applied() -> None:
+    edges = fleet(msgspec.structs.replace(PLAN, news=1.0))
+    edge = edges.edges[0]
+    edges.window(edge, 0.1)
+    edges.plan = PLAN
+    assert decode(edges.window(edge, 0.2)).channels == edges.moved[0].channels
+    update = Update("ax-00000", 4, 3, ("boot-9", 0), 200.0, 0.19, 1e-3, (0.18, 0.2), "ok", Setting(0.0), 400.0)
+    sealed = seal(key_of(verifier_of("")), TO_EDGE, "ax-00000", 1, encode(update))
+    edges.apply_messages(edge, msgspec.msgpack.encode([sealed]))
+    after = decode(edges.window(edge, 0.3))
+    assert (after.channels, after.parameter_version) == (edges.places[1][0].channels, 4)
+
+
+def test_a_commissioned_twin_has_learnt_on_the_clock_and_waits_for_no_receipt(monkeypatch) -> None:
+    times, letters, serial = [], [], iter(range(9))
+
+    def work(_registry, lease, now):
+        (message,) = lease.messages
+        times.extend([message.received, now])
+        update = Update("a", next(serial) + 1, 0, ("boot-1", 0), 0.0, 0.1, 1e-3, (0.0, 0.2), "ok", Setting(0.0), 9.0)
+        letters.extend([decode(message.body)] if message.kind is MessageKind.LETTER else [])
+        state = msgspec.msgpack.encode(TwinState("a", Versions(), {}, Wear(0.1)))
+        sent = (encode(update),) if message.kind is MessageKind.WINDOW else ()
+        return WorkResult("a", 0, state, None, (), outgoing=sent)
+
+    monkeypatch.setattr("benchmarks.fleet.stock.work", work)
+    place = WindowSource(0.1, (window_message(), window_message(1)), (), window_message(2))
+    version = commissioned(None, "a", place, zero=1e9).version
+    assert min(times) > 1e9 + COMMISSIONED - 2.5 * PERIOD
+    assert max(times) < 1e9 + COMMISSIONED
+    assert [(one.version, one.applied) for one in letters] == [(1, True), (version, True)]
 
 
 def test_updates_are_applied_once_and_answered() -> None:
@@ -146,9 +184,9 @@ def test_a_turn_polls_answers_and_sends() -> None:
     assert [what for what, _ in line.requests] == [
         "GET /v1/servos/ax-00000/outgoing?after=0&wait=0",
         "POST /v1/servos/ax-00000/letters",
-        "PUT /v1/servos/ax-00000/windows/boot-9/100",
+        "PUT /v1/servos/ax-00000/windows/boot-9/0",
     ]
-    assert (edge.sequence, edges.counts.windows, edges.counts.polls) == (101, 1, 1)
+    assert (edge.sequence, edges.counts.windows, edges.counts.polls) == (1, 1, 1)
     assert turn.done.is_set()
     assert not failed
 
@@ -278,6 +316,7 @@ def test_a_small_fleet_runs_with_real_processes(tmp_path: Path, monkeypatch) -> 
     # Every window with news is estimated, and of the others those that are due.
     assert whole.report.news <= whole.made.get("estimate", 0) <= whole.report.news + 0.1 * sent
     assert whole.steady.undone == 0
+    assert "alarm" not in whole.made  # each window is of the controller that is stated for it
     assert not math.isnan(whole.drained)
     assert {role for role in (EDGES, TWIN, WORKERS) if whole.watch.memory(role)[2] > 0} == {EDGES, TWIN, WORKERS}
     found = json.loads(output.read_text())
