@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 
 WINDOW = 1.0  # s of the servo's own
+_WEAR = 40.0  # windows in which the gap of an axis grows by itself, where the log is shorter
 _FREE = 8.0  # windows: a load behind a free shaft needs so much longer to come to rest
 
 
@@ -84,17 +85,53 @@ def identify(options: IdentifyOptions) -> Identification:
     """
     log, stated = read_log(options.log), _settings(options)
     servo = _servo(options, log)
-    settings, wear = stated.on(servo), Wear(stated.initial_gap)
-    estimator = estimator_of(_with_seen_load(servo, log.whole), settings)
-    windows = cut(log, options, servo)
+    settings, windows = stated.on(servo), cut(log, options, servo)
+    seen = _with_seen_load(servo, log.whole)
+    if isinstance(servo, Axis) and options.wear_deg is None:
+        estimates, trend = _followed_without_wear(log, windows, seen, settings)
+    else:
+        estimates, trend = _followed(windows, seen, settings)
+    until = None if settings.gap_limit is None or trend is None else trend.time_until(settings.gap_limit)
+    return Identification(servo, windows, estimates, trend, until)
+
+
+def _followed(
+    windows: Iterable[Window], seen: Plant, settings: TwinSettings
+) -> tuple[tuple[GapEstimate, ...], Trend | None]:
+    """Estimates of windows in the order of time, and the trend after the last one."""
+    wear, estimator = Wear(settings.initial_gap), estimator_of(seen, settings)
     estimates = []
     for window in windows:
         now = window.mid_time
         estimates.append(estimator(window, wear.expect(settings.trend, "log", now, now, settings.learning)))
         wear, _ = wear.update(settings.trend, "log", estimates[-1], now, settings.learning)
-    limit, trend = settings.gap_limit, wear.trend(settings.trend)
-    until = None if limit is None or trend is None else trend.time_until(limit)
-    return Identification(servo, windows, tuple(estimates), trend, until)
+    return tuple(estimates), wear.trend(settings.trend)
+
+
+def _followed_without_wear(
+    log: Log, windows: Sequence[Window], seen: Plant, settings: TwinSettings
+) -> tuple[tuple[GapEstimate, ...], Trend | None]:
+    """The same of an axis of which nobody states the wear: it grows by what the log shows, and by itself in 40 windows.
+
+    The wear decides which windows are accepted, and these show the wear: the log is read again until it is consistent.
+    """
+    over, growth = log.whole.duration, 0.0
+    share = min(1.0, over / (_WEAR * windows[0].duration))
+    trend = TrendSettings(rate_std_rad_per_s=0.0)
+    while True:
+        estimates, found = _followed(windows, seen, replace(settings, trend=trend))
+        shown = _growth([estimate for estimate in estimates if estimate.ok], share)
+        if shown <= 2.0 * growth:
+            return estimates, found
+        growth = shown
+        trend = TrendSettings.for_wear(growth, over)
+
+
+def _growth(estimates: Sequence[GapEstimate], share: float) -> float:
+    """Growth of the gap between estimates, at least a share of what it may be, rad; 0 without any."""
+    gaps = [float(estimate.gap) for estimate in estimates]
+    widest = max((float(estimate.interval[1]) for estimate in estimates), default=0.0)
+    return max(share * widest, max(gaps) - min(gaps)) if gaps else 0.0
 
 
 def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:

@@ -148,7 +148,13 @@ def identify(
     wear_deg: Annotated[
         float | None, typer.Option(help="Typical growth of the gap, deg, in the time of --wear-over-s.")
     ] = None,
-    wear_over_s: Annotated[float | None, typer.Option(help="Time of that growth, s; by default 0.2 deg/s.")] = None,
+    wear_over_s: Annotated[
+        float | None,
+        typer.Option(
+            help="Time of that growth, s; by default 0.2 deg/s of the paper's servo in the machine's own second, of an "
+            "axis what its log shows."
+        ),
+    ] = None,
     gap_limit_deg: Annotated[float | None, typer.Option(help="Predict when the gap reaches this limit, deg.")] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:

@@ -44,6 +44,42 @@ def test_a_log_of_a_rotary_axis_shows_its_gap(logs: Path, name: str, servo: str 
     assert estimate.gap == pytest.approx(GAP, rel=0.01)
 
 
+@pytest.fixture(scope="module")
+def two_steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = st.simulate(DRIVE, 4.0, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=1000.0)
+    path = tmp_path_factory.mktemp("wear") / "log.npz"
+    write_log(SignalTable(run.columns, {"servo": DRIVE.dumps()}), path)
+    return path
+
+
+@pytest.mark.slow
+def test_the_wear_of_an_axis_is_that_of_its_gap_and_log(two_steps: Path) -> None:
+    """The gap grows by itself within 40 windows, and not by the 0.2 deg/s of the paper's servo."""
+    found = identify(IdentifyOptions(two_steps, window=1.9))
+    widest = max(estimate.interval[1] for estimate in found.estimates)
+    assert len(found.estimates) == 2
+    assert found.trend is not None
+    assert found.trend.settings.rate_std_rad_per_s == pytest.approx(widest / (40.0 * 1.9), rel=0.5)
+    stated = identify(IdentifyOptions(two_steps, window=1.9, wear_deg=0.2, wear_over_s=1.0))
+    for own, fast in zip(found.estimates, stated.estimates, strict=True):
+        assert own.ok
+        assert own.interval[0] <= GAP <= own.interval[1]
+        assert np.ptp(own.interval) < 0.8 * np.ptp(fast.interval)
+
+
+@pytest.mark.slow
+def test_a_gap_that_grows_tenfold_within_a_log_is_followed(tmp_path: Path) -> None:
+    """Of its five windows two are accepted: the trend goes through both, and not below the last one."""
+    gap = st.SCurve(0.01, 0.1, duration=40.0)
+    run = st.simulate(DRIVE, 40.0, reference=st.SquareWave(0.2, 4.0), gap=gap, sample_rate=1000.0)
+    write_log(SignalTable(run.columns, {"servo": DRIVE.dumps()}), tmp_path / "log.npz")
+    found = identify(IdentifyOptions(tmp_path / "log.npz"))
+    assert sum(estimate.ok for estimate in found.estimates) >= 2
+    assert found.trend is not None
+    low, high = found.trend.gap_interval
+    assert low <= float(np.interp(found.trend.time, run.time, run.gap)) <= high
+
+
 def test_a_log_in_degrees_is_the_log_in_radians(logs: Path) -> None:
     own, foreign = (read_log(logs / f"{name}.npz").table().columns for name in ("own", "foreign"))
     assert own.keys() == foreign.keys()

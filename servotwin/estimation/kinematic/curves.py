@@ -43,13 +43,13 @@ def fitted_curves(prepared: Regression, model: Model, gap: float, interval: Inte
     recording, rows, places = prepared.recording, prepared.rows, model.places(prepared)
     values, _ = columns(prepared, gap)
     fit = solved(values @ values.T, places)
-    motor = np.interp(recording.time[rows] - prepared.lag, recording.time, recording.motor)
+    motor = np.interp(recording.time[rows] - prepared.lag, recording.time, recording.motor) - recording.motor[0]
     reach = float(np.ptp(recording.motor))
     most = min(max(2.0 * gap, 1.2 * interval[1] if np.isfinite(interval[1]) else 0.0), 0.9 * reach) or 0.5 * reach
     gaps = np.unique(np.append(np.linspace(0.0, most, _PROFILE), gap))
     return FittedCurves(
         time=recording.time[rows],
-        load=values[0],
+        load=recording.load[rows],
         lead=motor - _follower(values, fit, places),
         residual=values[0] - fit.coefficients @ values[places],
         gaps=gaps,

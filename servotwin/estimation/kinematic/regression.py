@@ -71,14 +71,18 @@ def regression(
 
 
 def columns(design: Regression, gap: float) -> tuple[Array, Array]:
-    """Columns of the regression, (p, k), and the side of the flank that was touched last, (k,)."""
+    """Columns of the regression, (p, k), and the side of the flank that was touched last, (k,).
+
+    Positions count from the first sample: a zero that is many turns away would take the digits of the motion.
+    """
     recording = design.recording
     side = np.zeros(recording.motor.size, dtype=np.int8)
     output, time = play_and_side(recording.motor, gap, side), recording.time
     if design.lag:
         output = np.interp(time - design.lag, time, output)
     rate = _rate(time, output)
-    rows = [recording.load, output, np.ones_like(output), -rate, _rate(time, rate)]
+    output = output - recording.motor[0]
+    rows = [recording.load - recording.load[0], output, np.ones_like(output), -rate, _rate(time, rate)]
     if recording.command is not None:
         rows.append(recording.command)
     chosen = [row[design.rows] for row in rows]

@@ -25,6 +25,17 @@ def test_from_two_counts_to_most_of_the_travel(gap):
     assert found.at_load == pytest.approx(0.1 * found.at_motor, rel=1e-3)
 
 
+def test_zeros_that_are_many_turns_away_change_nothing():
+    # An absolute encoder of 32 bits, a slide a kilometre from its origin: the digits of the motion got lost in sums.
+    near = recording()
+    found = estimate_lost_motion(near)
+    far = estimate_lost_motion(replace(near, motor=near.motor + 1e6, load=near.load - 1e6))
+    assert far.ok, far.reasons
+    assert far.interval_motor == pytest.approx(found.interval_motor, rel=1e-2)
+    assert np.ptp(far.curves.lead) == pytest.approx(np.ptp(found.curves.lead), rel=1e-2)
+    assert far.curves.load == pytest.approx(found.curves.load - 1e6)
+
+
 def test_a_lag_is_told_from_the_gap():
     found = estimate_lost_motion(recording(lag=5e-3))
     assert found.ok
