@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 LEASE_S, _POLL_S, _RETRY_S = 120.0, 0.5, 1.0
 _RENEWALS = 4.0
 """Renewals of a lease within its time while a worker is at work, however long that takes."""
+_GATHER_S = 0.02
+"""s from a job that was not full to the next one of new messages: a lease takes as long as ten servos in it."""
 _MESSAGES = 16
 """Messages of each servo in a job, at most."""
 _MAX_STEPS = 64
@@ -90,6 +92,7 @@ class Dispatcher:
         self._owner, self._quota = owner, quota
         self._pace, self._speed, self._paused = pace or WorkPace(), speed, paused
         self._estimate_pace, self._estimates = WorkPace(), EstimateShare()
+        self._deferred, self._next_job = set[str](), 0.0
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for, self._latest = False, False, set[str]()
         self.away = ""
@@ -193,9 +196,25 @@ class Dispatcher:
             if verifications:
                 self._quota.take()
                 return verifications
-        return await self._lease(now, self._pace.servos, WORK_KINDS)
+        return await self._lease_work(now)
 
-    async def _lease(self, now: float, servos: int, kinds: Collection[MessageKind]) -> list[Lease]:
+    async def _lease_work(self, now: float) -> list[Lease]:
+        """Lease new messages, of many servos where many send, or an estimate: where one is due, or until then."""
+        most, first = self._pace.servos, self._estimates.due
+        if not first and (wait := self._next_job - self._clocks.monotonic()) > 0.0:
+            first = bool(self._deferred)
+            if not first:
+                await asyncio.sleep(min(wait, _GATHER_S))
+        leases = await self._lease(now, most, WORK_KINDS, first)
+        if leases and not leases[0].estimate:
+            self._next_job = self._clocks.monotonic() + (_GATHER_S if len(leases) < most else 0.0)
+            if first:
+                self._deferred.clear()  # those that are left wait for something else
+        return leases
+
+    async def _lease(
+        self, now: float, servos: int, kinds: Collection[MessageKind], estimate_first: bool = False
+    ) -> list[Lease]:
         return await self._executor.run(
             lambda: self._store.lease(
                 self._owner,
@@ -205,7 +224,7 @@ class Dispatcher:
                 kinds,
                 per_servo=_MESSAGES,
                 newest_first=True,
-                estimate_first=self._estimates.due,
+                estimate_first=estimate_first,
             )
         )
 
@@ -281,6 +300,10 @@ class Dispatcher:
         if not await self._committed(done.result):
             return None
         self._failures.pop(_queue(lease), None)
+        if done.result.deferred:
+            self._deferred.add(lease.servo)
+        elif lease.estimate:
+            self._deferred.discard(lease.servo)
         if others_wait:
             await self._hold(lease.servo, done.seconds)
         self._report(lease, done.result, done.seconds, now)

@@ -132,6 +132,22 @@ def test_derivatives_are_those_of_the_residual():
     assert residual.size > rows.shape[0]
 
 
+def test_a_descent_ends_where_a_step_that_promises_little_leads_up(monkeypatch):
+    problem, points = problem_of(machine_window(factors=np.zeros(4)), noise=1e-6)
+    fit = problem.descend(np.array([*points[0], 0.0, 0.0, 0.0, 0.0]), (True, True))
+    evaluated, smooth = [], FreeProblem.rows
+
+    def ever_higher(self, q, keep=False):
+        residual, rows = smooth(self, q, keep)
+        evaluated.append(q)
+        return residual * (1.0 + 1e-3 * len(evaluated)), rows
+
+    monkeypatch.setattr(FreeProblem, "rows", ever_higher)
+    near = np.array([*fit.point, *fit.factors])
+    near[0] += 0.01 * np.sqrt(fit.covariance[0, 0] * fit.cost / fit.rows.shape[1])
+    assert problem.descend(near, (True, True)).evaluations == 2
+
+
 def test_without_noise_the_factors_come_out_exactly():
     fitted = whitened.fit(machine_window(noise=0.0).window, MODEL, None, None, ROUGH)
     assert fitted.learnt.free.factors == pytest.approx(TRUTH, abs=2e-5)

@@ -4,6 +4,7 @@ import os
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, wait
 from pathlib import Path
@@ -96,10 +97,28 @@ def test_waiting_writes_are_committed_together(gate: Gate) -> None:
     group.close()
 
 
-def test_messages_wait_for_no_others(gate: Gate) -> None:
-    """Neither one alone nor the next after several: it took a quarter of the rate of commits."""
-    pauses: list[float] = []
-    group = GroupCommit(gate, sleep=pauses.append)
+def test_writes_wait_for_others_until_there_are_enough(gate: Gate) -> None:
+    gate.opened.set()
+    group = GroupCommit(gate, CommitLimits(gather=10.0 * PATIENCE_S, enough=3))
+    futures = [group.put(window(sequence=n)) for n in range(3)]
+    assert results(futures) == [PutResult.NEW] * 3
+    last = group.put(window(sequence=3))
+    group.close()  # does not wait any longer
+    assert last.result(0.0) is PutResult.NEW
+    assert gate.sizes == [3, 1]
+
+
+def test_a_write_alone_waits_for_no_longer_than_the_limit(gate: Gate) -> None:
+    gate.opened.set()
+    group = GroupCommit(gate, CommitLimits(gather=0.02))
+    begun = time.monotonic()
+    assert group.put(window(sequence=0)).result(PATIENCE_S) is PutResult.NEW
+    assert time.monotonic() - begun >= 0.02
+    group.close()
+
+
+def test_without_a_limit_nothing_waits_for_others(gate: Gate) -> None:
+    group = GroupCommit(gate, CommitLimits(gather=0.0))
     first = group.put(window(sequence=0))
     assert gate.entered.wait(PATIENCE_S)
     others = [group.put(window(sequence=n)) for n in (1, 2)]
@@ -107,18 +126,7 @@ def test_messages_wait_for_no_others(gate: Gate) -> None:
     assert results([first, *others]) == [PutResult.NEW] * 3
     assert group.put(window(sequence=3)).result(PATIENCE_S) is PutResult.NEW
     group.close()
-    assert (gate.sizes, pauses) == ([1, 2, 1], [])
-
-
-@pytest.mark.parametrize("gather", [0.25, 0.0])
-def test_results_gather_unless_somebody_waits_for_them(store: Store, gather: float) -> None:
-    pauses: list[float] = []
-    group = GroupCommit(store, CommitLimits(gather=gather), lambda: 300.0, pauses.append)
-    store.put([window("s")])
-    (claim,) = store.lease("me", 1, 30.0, 200.0)
-    assert group.commit(outcome(claim)).result(PATIENCE_S)
-    group.close()
-    assert pauses == ([gather] if gather else [])
+    assert gate.sizes == [1, 2, 1]
 
 
 def test_a_transaction_is_bounded_in_bytes(gate: Gate) -> None:

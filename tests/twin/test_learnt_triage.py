@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import math
+import tracemalloc
 from dataclasses import replace
 from functools import cache
 
@@ -13,7 +14,6 @@ import pytest
 from twin_messages import message_of
 
 from benchmarks.estimator_windows import cut
-from servotwin.estimation.core.response import Response
 from servotwin.estimation.learning.machine import LearningSettings
 from servotwin.estimation.whitened.free_model import FactorPrior, adapted
 from servotwin.estimation.whitened.quick import quick_fit
@@ -123,15 +123,22 @@ def test_glances_keep_little_of_the_machines_that_they_have_seen() -> None:
     """A worker of a fleet meets thousands of machines, each of which comes back after all the others."""
     window = decode_window(off_windows(OFF_BY[0], 10.0, False, 0.0)[0])
     rng, covariance = np.random.default_rng(3), np.diag([1e-6, 1e-5, 1e-7, 1e-6])
-    gc.collect()
-    before = responses_in_memory()
-    for _ in range(200):
-        quick_fit(window, SERVO, 10.0 * DEG, None, FactorPrior(1e-3 * rng.standard_normal(4), covariance))
-    gc.collect()
-    assert responses_in_memory() - before < 100
+    machines = [FactorPrior(1e-3 * rng.standard_normal(4), covariance) for _ in range(300)]
+    used = []
+    tracemalloc.start()
+    for some in (machines[:100], machines[100:]):  # after the first ones other caches are full
+        for machine in some:
+            quick_fit(window, SERVO, 10.0 * DEG, None, machine)
+        gc.collect()
+        used.append(tracemalloc.get_traced_memory()[0])
+    tracemalloc.stop()
+    kept = (used[1] - used[0]) / 200
+    assert kept < 4000.0  # one row of a window is as much
 
 
-def responses_in_memory() -> int:
-    """Number of sampled responses that something still refers to."""
-    # `isinstance` would follow the weak references of others, some of them to what is gone.
-    return sum(type(one) is Response for one in gc.get_objects())
+def test_a_glance_at_a_machine_that_was_seen_before_computes_no_response(monkeypatch) -> None:
+    window = decode_window(off_windows(OFF_BY[0], 10.0, False, 0.0)[0])
+    machine = FactorPrior(np.array([1e-3, 2e-3, 3e-4, 4e-3]), np.diag([1e-6, 1e-5, 1e-7, 1e-6]))
+    first = quick_fit(window, SERVO, 10.0 * DEG, None, machine)
+    monkeypatch.setattr("servotwin.estimation.whitened.quick.variants", None)
+    assert quick_fit(window, SERVO, 10.0 * DEG, None, replace(machine)) == first

@@ -1,6 +1,7 @@
 """The dispatcher with a scripted store, pool and commit: failures are counted and leases released."""
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Sequence
 
 from servotwin.store.engine import StoreUnavailable
@@ -13,7 +14,7 @@ from servotwin.twin_service.pace import EstimateShare, VerificationQuota, WorkPa
 from servotwin.twin_service.store_executor import StoreExecutor
 from servotwin.twin_service.worker import LeaseResult, WorkerLost
 
-DIES, FAILS, TAKES_LONG = b"dies", b"fails", b"takes long"
+DIES, FAILS, TAKES_LONG, DEFERS = b"dies", b"fails", b"takes long", b"defers"
 
 
 def claim(servo: str, body: bytes = b"", kind: MessageKind = MessageKind.WINDOW) -> Lease:
@@ -25,15 +26,17 @@ class Lender:
 
     def __init__(self, turns: Sequence[Sequence[Lease]]) -> None:
         self.turns = list(turns)
+        self.leased: list[tuple[float, bool]] = []
         self.seen: list[tuple[str, int]] = []
         self.released: list[frozenset[str]] = []
         self.renewed: list[frozenset[str]] = []
         self.held: list[str] = []
         self.through = asyncio.Event()
 
-    def lease(self, _owner, _limit, _lease, _now, kinds, **_more) -> list[Lease]:
+    def lease(self, _owner, _limit, _lease, _now, kinds, *, estimate_first, **_more) -> list[Lease]:
         if MessageKind.VERIFICATION in kinds:
             return []
+        self.leased.append((time.monotonic(), estimate_first))
         return list(self.turns.pop(0)) if self.turns else []
 
     def renew(self, _owner, servos, _until) -> None:
@@ -62,7 +65,8 @@ class Lender:
             body = each.messages[0].body
             if body == DIES:
                 raise WorkerLost("it died")
-            made = None if body == FAILS else WorkResult(each.servo, each.serial, b"", None, (1,))
+            deferred = 1 if body == DEFERS else 0
+            made = None if body == FAILS else WorkResult(each.servo, each.serial, b"", None, (1,), deferred=deferred)
             while body == TAKES_LONG and not self.renewed:
                 await asyncio.sleep(0.001)
             yield LeaseResult(made, "it failed", 19.0 if body == TAKES_LONG else 0.0)
@@ -118,6 +122,21 @@ def test_a_verification_that_kills_its_workers_is_counted_although_windows_succe
     verification, window = claim("a", DIES, MessageKind.VERIFICATION), claim("a")
     lender = through([[verification], [window], [verification], [window], [verification]])
     assert [attempts for _, attempts in lender.seen] == [1, 1, 2, 1, 3]
+
+
+def test_a_job_that_was_not_full_waits_for_more_servos_and_a_full_one_does_not(monkeypatch):
+    monkeypatch.setattr(dispatching, "_GATHER_S", 0.2)
+    full = [claim(f"s{n}") for n in range(16)]
+    times = [at for at, _ in through([[claim("a")], full, [claim("b")]]).leased]
+    assert times[1] - times[0] >= 0.19
+    assert times[2] - times[1] < 0.19
+
+
+def test_an_estimate_comes_before_the_next_job_of_new_messages(monkeypatch):
+    monkeypatch.setattr(dispatching, "_GATHER_S", 30.0)
+    estimate = claim("a")._replace(estimate=True)
+    leased = through([[claim("a", DEFERS)], [estimate]]).leased
+    assert [first for _, first in leased] == [False, True]
 
 
 def test_a_void_result_releases_no_lease():

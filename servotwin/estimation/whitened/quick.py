@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares, project_out, remove
-from servotwin.estimation.core.response import response
+from servotwin.estimation.core.response import Response, response
 from servotwin.estimation.core.variants import variants
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.whitened.nearby import nearby
@@ -31,6 +32,8 @@ STEPS = 16
 _FREE, _PRECISION, _GAIN = 2.0, 1e-5, 1e-7  # ranges of the motor; of the motor's range; of the cost
 _LAST_STEP, _CLOSE = 0.3, 1e-5  # largest last step of a converged gap: standard deviations; of the motor's range
 _FLAT = 1e-9  # of the derivative's square: below it nothing shows the gap
+_MACHINES = 16_384
+"""Learnt machines whose responses are kept, at 2 kB: a fifth of a glance, and they stay the same until an estimate."""
 _ANYWHERE = 1.0 / 3.0  # variance of a place of which nothing is known, from -1 to 1
 
 
@@ -159,13 +162,19 @@ def _slow(window: Window, servo: Servo, offset: tuple[float, float] | None, mach
     reduce = decimation(factor_for(response(servo, window.sample_rate), angle.size))
     rows = reduce.rows(np.vstack([angle - angle[0], position - position[0]]))
     rate = window.sample_rate / reduce.factor
-    model = response(servo, rate) if machine is None else variants(servo, [machine.mean], rate)[0]
+    model = response(servo, rate) if machine is None else _learnt_response(servo, tuple(machine.mean.tolist()), rate)
     if offset is None:
         return Reduction.of(rows[0], rows[1], model, skew=False, factor=1)
     first, home = float(angle[0] + rows[0, 0]), float(position[0] + rows[1, 0])
     gain = model.static_gain
     known = NuisancePrior(gain * (first + offset[0]) - home, abs(gain) * offset[1])
     return Reduction.of(rows[0], rows[1], model, known, skew=False, factor=1)
+
+
+@lru_cache(maxsize=_MACHINES)
+def _learnt_response(servo: Servo, factors: tuple[float, ...], rate: float) -> Response:
+    """Response of a servo with other logarithms of its factors, at a sample rate (Hz)."""
+    return variants(servo, [np.array(factors)], rate)[0]
 
 
 def _weights(slopes: MisfitSlopes, rms: float) -> Array | None:
