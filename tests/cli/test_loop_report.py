@@ -3,12 +3,15 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.progress import Progress, TaskID
 
 import servotwin as st
+from servotwin.cli import simulate
 from servotwin.cli.loop_report import reasons, step_ends, summary, window_table
 from servotwin.cli.simulate import record
 from servotwin.cosim import Loop
@@ -100,6 +103,26 @@ def test_simulate_shows_the_report_and_writes_what_is_asked_for(file: Path, tmp_
     assert "95 % interval, deg" in text
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     assert [each.name for each in tmp_path.iterdir()] == ["run.png"]
+
+
+def test_progress_names_the_search_and_goes_to_the_standard_error(
+    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A fallback set that no process has found yet takes minutes, before the first sample."""
+    shown: list[str] = []
+
+    class Shown(Progress):
+        def update(self, task_id: TaskID, **changes: Any) -> None:
+            shown.append(self.tasks[task_id].description)
+            super().update(task_id, **changes)
+
+    monkeypatch.setattr(simulate, "Progress", Shown)
+    record(file)
+    assert shown[0] == "looking for a verified fallback set"
+    assert shown[-1] == "simulating"
+    told = capsys.readouterr()
+    assert "simulating" in told.err
+    assert "simulating" not in told.out
 
 
 @pytest.mark.parametrize("name", ["run.pdf", "missing/run.png"])
