@@ -59,8 +59,7 @@ def record(
     if figure is not None:
         files.check_file(figure, _PICTURES)
     console = console or Console()
-    text, described = _read(scenario)
-    loop = _run(described)
+    text, loop = _run(scenario)
     for line in summary(loop):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if windows and loop.windows:
@@ -139,11 +138,12 @@ def _read(path: Path) -> tuple[str, st.Scenario]:
     return path.read_text(encoding="utf-8"), scenario
 
 
-def _run(scenario: st.Scenario) -> Loop:
-    """Co-simulate under a progress bar."""
+def _run(scenario: Path) -> tuple[str, Loop]:
+    """Read and co-simulate a scenario under a progress bar."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
-    with Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True)) as progress:
+    console = Console(stderr=True)
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
         bar = progress.add_task("looking for a verified fallback set", total=None)
-        scenario.start  # noqa: B018  # kept, and computed for minutes where no process has done so
+        text, described = _read(scenario)
         progress.update(bar, description="simulating", total=1.0)
-        return st.cosimulate(scenario, lambda share: progress.update(bar, completed=share))
+        return text, st.cosimulate(described, lambda share: progress.update(bar, completed=share))

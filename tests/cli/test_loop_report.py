@@ -105,24 +105,27 @@ def test_simulate_shows_the_report_and_writes_what_is_asked_for(file: Path, tmp_
     assert [each.name for each in tmp_path.iterdir()] == ["run.png"]
 
 
-def test_progress_names_the_search_and_goes_to_the_standard_error(
-    file: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A fallback set that no process has found yet takes minutes, before the first sample."""
-    shown: list[str] = []
+def test_progress_names_the_search_and_goes_to_the_standard_error(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fallback set that no process has found yet is searched for while the scenario is read."""
+    shown: list[tuple[str, bool]] = []
 
     class Shown(Progress):
+        def add_task(self, description: str, *options: Any, **named: Any) -> TaskID:
+            shown.append((description, self.console.stderr))
+            return super().add_task(description, *options, **named)
+
         def update(self, task_id: TaskID, **changes: Any) -> None:
-            shown.append(self.tasks[task_id].description)
             super().update(task_id, **changes)
+            shown.append((self.tasks[task_id].description, self.console.stderr))
+
+    def read(path: Path) -> tuple[str, st.Scenario]:
+        assert shown == [("looking for a verified fallback set", True)]
+        return "", st.Scenario.load(path)
 
     monkeypatch.setattr(simulate, "Progress", Shown)
+    monkeypatch.setattr(simulate, "_read", read)
     record(file)
-    assert shown[0] == "looking for a verified fallback set"
-    assert shown[-1] == "simulating"
-    told = capsys.readouterr()
-    assert "simulating" in told.err
-    assert "simulating" not in told.out
+    assert shown[-1] == ("simulating", True)
 
 
 @pytest.mark.parametrize("name", ["run.pdf", "missing/run.png"])
