@@ -38,7 +38,7 @@ def record(
         NAME.parquet (needs the extra `parquet`), NAME.npz or NAME.csv (12 significant digits, metadata in the first row
         of a last column).
     console : Console, optional
-        Where progress and the report are shown.
+        Where the report is shown; progress is shown on the standard error.
     figure : Path, optional
         NAME.png or NAME.svg.
     windows : bool
@@ -59,8 +59,7 @@ def record(
     if figure is not None:
         files.check_file(figure, _PICTURES)
     console = console or Console()
-    text, described = _read(scenario)
-    loop = _run(described, console)
+    text, loop = _run(scenario)
     for line in summary(loop):
         console.print(line, markup=False, highlight=False, soft_wrap=True)
     if windows and loop.windows:
@@ -139,9 +138,12 @@ def _read(path: Path) -> tuple[str, st.Scenario]:
     return path.read_text(encoding="utf-8"), scenario
 
 
-def _run(scenario: st.Scenario, console: Console) -> Loop:
-    """Co-simulate under a progress bar."""
-    percent = TextColumn("{task.percentage:3.0f} %")
-    with Progress(TextColumn("simulating"), BarColumn(), percent, TimeElapsedColumn(), console=console) as progress:
-        bar = progress.add_task("", total=1.0)
-        return st.cosimulate(scenario, lambda share: progress.update(bar, completed=share))
+def _run(scenario: Path) -> tuple[str, Loop]:
+    """Read and co-simulate a scenario under a progress bar."""
+    columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
+    console = Console(stderr=True)
+    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
+        bar = progress.add_task("looking for a verified fallback set", total=None)
+        text, described = _read(scenario)
+        progress.update(bar, description="simulating", total=1.0)
+        return text, st.cosimulate(described, lambda share: progress.update(bar, completed=share))

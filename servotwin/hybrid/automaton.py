@@ -138,6 +138,16 @@ class AutomatonStack:
             if not np.isfinite(values).all():
                 raise InvalidInput(f"a {what} of a stack of automata holds a number that is not finite")
 
+    @cached_property
+    def speeds(self) -> tuple[Array, Array]:
+        """(A,) of each automaton, as of `speeds`."""
+        return speeds(self.flows)
+
+    @cached_property
+    def shared_flows(self) -> NDArray[np.int64]:
+        """(M,), as of `shared_flows`."""
+        return shared_flows(self.flows)
+
     @classmethod
     def of(cls, automata: Sequence[Automaton]) -> AutomatonStack:
         """Numbers of automata.

@@ -307,8 +307,14 @@ class Axis:
 
     def command_of(self, torque: float | Array) -> Any:
         """Command of a constant torque (N m); 0 for a drive that follows its command whatever the load."""
+        held, command = self._at_rest
+        return torque * held / command
+
+    @cached_property
+    def _at_rest(self) -> tuple[float, float]:
+        """Torque and command of a constant angle, over each other."""
         shaft = self.actuator.polynomials()
-        return torque * float(shaft.torque[0]) / float(shaft.command[0])
+        return float(shaft.torque[0]), float(shaft.command[0])
 
     def torque_of(self, command: float) -> float:
         """Torque at rest under a command, N m; 0 for a drive that follows its command whatever the load."""

@@ -15,7 +15,7 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import AnyGains, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.failed_search import FailedSearch
+from servotwin.redesign.certified.last_search import LastSearch
 from servotwin.redesign.certified.uncertainty import Region
 
 NOT_OBSERVED = nothing_known(float("nan"), "not observed")
@@ -47,8 +47,8 @@ class Evidence:
         V, input biases that the last windows before this one showed.
     steps : tuple of float
         m, sizes of the steps in the last windows, this one included.
-    failed : FailedSearch or None
-        The last search for a verified setting that found nothing.
+    search : LastSearch or None
+        The last search for a verified setting.
     """
 
     estimate: GapEstimate
@@ -61,7 +61,7 @@ class Evidence:
     motor: LearntMotor | None = None
     rests: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
-    failed: FailedSearch | None = None
+    search: LastSearch | None = None
 
     @property
     def gains(self) -> AnyGains | None:
@@ -93,8 +93,8 @@ class Redesign:
         Results of the setting in simulation.
     to_verify : Region, optional
         Region for which the setting is still to be verified, since its certificate is that of a wider one; None: none.
-    failed : FailedSearch, optional
-        Search that was made and found nothing, to be remembered; None: none was.
+    search : LastSearch, optional
+        Search that was made, to be remembered; None: none was.
     """
 
     setting: Setting | None
@@ -102,7 +102,7 @@ class Redesign:
     reason: str
     certificate: Certificate | None = None
     to_verify: Region | None = None
-    failed: FailedSearch | None = None
+    search: LastSearch | None = None
 
 
 class Policy(Protocol):

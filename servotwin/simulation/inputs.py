@@ -66,10 +66,10 @@ def plant_forces(servo: Plant) -> dict[str, float]:
 def with_forces(constants: dict[str, Array], plants: Sequence[Plant]) -> dict[str, Array]:
     """Constants of members, with the plants' own forces beside or among them."""
     # Thousands of members share a few plants.
-    different = {id(plant): plant for plant in plants}.values()
-    if not any(any(plant_forces(plant).values()) for plant in different):
+    forces = {key: plant_forces(plant) for key, plant in {id(each): each for each in plants}.items()}
+    if not any(any(each.values()) for each in forces.values()):
         return constants
-    own = {name: np.array([plant_forces(plant)[name] for plant in plants]) for name in plant_forces(plants[0])}
+    own = {name: np.array([forces[id(plant)][name] for plant in plants]) for name in plant_forces(plants[0])}
     friction = constants["friction"] + own.pop("friction")
     return {**constants, "friction": friction, **{name.replace(" ", "_"): values for name, values in own.items()}}
 

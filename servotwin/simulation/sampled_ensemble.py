@@ -227,7 +227,9 @@ def _span(duration: float, sample_rate: float, outputs: Sequence[str], last: flo
 
 def _ticked(members: SampledMembers, span: SampledSpan, threads: int | None) -> Iterator[tuple[int, Array]]:
     """Members that do not advance in blocks, with their (O, N) outputs: the deployed law at every tick."""
-    which = [k for k in range(len(members.servos)) if not in_blocks(members, k, span)]
+    which = [k for k, blocks in enumerate(in_blocks(members, span)) if not blocks]
+    if not which:
+        return
     with ThreadPoolExecutor(threads or os.cpu_count() or 1) as pool:
         yield from zip(which, pool.map(lambda k: _run(members, k, span), which), strict=True)
 

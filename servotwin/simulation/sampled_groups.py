@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters
 from servotwin.control.laws import Law, filtered_pid
-from servotwin.hybrid.automaton import Array, shared_flows, speeds, structure_key
+from servotwin.hybrid.automaton import Array, structure_key
 from servotwin.hybrid.buffer_pool import BufferPool
 from servotwin.hybrid.ensemble import on_threads
 from servotwin.hybrid.flow import new_scratch
@@ -80,15 +80,26 @@ class SampledGroup:
     kind: Hashable
 
 
-def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
-    """True for members that advance in blocks: a filtered PID, and ticks at every sample of the output; with a friction
-    feedforward a reference that is constant in every piece."""
-    law = members.controllers[member]
-    if not isinstance(law, Controller) or (law.friction_feedforward != 0.0 and degree(span.shape) > 0):
+def in_blocks(members: SampledMembers, span: SampledSpan) -> list[bool]:
+    """True for each member that advances in blocks: a filtered PID, and ticks at every sample of the output; with a
+    friction feedforward a reference that is constant in every piece."""
+    constant = degree(span.shape) == 0
+    # Members share laws, and many share a servo.
+    servos = {key: not _hangs(servo) for key, servo in {id(each): each for each in members.servos}.items()}
+    laws = {
+        key: _in_blocks(law, span, constant) for key, law in {id(each): each for each in members.controllers}.items()
+    }
+    return [servos[id(servo)] and laws[id(law)] for servo, law in zip(members.servos, members.controllers, strict=True)]
+
+
+def _hangs(servo: Plant) -> bool:
+    """True where the flank on which a load hangs depends on the gap."""
+    return servo.at_motor and bool(servo.guide.force)
+
+
+def _in_blocks(law: Law, span: SampledSpan, constant: bool) -> bool:
+    if not isinstance(law, Controller) or (law.friction_feedforward != 0.0 and not constant):
         return False
-    servo = members.servos[member]
-    if servo.at_motor and servo.guide.force:
-        return False  # the flank on which its load hangs depends on the gap
     ratio = (law.sample_rate or 0.0) / span.rate
     whole = round(ratio)
     return whole >= 1 and abs(ratio - whole) <= 1e-9 * ratio
@@ -97,8 +108,8 @@ def in_blocks(members: SampledMembers, member: int, span: SampledSpan) -> bool:
 def groups_of(members: SampledMembers, span: SampledSpan) -> list[SampledGroup]:
     """Members that advance in blocks, by structure."""
     by_structure: dict[object, list[int]] = {}
-    for member, structure in enumerate(_structures(members)):
-        if in_blocks(members, member, span):
+    for member, (structure, blocks) in enumerate(zip(_structures(members), in_blocks(members, span), strict=True)):
+        if blocks:
             by_structure.setdefault(structure, []).append(member)
     return [_group(members, span, np.array(which)) for which in by_structure.values()]
 
@@ -163,7 +174,7 @@ def _group(members: SampledMembers, span: SampledSpan, which: NDArray[np.int64])
     begun = SampledStarts(
         order, plant, law, states, constants["reference"], enter, leave, constants["resolution"], limits
     )
-    watches, flow_of = watches_of(loops.first, laws[0], dead_zone, counts), shared_flows(loops.automata.flows)
+    watches, flow_of = watches_of(loops.first, laws[0], dead_zone, counts), loops.automata.shared_flows
     outputs = dead_zone, family.modes, len(span.outputs)
     kind = structure_key(loops.first.automaton), flow_of.tobytes(), places, watches, outputs
     return SampledGroup(which, loops.first, places, watches, family, begun, flow_of, kind)
@@ -179,7 +190,7 @@ def _family(
     side: int,
 ) -> SampledFamily:
     stack, period = loops.automata, 1.0 / rates
-    searches = divisors(*speeds(stack.flows), period)
+    searches = divisors(*stack.speeds, period)
     return SampledFamily(
         stack.flows.reshape(len(rates), -1),
         stack.rows.reshape(len(rates), -1),

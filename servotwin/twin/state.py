@@ -18,7 +18,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.learning.wear import Wear
 from servotwin.messages import Gains, Reason, Receipt, Setting, Update, WindowMessage, finite, needed_fields
 from servotwin.messages.legacy import upgrade
-from servotwin.redesign.certified.failed_search import FailedSearch
+from servotwin.redesign.certified.last_search import LastSearch
 from servotwin.redesign.certified.verification import verification_of
 from servotwin.redesign.design import decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
@@ -211,8 +211,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         Effect of engineers' acts.
     ratio : UntoldRatio
         Windows that do not tell the gap from the transmission's ratio.
-    failed : FailedSearch or None
-        The last search for a verified setting that found nothing.
+    search : LastSearch or None
+        The last search for a verified setting.
     """
 
     servo: str
@@ -232,7 +232,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     introduced: bool = False
     oversight: Oversight = Oversight()
     ratio: UntoldRatio = UntoldRatio()
-    failed: FailedSearch | None = None
+    search: LastSearch | None = None
 
     def with_sent(self, update: Update, now: float) -> TwinState:
         """Note the first sending of an update, with its setting: the receipt may get lost."""

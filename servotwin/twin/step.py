@@ -302,7 +302,7 @@ def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: floa
         None if model.motor is None else model.motor.current(wear.motor, arrived),
         state.rests,
         state.steps,
-        state.failed,
+        state.search,
     )
 
 
@@ -363,7 +363,7 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
             lookups, redesign = state.lookups, model.policy.redesign(evidence)
         else:
             lookups, redesign = model.lookups.redesign(state.lookups, evidence)
-        return replace(state, lookups=lookups, failed=redesign.failed or state.failed), redesign
+        return replace(state, lookups=lookups, search=redesign.search or state.search), redesign
     except InvalidInput as error:
         return state, Redesign(None, math.nan, str(error))
 

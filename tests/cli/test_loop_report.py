@@ -3,12 +3,15 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from rich.progress import Progress, TaskID
 
 import servotwin as st
+from servotwin.cli import simulate
 from servotwin.cli.loop_report import reasons, step_ends, summary, window_table
 from servotwin.cli.simulate import record
 from servotwin.cosim import Loop
@@ -100,6 +103,29 @@ def test_simulate_shows_the_report_and_writes_what_is_asked_for(file: Path, tmp_
     assert "95 % interval, deg" in text
     assert (tmp_path / "run.png").read_bytes().startswith(b"\x89PNG")
     assert [each.name for each in tmp_path.iterdir()] == ["run.png"]
+
+
+def test_progress_names_the_search_and_goes_to_the_standard_error(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A fallback set that no process has found yet is searched for while the scenario is read."""
+    shown: list[tuple[str, bool]] = []
+
+    class Shown(Progress):
+        def add_task(self, description: str, *options: Any, **named: Any) -> TaskID:
+            shown.append((description, self.console.stderr))
+            return super().add_task(description, *options, **named)
+
+        def update(self, task_id: TaskID, **changes: Any) -> None:
+            super().update(task_id, **changes)
+            shown.append((self.tasks[task_id].description, self.console.stderr))
+
+    def read(path: Path) -> tuple[str, st.Scenario]:
+        assert shown == [("looking for a verified fallback set", True)]
+        return "", st.Scenario.load(path)
+
+    monkeypatch.setattr(simulate, "Progress", Shown)
+    monkeypatch.setattr(simulate, "_read", read)
+    record(file)
+    assert shown[-1] == ("simulating", True)
 
 
 @pytest.mark.parametrize("name", ["run.pdf", "missing/run.png"])

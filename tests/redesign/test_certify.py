@@ -235,6 +235,22 @@ def test_of_laws_that_cost_alike_the_one_without_velocity_feedforward_is_chosen(
     assert unseen.controller.velocity_feedforward > 0.0
 
 
+def test_a_law_whose_plainer_one_is_verified_is_not_verified_to_its_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    finished: list[Design] = []
+    certificate = Attempt.certificate
+
+    def noted(self: Attempt) -> Certificate:
+        finished.append(self.setting)
+        return certificate(self)
+
+    monkeypatch.setattr(Attempt, "certificate", noted)
+    monkeypatch.setattr(certify_module, "_ALIKE", 10.0)
+    found = certify(SERVO, Uncertainty(gap=gaps(9, 10), usual_step=(0.9e-3, 1.1e-3)), SMALL, SHORT)
+    assert isinstance(found, Certificate)
+    assert found.setting.controller.velocity_feedforward == 0.0
+    assert finished == [found.setting]
+
+
 def test_no_candidate_is_one_sentence() -> None:
     with pytest.raises(InvalidInput, match=r"no candidate has Ms <= 1\.01 on this servo"):
         certify(SERVO, Uncertainty(), replace(SMALL, Ms=1.01), SHORT)

@@ -1,6 +1,7 @@
 """Ensembles of sampled loops: every member is the run that it would be alone."""
 
 import math
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -8,12 +9,13 @@ from held_plant import HeldPlant
 
 from servotwin.control import law
 from servotwin.errors import InvalidInput
+from servotwin.hybrid import automaton
 from servotwin.hybrid.buffer_pool import BufferPool
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.plant.stack import sampled_plants
-from servotwin.simulation import sampled_groups, simulate
+from servotwin.simulation import inputs, sampled_groups, simulate
 from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled, summarise_sampled
 
 DEGREE = np.pi / 180.0
@@ -142,3 +144,29 @@ def test_what_an_ensemble_refuses(cases: SampledCases, options: dict[str, object
     given = {"controllers": PAPER.controller.replace(sample_rate=1e3), "last": 0.5} | options
     with pytest.raises(InvalidInput, match=message):
         summarise_sampled(PAPER, duration=1.0, cases=cases, **given)
+
+
+def test_what_members_share_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search simulates hundreds of controllers on the same few machines."""
+    counts = dict.fromkeys(("plant_forces", "speeds"), 0)
+
+    def counted(module: ModuleType, name: str) -> None:
+        original = getattr(module, name)
+
+        def call(*given: object) -> object:
+            counts[name] += 1
+            return original(*given)
+
+        monkeypatch.setattr(module, name, call)
+
+    counted(inputs, "plant_forces")
+    counted(automaton, "speeds")
+    axis = Axis.preset("ball-screw")
+    plants = np.array([axis, axis.scaled({"k": 0.97})], dtype=object)[:, None, None]
+    for scale in (0.5, 0.6):
+        own = axis.pidf
+        laws = np.array([own.replace(Kp=scale * own.Kp * more) for more in (1.0, 1.01, 1.02)], dtype=object)[:, None]
+        cases = SampledCases(np.linspace(1e-4, 3e-4, 8), 1e-3, 0.0)
+        summarise_sampled(plants, laws, 0.01, cases, 0.005, sample_rate=own.sample_rate)
+    assert counts["speeds"] == 1
+    assert counts["plant_forces"] <= 2 * (len(plants) + 1)

@@ -166,6 +166,6 @@ def test_a_search_that_found_nothing_is_not_repeated_by_a_twin_that_was_restored
     assert len(searches) == 1
     assert repeated.setting == sent.setting
     assert again.log.redesigns["axis", "boot-1", 1].reason.startswith("nothing found; the ranges have not become")
-    without = msgspec.structs.replace(decode_state("axis", first.state()), failed=None)
+    without = msgspec.structs.replace(decode_state("axis", first.state()), search=None)
     Twin("axis", model, state=encode_state(without)).receive(window(1, 40.0), 20.0)
     assert len(searches) == 2

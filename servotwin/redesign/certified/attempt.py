@@ -167,6 +167,11 @@ class Attempt:
             return True
         return bool(few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot)
 
+    def verified(self) -> Certificate | None:
+        """Certificate of the setting, where it meets the demands."""
+        tried = self.certificate()
+        return None if self.question.shortcoming(tried) else tried
+
     def reached(self) -> tuple[int, float]:
         """Machines on which the setting was simulated, and the share of these that settled."""
         measures = self._measures

@@ -120,9 +120,10 @@ def _first_verified(
     for attempt in _shortlist(screening, likely, has_widest_integral_zone(candidates), question.demands.attempts):
         attempts.append(attempt)
         if not attempt.cannot_pass():
-            tried = attempt.certificate()
-            if not question.shortcoming(tried):
-                return _plainer(question, screening, tried) or tried
+            # Before the rest of the attempt's machines, which are needed only where this is none.
+            verified = _plainer(question, screening, attempt.setting) or attempt.verified()
+            if verified is not None:
+                return verified
         hard += attempt.missed()
     return None
 
@@ -154,22 +155,22 @@ def confirm(
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 
 
-def _plainer(question: Question, screening: Screening, found: Certificate) -> Certificate | None:
+def _plainer(question: Question, screening: Screening, found: Design) -> Certificate | None:
     """On a machine that was observed: the setting without its velocity feedforward, where that costs hardly more there
     and is verified too. On any other one the costs of a few machines do not tell the two apart."""
-    law, own = found.setting.controller, question.servo.controller
+    law, own = found.controller, question.servo.controller
     if not (isinstance(law, Controller) and isinstance(own, Controller) and law.velocity_feedforward):
         return None
     if question.uncertainty.usual_step is None:
         return None
-    plain = replace(found.setting, controller=law.replace(velocity_feedforward=0.0, velocity_time=own.velocity_time))
+    plain = replace(found, controller=law.replace(velocity_feedforward=0.0, velocity_time=own.velocity_time))
     if screening.fails(plain):
         return None
-    costs = screening.expected_costs([found.setting, plain])
-    if costs[plain] > _ALIKE * costs[found.setting]:
+    costs = screening.expected_costs([found, plain])
+    if costs[plain] > _ALIKE * costs[found]:
         return None
-    tried = Attempt(question, plain).certificate()
-    return None if question.shortcoming(tried) else tried
+    attempt = Attempt(question, plain)
+    return None if attempt.cannot_pass() else attempt.verified()
 
 
 def _likely(question: Question, hard: list[SimulatedMachines], ranked: Iterator[Design]) -> Iterator[Attempt]:

@@ -15,12 +15,13 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import NEAR
+from servotwin.redesign.certified.attempt import with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.evidence_ranges import SAME_FEEDFORWARD, EvidenceRanges
-from servotwin.redesign.certified.failed_search import Asked, FailedSearch, digest_of, learnt_ranges, ranges_of
 from servotwin.redesign.certified.fallback import fallback_certificate
+from servotwin.redesign.certified.last_search import Asked, LastSearch, digest_of, learnt_ranges, ranges_of
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
@@ -122,21 +123,41 @@ class CertifiedPolicy:
         estimate = self.ranges.estimate(evidence)
         if estimate is None and not self.ranges.shows_more(evidence):
             return Redesign(None, math.nan, evidence.unusable)
-        best = math.nan if estimate is None else estimate.gap
         region = self.ranges.region(evidence)
         if too_wide := self._too_wide(region):
             return self._for_growth(evidence, verifier.fallback(), region) or Redesign(None, math.nan, too_wide)
-        asked, past = verifier.asked(region), evidence.failed
-        if asked is not None and past is not None and asked.contains(past.asked):
+        asked, past = verifier.asked(region), evidence.search
+        if asked is not None and past is not None and past.fails(asked):
             reason = f"{past.reason}; the ranges have not become noticeably narrower since that search"
             return _fallback_redesign(verifier.fallback(), region, reason)
-        result = verifier.verify(region, evidence.setting)
+        kept = None if asked is None else self._still_verified(evidence, region, asked)
+        result = kept or verifier.verify(region, evidence.setting)
+        made = self._answer(evidence, region, result, verifier)
+        if asked is None or kept is not None:
+            return made
         if isinstance(result, NotVerified):
-            made = _fallback_redesign(verifier.fallback(), region, result.reason + self.ranges.contradiction(region))
-            return made if asked is None else replace(made, failed=FailedSearch(asked, result.reason))
+            return replace(made, search=LastSearch(asked, reason=result.reason))
+        return replace(made, search=LastSearch(asked, result.setting))
+
+    def _still_verified(self, evidence: Evidence, region: Region, asked: Asked) -> Certificate | None:
+        """Certificate of the setting in force, where the last search chose it for nearly the same question."""
+        found = None if evidence.search is None else evidence.search.finds(asked)
+        if found is None or not alike(found, evidence.setting):
+            return None
+        result = self.confirm(region, with_feedforward(found, region.feedforward), evidence.machine, evidence.motor)
+        return result if isinstance(result, Certificate) else None
+
+    def _answer(
+        self, evidence: Evidence, region: Region, result: Certificate | NotVerified, verifier: Verifier
+    ) -> Redesign:
+        """Redesign that follows from a certificate, or from none."""
+        estimate = self.ranges.estimate(evidence)
+        gap = math.nan if estimate is None else estimate.gap
+        if isinstance(result, NotVerified):
+            return _fallback_redesign(verifier.fallback(), region, result.reason + self.ranges.contradiction(region))
         if _in_force(result.setting, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
-            return Redesign(None, best, "the verified setting is in force already", certificate=result)
-        redesign = _redesign(result, region.noise, best, "")
+            return Redesign(None, gap, "the verified setting is in force already", certificate=result)
+        redesign = _redesign(result, region.noise, gap, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
     def _too_wide(self, region: Region) -> str:

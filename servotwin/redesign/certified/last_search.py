@@ -1,7 +1,8 @@
-"""Memory of a search that found nothing: the ranges that it was asked about, and its result.
+"""Memory of the last search: the ranges that it was asked about, and its result.
 
-Another search for nearly the same ranges, or for wider ones, would take as long and find nothing either, or a setting
-that passes by chance: the more often one is drawn anew, the more likely is a draw without its failures.
+Where it found nothing, another search for nearly the same ranges, or for wider ones, would take as long and find
+nothing either, or a setting that passes by chance: the more often one is drawn anew, the more likely is a draw without
+its failures. Where it found a setting, this is still the cheapest for nearly the same ranges, or hardly dearer.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.fallback import flattened
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
+from servotwin.redesign.design import Design
 
 # A range is as wide as one whose ends are further out by up to that much of the largest end, or of the unit.
 _NOTICEABLE = 0.1
@@ -52,11 +54,20 @@ class Asked(Struct, frozen=True):
         )
 
 
-class FailedSearch(Struct, frozen=True):
-    """Question of the last search that found nothing, and the reason."""
+class LastSearch(Struct, frozen=True):
+    """Question of the last search, the setting that it found, and the reason where it found none."""
 
     asked: Asked
-    reason: str
+    found: Design | None = None
+    reason: str = ""
+
+    def fails(self, asked: Asked) -> bool:
+        """True where it found nothing, and this question is no narrower."""
+        return self.found is None and asked.contains(self.asked)
+
+    def finds(self, asked: Asked) -> Design | None:
+        """The setting that it found, where this question is nearly the same."""
+        return self.found if asked.contains(self.asked) and self.asked.contains(asked) else None
 
 
 def digest_of(servo: Plant, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> str:

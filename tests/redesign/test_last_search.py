@@ -1,4 +1,4 @@
-"""A search that found nothing is remembered, and made again only where another answer is possible."""
+"""A search is remembered, and made again only where another answer is possible."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from servotwin.control.gains import gains_of
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -17,9 +18,10 @@ from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as policies
 from servotwin.redesign.certified.certificate import NotVerified
 from servotwin.redesign.certified.demands import Beyond, Demands
-from servotwin.redesign.certified.failed_search import FailedSearch
+from servotwin.redesign.certified.last_search import LastSearch
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.design import Design, decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 
 DEG = math.pi / 180.0
@@ -54,8 +56,8 @@ def seen(low: float, high: float, bias: float = 0.02, noise: float = 1e-5, **mor
 
 def asked_twice(first: Evidence, then: Evidence, policy: CertifiedPolicy = POLICY) -> tuple[Redesign, Redesign]:
     made = policy.redesign(first)
-    assert made.failed is not None
-    return made, policy.redesign(replace(then, failed=made.failed))
+    assert made.search is not None
+    return made, policy.redesign(replace(then, search=made.search))
 
 
 @pytest.mark.parametrize(
@@ -67,7 +69,7 @@ def test_nearly_the_same_question_or_a_harder_one_is_not_asked_again(searches: S
     assert searches.count == 1
     assert made.certificate is not None
     assert alike(made.certificate.setting, again.setting)
-    assert again.failed is None
+    assert again.search is None
     assert made.reason == "nothing found in search 1; the fallback set is sent"
     assert again.reason.startswith("nothing found in search 1; the ranges have not become noticeably narrower since")
 
@@ -86,8 +88,8 @@ def test_nearly_the_same_question_or_a_harder_one_is_not_asked_again(searches: S
 def test_a_question_that_may_have_another_answer_is_asked(searches: Searches, first: Evidence, then: Evidence) -> None:
     _, again = asked_twice(first, then)
     assert searches.count == 2
-    assert again.failed is not None
-    assert again.failed.reason == "nothing found in search 2"
+    assert again.search is not None
+    assert again.search.reason == "nothing found in search 2"
 
 
 def test_a_machine_that_was_learnt_anew_is_another_question(searches: Searches) -> None:
@@ -105,30 +107,60 @@ def test_a_machine_that_was_learnt_anew_is_another_question(searches: Searches) 
 
 def test_other_demands_or_stated_ranges_are_asked_again(searches: Searches) -> None:
     """The settings of a twin may change while its state stays."""
-    failed = POLICY.redesign(seen(9.0, 11.0)).failed
+    search = POLICY.redesign(seen(9.0, 11.0)).search
     for policy in (
         replace(POLICY, demands=replace(SMALL, Ms=1.9)),
         replace(POLICY, uncertainty=replace(POLICY.uncertainty, k=0.1)),
     ):
-        assert policy.redesign(replace(seen(9.0, 11.0), failed=failed)).failed is not None
+        assert policy.redesign(replace(seen(9.0, 11.0), search=search)).search is not None
     assert searches.count == 3
 
 
-def test_a_found_setting_leaves_nothing_to_remember() -> None:
-    assert POLICY.redesign(seen(9.9, 10.1)).failed is None
+def test_the_chosen_setting_is_verified_alone_while_the_question_is_nearly_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = POLICY.redesign(seen(9.9, 10.1))
+    assert made.search is not None
+    assert made.search.found is not None
+    searches = Searches()
+    monkeypatch.setattr(policies, "certify", searches)
+    then = seen(9.8, 10.3, setting=made.setting, search=made.search)
+    again = POLICY.redesign(then)
+    assert (again.setting, again.reason) == (None, "the verified setting is in force already")
+    assert again.search is None
+    assert again.certificate is not None
+    assert again.certificate.gap == pytest.approx((9.8 * DEG, 10.3 * DEG))
+    assert searches.count == 0
+    other = Setting(0.0, gains_of(POLICY.servo.controller))
+    for asked in (seen(5.0, 10.1, setting=made.setting), seen(9.8, 10.3, setting=other)):
+        assert POLICY.redesign(replace(asked, search=made.search)).search is not None
+    assert searches.count == 2
+
+
+def test_a_chosen_setting_that_is_not_verified_any_more_is_searched_for_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = POLICY.redesign(seen(9.9, 10.1))
+    searches = Searches()
+    monkeypatch.setattr(policies, "certify", searches)
+    monkeypatch.setattr(policies, "confirm", lambda *_question: NotVerified("it hunts"))
+    again = POLICY.redesign(seen(9.8, 10.3, setting=made.setting, search=made.search))
+    assert searches.count == 1
+    assert again.reason == "nothing found in search 1; the fallback set is sent"
 
 
 def test_the_memory_keeps_every_bit(searches: Searches) -> None:
-    failed = POLICY.redesign(seen(9.0, 11.0, steps=(1e-3 / 3.0,))).failed
-    data = msgspec.msgpack.encode(failed)
-    assert msgspec.msgpack.decode(data, type=FailedSearch) == failed
-    assert len(data) < 500
+    failed = POLICY.redesign(seen(9.0, 11.0, steps=(1e-3 / 3.0,))).search
+    assert failed is not None
+    found = replace(POLICY.servo.controller, Kp=1.0 / 3.0)
+    for memory in (failed, LastSearch(failed.asked, Design(found, 1e-4 / 3.0))):
+        data = msgspec.msgpack.encode(memory)
+        assert msgspec.msgpack.decode(data, type=LastSearch, dec_hook=decoded_part) == memory
+        assert len(data) < 1000
     assert searches.count == 1
 
 
 def test_ranges_beyond_the_stated_ones_are_named_with_the_failure(searches: Searches) -> None:
-    failed = POLICY.redesign(seen(9.0, 11.0, bias=0.3))
-    assert "; the windows show an input bias of 0.3 to 0.3 V, and -0.1 to 0.1 are stated" in failed.reason
+    biased = POLICY.redesign(seen(9.0, 11.0, bias=0.3))
+    assert "; the windows show an input bias of 0.3 to 0.3 V, and -0.1 to 0.1 are stated" in biased.reason
     setting = Setting(0.0, None)
     friction = POLICY.redesign(replace(seen(9.0, 11.0, bias=0.06), rests=(-0.06, 0.06), setting=setting))
     assert "; the windows show friction of 0 to 0.0" in friction.reason
