@@ -147,6 +147,21 @@ def test_a_chosen_setting_that_is_not_verified_any_more_is_searched_for_anew(mon
     assert again.reason == "nothing found in search 1; the fallback set is sent"
 
 
+def test_a_fallback_set_in_force_is_not_sent_again(searches: Searches) -> None:
+    made = POLICY.redesign(seen(9.0, 11.0))
+    again = POLICY.redesign(seen(9.0, 11.0, setting=made.setting, search=made.search))
+    assert (again.setting, again.reason.partition("; the ")[0]) == (None, "nothing found in search 1")
+    assert again.reason.endswith("; the fallback set stays")
+    anew = POLICY.redesign(seen(9.0, 11.0, setting=made.setting))
+    assert (anew.setting, anew.reason) == (None, "nothing found in search 2; the fallback set stays")
+    assert anew.search is not None
+    other = POLICY.redesign(seen(9.0, 11.0, bias=0.06, setting=made.setting))
+    assert other.reason == "nothing found in search 3; the fallback set is sent"
+    assert other.setting is not None
+    assert other.setting.gains is not None
+    assert other.setting.gains.feedforward == pytest.approx(-0.06)
+
+
 def test_the_memory_keeps_every_bit(searches: Searches) -> None:
     failed = POLICY.redesign(seen(9.0, 11.0, steps=(1e-3 / 3.0,))).search
     assert failed is not None

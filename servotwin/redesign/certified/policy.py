@@ -129,15 +129,24 @@ class CertifiedPolicy:
         asked, past = verifier.asked(region), evidence.search
         if asked is not None and past is not None and past.fails(asked):
             reason = f"{past.reason}; the ranges have not become noticeably narrower since that search"
-            return _fallback_redesign(verifier.fallback(), region, reason)
+            return self._without(evidence, region, verifier.fallback(), reason)
         kept = None if asked is None else self._still_verified(evidence, region, asked)
         result = kept or verifier.verify(region, evidence.setting)
-        made = self._answer(evidence, region, result, verifier)
-        if asked is None or kept is not None:
-            return made
         if isinstance(result, NotVerified):
+            reason = result.reason + self.ranges.contradiction(region)
+            if asked is None:
+                return _fallback_redesign(verifier.fallback(), region, reason)
+            made = self._without(evidence, region, verifier.fallback(), reason)
             return replace(made, search=LastSearch(asked, reason=result.reason))
-        return replace(made, search=LastSearch(asked, result.setting))
+        made = self._answer(evidence, region, result, verifier)
+        return made if asked is None or kept is not None else replace(made, search=LastSearch(asked, result.setting))
+
+    def _without(self, evidence: Evidence, region: Region, fallback: Certificate, reason: str) -> Redesign:
+        """The fallback set, where a search found nothing and it is not in force yet."""
+        fed = with_feedforward(fallback.setting, region.feedforward)
+        if _in_force(fed, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
+            return Redesign(None, math.nan, f"{reason}; the fallback set stays")
+        return _fallback_redesign(fallback, region, reason)
 
     def _still_verified(self, evidence: Evidence, region: Region, asked: Asked) -> Certificate | None:
         """Certificate of the setting in force, where the last search chose it for nearly the same question."""
@@ -147,17 +156,13 @@ class CertifiedPolicy:
         result = self.confirm(region, with_feedforward(found, region.feedforward), evidence.machine, evidence.motor)
         return result if isinstance(result, Certificate) else None
 
-    def _answer(
-        self, evidence: Evidence, region: Region, result: Certificate | NotVerified, verifier: Verifier
-    ) -> Redesign:
-        """Redesign that follows from a certificate, or from none."""
+    def _answer(self, evidence: Evidence, region: Region, found: Certificate, verifier: Verifier) -> Redesign:
+        """Redesign that follows from a certificate."""
         estimate = self.ranges.estimate(evidence)
         gap = math.nan if estimate is None else estimate.gap
-        if isinstance(result, NotVerified):
-            return _fallback_redesign(verifier.fallback(), region, result.reason + self.ranges.contradiction(region))
-        if _in_force(result.setting, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
-            return Redesign(None, gap, "the verified setting is in force already", certificate=result)
-        redesign = _redesign(result, region.noise, gap, "")
+        if _in_force(found.setting, evidence, SAME_FEEDFORWARD * self.ranges.smallest_answer):
+            return Redesign(None, gap, "the verified setting is in force already", certificate=found)
+        redesign = _redesign(found, region.noise, gap, "")
         return replace(redesign, to_verify=region) if verifier.provisional else redesign
 
     def _too_wide(self, region: Region) -> str:
