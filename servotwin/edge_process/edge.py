@@ -222,7 +222,7 @@ def _gains(law: AnyController | None) -> dict[str, Value]:
         return {}
     if isinstance(law, LinearLaw):
         gains = msgspec.structs.asdict(gains_of(law))
-        return {"feedforward_v" if name == "feedforward" else name: float(value) for name, value in gains.items()}
+        return {"feedforward_v" if name == "feedforward" else name: value for name, value in gains.items()}
     if isinstance(law, Cascade):
         return written_gains(gains_of(law), law)
     return {
