@@ -28,7 +28,7 @@ def machine_series(connection: sa.Connection, servo: str, limit: int, before: in
     """Read the gaps of a servo's newest windows (or of those before an id), what was decided, and its model's facts."""
     found = overview.gaps(connection, servo, limit, before)
     decided = overview.decisions(connection, servo, _DECISIONS)
-    key = _context((one for each in reversed(found) for one in each.evidence)) or _context(
+    key = _context(one for each in reversed(found) for one in each.evidence) or _context(
         # The newest windows may all wait to be processed.
         overview.evidence_of_kinds(connection, servo, ("estimate",), 1)
     )
