@@ -256,7 +256,9 @@ def _sent_update(update: JsonObject, units: Units) -> str:
         parts += [f"friction feedforward {units.of_command(friction)}"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     law = setting.get("law") or {}
-    numbers = [units.of_gain(Cascade, name, value) for name, value in law.items() if _is_number(value) and value]
+    # A share of 0 says that nothing of a linear law integrates; other zeros are what is not there.
+    named = {name: value for name, value in law.items() if _is_number(value) and (value or name == "integral_share")}
+    numbers = [units.of_gain(Cascade, name, value) for name, value in named.items()]
     parts += [", ".join(numbers)] if numbers else []
     if verification:
         parts.append(f"verified on {verification['members']} simulated machines")

@@ -14,6 +14,7 @@ from servotwin.config.own_units import COMMANDS, POSITIONS, OwnUnits
 from servotwin.config.reference import TableSpec, in_units, markdown, schema
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
+from servotwin.control.linear_law_file import matrices_law
 from servotwin.cosim import scenario_file as tables
 from servotwin.cosim.scenario import Scenario
 from servotwin.drives.simulated.settings import MachineSettings
@@ -26,7 +27,7 @@ from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.config_file import LAWS, update_gains_table
 from servotwin.estimation.gap import METHODS
 from servotwin.link.simulated import LinkSettings
-from servotwin.messages import Gains
+from servotwin.messages import CascadeGains, Gains, LinearGains
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
 from servotwin.plant.actuator import ACTUATORS
 from servotwin.plant.axis_file import LOADS, TRANSMISSIONS, units_of
@@ -52,27 +53,29 @@ of a speed `rad_per_s` and `speed`, of an angle `rad` and `angle`; of a rotary a
 """
 
 
-_GAINS = Gains.__struct_fields__
+_LAWS = (Controller, Cascade, matrices_law)
+_GAINS = tuple({name: None for kind in (Gains, CascadeGains, LinearGains) for name in kind.__struct_fields__})
 _CHANGED = TableSpec((Controller,), "Changes of the servo's own controller.", partial=True)
-_FALLBACK_HELP = "Setting that the edge falls back to; gains that are left out are those of the controller."
-_FALLBACK_KEYS = ("tolerance", "band", "silence_s", "refuse_s", *_GAINS)
-_SCENARIO_FALLBACK = TableSpec(
-    (setting_table, FallbackSet, Controller), _FALLBACK_HELP, only=_FALLBACK_KEYS, partial=True
+_FALLBACK_HELP = (
+    "Setting that the edge falls back to; gains that are left out are those of the controller, and it has those of "
+    "its own kind only."
 )
+_FALLBACK_KEYS = ("tolerance", "band", "silence_s", "refuse_s", *_GAINS)
+_SCENARIO_FALLBACK = TableSpec((setting_table, FallbackSet, *_LAWS), _FALLBACK_HELP, only=_FALLBACK_KEYS, partial=True)
 _EDGE_FALLBACK = TableSpec(
-    (setting_table, FallbackSet, Controller, gains_stay_table),
+    (setting_table, FallbackSet, *_LAWS, gains_stay_table),
     _FALLBACK_HELP,
     only=("gains_stay", *_FALLBACK_KEYS),
     partial=True,
 )
 _START = TableSpec(
-    (setting_table, start_table, Controller),
+    (setting_table, start_table, *_LAWS),
     "Parameters before the first update.",
     only=("tolerance", "band", "fallback", *_GAINS),
     partial=True,
 )
 _OWN = TableSpec(
-    (Controller, gains_stay_table),
+    (*_LAWS, gains_stay_table),
     "Gains in the middle of the box that updates must stay in; the controller's where absent.",
     only=("gains_stay", *_GAINS),
     partial=True,

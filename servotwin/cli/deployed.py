@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from servotwin.errors import InvalidInput
+
 _Config = Annotated[Path, typer.Option("--config", "--twin", help="The twin's file.")]
 
 
@@ -47,10 +49,11 @@ class TwinAction(StrEnum):
 
 def twin(
     action: Annotated[
-        TwinAction | None,
+        str | None,
         typer.Argument(
+            metavar="check|test-alarm",
             help="Instead of serving. check: check the whole store, even while the twin runs. "
-            "test-alarm: post a test to the webhook in the file's table service.webhook. --config names the file."
+            "test-alarm: post a test to the webhook in the file's table service.webhook. --config names the file.",
         ),
     ] = None,
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
@@ -59,12 +62,17 @@ def twin(
     ] = None,
 ) -> None:
     """Run the twin as a service: it receives windows, stores estimates and sends updates."""
-    if action is TwinAction.CHECK:
+    if action is not None and action not in list(TwinAction):
+        raise InvalidInput(
+            f"servotwin twin {action}: the argument says what to do instead of serving ({', '.join(TwinAction)}); the "
+            "twin's file is given with --config"
+        )
+    if action == TwinAction.CHECK:
         from servotwin.cli.check import check_store
 
         check_store(config)
         return
-    if action is TwinAction.ALARM:
+    if action == TwinAction.ALARM:
         from servotwin.cli.alarm_test import post_test_alarm
 
         post_test_alarm(config)
@@ -115,7 +123,6 @@ def enroll(
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the edge checks the twin's.")] = None,
 ) -> None:
     """Enroll a servo: write its token and a folder with everything that its edge needs."""
-    from servotwin.errors import InvalidInput
     from servotwin.up import enrolment
     from servotwin.up.bulk_enrolment import enroll_all, read_enrolments
 

@@ -86,10 +86,12 @@ def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guardi
 def supervision_of(servo: Plant, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
     """Supervision of a servo in its own seconds and volts; errors count from a tenth of the smallest stated step on.
 
-    The command of a stepper is its position and no evidence.
+    The command of a stepper is its position and no evidence. Friction holds an axis at rest under any command up to its
+    own, and settings that were not simulated predict none: then only larger ones are evidence.
     """
     usual, period = WatchSettings(), Supervision().period_s
     second, _, volt = scales(servo)
+    held = 0.0 if settings.policy == "certified" else float(servo.command_of(servo.own_friction))
     watch = dataclasses.replace(
         usual,
         slot_s=usual.slot_s * second,
@@ -97,7 +99,7 @@ def supervision_of(servo: Plant, settings: TwinSettings, fallback: FallbackSet) 
         settling_s=usual.settling_s * second,
         persist_s=usual.persist_s * second,
         error_floor=settings.uncertainty.step[0] / _ERROR_FLOORS,
-        effort_floor=math.inf if holds_position(servo) else usual.effort_floor * volt,
+        effort_floor=math.inf if holds_position(servo) else usual.effort_floor * volt + held,
     )
     return Supervision(fallback, watch, period * second)
 

@@ -54,7 +54,12 @@ class TableSpec:
     def items(self) -> tuple[Item, ...]:
         """The attributes with a key in this table or in an inner one."""
         items = (item for maker in self.makers for item in items_of(maker) if item.key.in_file)
-        return tuple(self._named(item) for item in items if self.only is None or item.name in self.only)
+        named = (self._named(item) for item in items if self.only is None or item.name in self.only)
+        # The first of those who declare the same key describes it.
+        first: dict[tuple[str, str], Item] = {}
+        for item in named:
+            first.setdefault((item.key.table, item.exact_name), item)
+        return tuple(first.values())
 
     def _named(self, item: Item) -> Item:
         if not self.units:

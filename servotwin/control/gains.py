@@ -1,6 +1,6 @@
 """Gains: the numbers of a law, of each kind, that the twin may set; they cross the link."""
 
-from typing import overload
+from typing import Any, overload
 
 import msgspec
 
@@ -10,10 +10,13 @@ from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
+from servotwin.control.linear_law_file import matrices_law
 from servotwin.errors import InvalidInput
 from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains
 
 _KINDS: dict[type, type[AnyGains]] = {Controller: Gains, Cascade: CascadeGains, LinearLaw: LinearGains}
+# Declares the keys of a law that is no settings class.
+_MAKERS: dict[type, Any] = {LinearLaw: matrices_law}
 # What a cascade lacks is None, and 0 in its gains.
 _MAY_LACK = ("velocity_gain", "integral_time", "notch_hz")
 
@@ -71,14 +74,16 @@ def holds(controller: AnyController, gains: AnyGains | None) -> bool:
 
 def read_gains(table: Table, running: AnyController) -> AnyGains:
     """The gains that a table gives, with those of the running controller for the others."""
-    if isinstance(running, LinearLaw):
-        return gains_of(running)
-    return gains_of(running.replace(**changes(table, type(running), only=settable(type(running)))))
+    return gains_of(running.replace(**_changes(table, type(running))))
 
 
 def has_gains(table: Table, kind: type = Controller) -> bool:
     """True when a table gives any gain."""
-    return kind is not LinearLaw and bool(changes(table, kind, only=settable(kind)))
+    return bool(_changes(table, kind))
+
+
+def _changes(table: Table, kind: type) -> Values:
+    return changes(table, _MAKERS.get(kind, kind), only=settable(kind))
 
 
 def written_gains(gains: AnyGains, running: AnyController | None = None) -> Values:
@@ -87,17 +92,15 @@ def written_gains(gains: AnyGains, running: AnyController | None = None) -> Valu
     Raises
     ------
     InvalidInput
-        The gains are those of a linear law, or not those of the running law.
+        The gains are not those of the running law.
     """
     if isinstance(gains, Gains):
         written: AnyController = Controller(**msgspec.structs.asdict(gains))
     else:
-        if isinstance(gains, LinearGains):
-            raise InvalidInput(f"gains = {gains!r}: no table of an edge's file holds them")
         if running is None:
             raise InvalidInput(f"gains = {gains!r}: must come with the law that they belong to")
         written = with_gains(running, gains)
-    values = values_of(written, only=settable(type(written)))
+    values = values_of(written, _MAKERS.get(type(written)), only=settable(type(written)))
     # Where nothing is said of them, a reader takes those of the running law.
     lacking = {"integral_time_s": 0.0, "notch_hz": 0.0} if isinstance(written, Cascade) else {}
     return {**lacking, **values}

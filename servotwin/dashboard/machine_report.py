@@ -115,6 +115,9 @@ def _updates(traces: Iterable[Trace], factor: float) -> list[tuple[str, ...]]:
     return [_update(trace, step, factor) for trace, step in steps]
 
 
+_REFUSED = "refused it"
+
+
 def _update(trace: Trace, step: Trace, factor: float) -> tuple[str, ...]:
     update = step["update"]
     body = update["body"] or {}
@@ -128,7 +131,7 @@ def _update(trace: Trace, step: Trace, factor: float) -> tuple[str, ...]:
         _brief(tolerance * factor) if tolerance else "none",
         f"{verification['members']} simulated machines" if verification else "not simulated",
         _answer(step),
-        _effect(step["effect"], factor),
+        "" if _answer(step).startswith(_REFUSED) else _effect(step["effect"], factor),
     )
 
 
@@ -139,7 +142,7 @@ def _answer(step: Trace) -> str:
     if "receipt" not in answers:
         return "has not answered yet"
     receipt = answers["receipt"]
-    return "applied it" if (receipt["body"] or {}).get("applied") else f"refused it: {receipt['status']}"
+    return "applied it" if (receipt["body"] or {}).get("applied") else f"{_REFUSED}: {receipt['status']}"
 
 
 def _effect(effect: Trace | None, factor: float) -> str:

@@ -28,7 +28,10 @@ def machine_series(connection: sa.Connection, servo: str, limit: int, before: in
     """Read the gaps of a servo's newest windows (or of those before an id), what was decided, and its model's facts."""
     found = overview.gaps(connection, servo, limit, before)
     decided = overview.decisions(connection, servo, _DECISIONS)
-    key = next((one.context for each in reversed(found) for one in each.evidence if one.context), "")
+    key = _context(one for each in reversed(found) for one in each.evidence) or _context(
+        # The newest windows may all wait to be processed.
+        overview.evidence_of_kinds(connection, servo, ("estimate",), 1)
+    )
     context = queries.contexts(connection, [key]).get(key)
     return {
         "servo": servo,
@@ -38,6 +41,11 @@ def machine_series(connection: sa.Connection, servo: str, limit: int, before: in
         "fallbacks": fallbacks(decided),
         "machine": UNKNOWN if context is None else machine_facts(context),
     }
+
+
+def _context(records: Iterable[StoredEvidence]) -> str:
+    """Key of the first context that evidence names; empty: none."""
+    return next((record.context for record in records if record.context), "")
 
 
 def gap_series(windows: Iterable[WindowGap]) -> dict[str, list[Any]]:

@@ -221,7 +221,8 @@ def _gains(law: AnyController | None) -> dict[str, Value]:
     if law is None:
         return {}
     if isinstance(law, LinearLaw):
-        return {name: float(value) for name, value in msgspec.structs.asdict(gains_of(law)).items()}
+        gains = msgspec.structs.asdict(gains_of(law))
+        return {"feedforward_v" if name == "feedforward" else name: value for name, value in gains.items()}
     if isinstance(law, Cascade):
         return written_gains(gains_of(law), law)
     return {

@@ -19,10 +19,12 @@ _HELD_CHANGES, _HELD = 50, 0.9  # changes of a channel that is held, and share o
 MEASURED = ("motor", "load")
 """Channels that encoders measure; commands and references are held on purpose."""
 _STEPS = (0.1, 0.9)  # quantiles of its steps, which differ
+_SLOWER = 0.95  # share of a slower channel's samples that follow the one before after equally many rows
 
 
 OUT_OF_ORDER, SAME_TIME = "samples out of order in time", "samples at the time of the one before"
 REPEATED = "samples that repeat the one before in every column"
+BETWEEN = "rows between the samples of a slower channel"
 """Names of defects."""
 
 
@@ -74,6 +76,13 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
             found[defect] = int(np.sum(~kept))
             table = table[kept]
 
+    slowest, turned = _of_slowest(table[:, 1:]), dict[str, int]()
+    if not slowest.all():
+        for place, name in enumerate(names, 1):
+            if name in turns and np.isfinite(table[:, place]).all():
+                # Between two samples of the slower one an angle may make more than half a turn.
+                table[:, place], turned[name] = unwrapped(table[:, place], turns[name])
+        keep(slowest, BETWEEN)
     keep(np.isfinite(table.sum(axis=1)), "samples without a number in some column")
     if first:
         keep(~_long_before(table[:, 0]), "stale samples, long before all others")
@@ -88,7 +97,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
         if name in turns:
             table[:, place], count, lost = _turned_on(name, table[:, 0], table[:, place], turns[name])
             parted += lost
-            if count:
+            if count := count + turned.get(name, 0):
                 found[unwrapped_turns(name)] = count
     for place, name in enumerate(names, 1):
         # A command may have pulses, such as the kick of a derivative: what is left out need not be wrong.
@@ -105,6 +114,18 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
     if gaps := pauses(table[:, 0]):
         found["pauses longer than five intervals"] = len(gaps)
     return Cleaned(table[:, 0], {name: table[:, place] for place, name in enumerate(names, 1)}, found, parted)
+
+
+def _of_slowest(channels: Array) -> _Mask:
+    """True for the rows in which the channels with samples in every k-th row only have one."""
+    result = np.ones(len(channels), dtype=np.bool_)
+    for values in channels.T:
+        known = np.isfinite(values)
+        apart = np.diff(np.flatnonzero(known))
+        usual = int(np.median(apart)) if apart.size else 1
+        if usual > 1 and np.mean(apart == usual) >= _SLOWER:
+            result &= known
+    return result if result.any() else np.ones_like(result)
 
 
 def _turned_on(name: str, time: Array, angle: Array, turn: float) -> tuple[Array, int, list[float]]:

@@ -13,7 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.strokes import resolution
 from servotwin.estimation.kinematic.travel import ANGLES
-from servotwin.logs.cleaning import OUT_OF_ORDER, REPEATED, SAME_TIME, Cleaned
+from servotwin.logs.cleaning import BETWEEN, OUT_OF_ORDER, REPEATED, SAME_TIME, Cleaned
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
@@ -197,7 +197,7 @@ def _check_left(path: Path, clean: Cleaned, size: int, damaged: Mapping[str, str
         raise InvalidInput(f"log {path}: holds no row of numbers below the names of its columns")
     if left == 1 and clean.found.get(SAME_TIME, 0) > _LEFT * size:
         raise InvalidInput(f"log {path}: its {size} samples have one time stamp: give --rate in Hz")
-    whole = size - sum(clean.found.get(defect, 0) for defect in (THINNED, PARTED, REPEATED))
+    whole = size - sum(clean.found.get(defect, 0) for defect in (THINNED, PARTED, REPEATED, BETWEEN))
     if left >= max(_LEAST, _LEFT * whole):
         return
     what = "; ".join(f"{defect}: {count}" for defect, count in clean.found.items()) or "the log is short"

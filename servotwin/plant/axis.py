@@ -88,6 +88,7 @@ class Axis:
     def __post_init__(self) -> None:
         check_kinds({name: getattr(self, name) for name in PARTS})
         check_fit(self.actuator, self.transmission, self.load, self.controller)
+        check_encoders(self, law_of(self.controller))
 
     @classmethod
     def preset(cls, name: str) -> Axis:

@@ -247,7 +247,8 @@ def _transmission_values(transmission: Transmission, kind: str) -> Values:
     if kind == "screw":
         return values_of(transmission, screw)
     near = 1.0 / transmission.p
-    close = (near, math.nextafter(near, math.inf), math.nextafter(near, 0.0))
+    # A ratio of 105 is not written as 104.99999999999999.
+    close = (float(f"{near:.15g}"), near, math.nextafter(near, math.inf), math.nextafter(near, 0.0))
     ratio = next((each for each in close if 1.0 / each == transmission.p), None)
     turns = {"travel_rad_per_rad": transmission.p} if ratio is None else {"ratio": ratio}
     return {**turns, **values_of(transmission, gear, only=("k_d", "c_d", "in_gap"))}

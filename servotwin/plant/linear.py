@@ -96,12 +96,14 @@ class LinearSystem:
     @cached_property
     def _schur(self) -> tuple[Complex, Complex, Complex]:
         """Schur form of the balanced A, with B and C in its states."""
-        from scipy.linalg import matrix_balance, schur, solve
+        from scipy.linalg import matrix_balance, schur
 
         # Balanced, because the entries of a stiff chain differ by many powers of ten.
         balanced, scaling = matrix_balance(self.A)
         triangular, unitary = schur(balanced, output="complex")
-        return triangular, unitary.conj().T @ solve(scaling, self.B), (self.C @ scaling) @ unitary
+        # One number in each row and column, however far apart they are.
+        back = np.divide(1.0, scaling.T, out=np.zeros_like(scaling), where=scaling.T != 0.0)
+        return triangular, unitary.conj().T @ (back @ self.B), (self.C @ scaling) @ unitary
 
     def zeros(self) -> Complex:
         """(K,) zeros, 1/s, the roots of the numerator; none where it overflows."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
+from servotwin.messages import Reason
 from servotwin.store.records import (
     Backlog,
     MessageKind,
@@ -23,6 +24,7 @@ from servotwin.store.schema import contexts as context_table
 
 _ESTIMATES = ("glance", "estimate")
 _ANSWERS = ("receipt", "fallback")
+_APPLIED = Reason.APPLIED.value
 _EVENTS = ("hello", "fallback", "answer", "act")
 """Kinds of evidence that an edge reports by itself, not about a window, and acts of engineers."""
 _WINDOW_COLUMNS = tuple(messages.c[name] for name in StoredWindow._fields)
@@ -165,7 +167,9 @@ def _update_trace(update: StoredEvidence, rows: list[Any], before: StoredEvidenc
     matching = [row for row in rows if row[_WIDTH] == update.id]
     answers = {each.id: each for row in matching if (each := _evidence(row, _WIDTH + _EVIDENCE_WIDTH)) is not None}
     after = _evidence(matching[0], _WIDTH + 2 * _EVIDENCE_WIDTH)
-    if after is None:
+    # A fallback may have taken the number of an update that came too late: what follows is not the update's effect.
+    refused = bool(answers) and all(each.kind == "receipt" and each.status != _APPLIED for each in answers.values())
+    if after is None or refused:
         return UpdateTrace(update, tuple(answers.values()), None)
     window = StoredWindow(*matching[0][_WIDTH + 3 * _EVIDENCE_WIDTH :])
     return UpdateTrace(update, tuple(answers.values()), UpdateEffect(window, before, after))

@@ -197,6 +197,15 @@ def test_an_update_of_a_cascade_shows_its_numbers() -> None:
     )
 
 
+def test_an_update_of_a_linear_law_says_that_nothing_integrates() -> None:
+    law = {"type": "linear", "gain": 0.6, "integral_share": 0.0, "feedforward": 0.02}
+    update = {"version": 5, "body": {"setting": {"tolerance": 0.0, "law": law}}}
+    units = Units.of({"travel_unit": "rad", "command_unit": "N m"})
+    assert _sent_update(update, units) == (
+        "version 5 sent: no dead zone, gain 0.6, integral_share 0, feedforward 0.02 N m"
+    )
+
+
 def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
     """Its position is in rad, its command in N m; a servo of which nothing is known is a linear one on volts."""
     units = Units.of({"travel_unit": "rad", "command_unit": "N m"})

@@ -99,7 +99,7 @@ def test_a_user_error_is_one_sentence_and_exit_code_2(scenario, monkeypatch, arg
         (("map", "--worker", "2"), "map: no such option: --worker (did you mean --workers?)"),
         (("map", "paper", "other"), "(other)"),
         (("map", "--members", "many"), "invalid value for '--members'"),
-        (("twin", "twin.toml"), "invalid value for 'action': 'twin.toml' is not one of 'check', 'test-alarm'"),
+        (("twin", "twin.toml"), "instead of serving (check, test-alarm); the twin's file is given with --config"),
         (("map", "--workers", "0"), "greater than or equal to 1"),
         (("map", "--out"), "'--out' requires an argument"),
         (("simulate",), "simulate: missing argument 'scenario'; see "),

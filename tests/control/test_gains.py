@@ -5,9 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.config.table import parse_toml
+from servotwin.config.toml import dumps
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.gains import gains_of, holds, with_gains, written_gains
+from servotwin.control.gains import gains_of, has_gains, holds, read_gains, with_gains, written_gains
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates, scaled, static_gain, without_integral
 from servotwin.control.running_law import RunningLaw, command_of
@@ -76,16 +78,18 @@ def test_a_cascade_cannot_hold_an_integral_without_a_velocity_loop_nor_a_notch_b
     assert not holds(CASCADE, msgspec.structs.replace(gains, notch_hz=500.0))
 
 
-@pytest.mark.parametrize(
-    ("law", "gains", "words"),
-    [
-        (LINEAR, gains_of(LINEAR), "no table of an edge.s"),
-        (None, gains_of(CASCADE), "with the law that they belong to"),
-    ],
-)
-def test_gains_that_no_table_holds_are_refused(law: AnyController | None, gains: AnyGains, words: str) -> None:
-    with pytest.raises(InvalidInput, match=words):
-        written_gains(gains, law)
+def test_gains_of_a_cascade_alone_are_refused() -> None:
+    with pytest.raises(InvalidInput, match="with the law that they belong to"):
+        written_gains(gains_of(CASCADE))
+
+
+def test_gains_of_a_linear_law_read_back_as_they_were_written() -> None:
+    """An edge whose fallback set is not its own law could not be enrolled."""
+    gains = LinearGains(gain=0.6, integral_share=0.0, enter=0.5, leave=1.5, feedforward=0.25, integral_only=False)
+    table = parse_toml(dumps(written_gains(gains, LINEAR)), "edge.toml")
+    assert has_gains(table, type(LINEAR))
+    assert read_gains(table, LINEAR) == gains
+    table.done()
 
 
 @pytest.mark.parametrize("share", [0.0, 0.4, 1.0])

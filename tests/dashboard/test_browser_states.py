@@ -75,6 +75,16 @@ def test_every_gain_of_an_update_has_its_unit(open_page):
     assert re.search(r"dead zone [\d.]+ mm; Kp \S+ V/m, Ki \S+ V/\(m s\), Kd \S+ V s/m", setting)
 
 
+def test_gains_of_every_law_are_shown_with_their_units(open_page):
+    page = open_page()
+    text = """([law]) => import("/static/updates.js").then((updates) => updates.settingText(
+        { tolerance: 0, law }, { factor: 1, name: "deg" }, { command_unit: "N m", travel_unit: "rad" }))"""
+    linear = {"type": "linear", "gain": 0.6, "integral_share": 0.0, "feedforward": 0.02}
+    assert page.evaluate(text, [linear]) == "no dead zone; gain 0.600, integral share 0; feedforward 0.0200 N m"
+    cascade = {"type": "cascade", "position_gain": 20.0, "velocity_gain": 3.0, "integral_time": 0.0, "feedforward": 0.0}
+    assert page.evaluate(text, [cascade]) == "no dead zone; position gain 20.0 1/s, velocity gain 3.00 N m s/rad"
+
+
 def test_a_list_on_the_screen_keeps_its_height_while_rows_come(open_page):
     page = open_page()
     rows = """async (count) => {

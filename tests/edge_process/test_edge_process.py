@@ -18,6 +18,7 @@ from stubmachine import StubMachine
 from waiting import until
 
 from servotwin.control.cascade import Cascade
+from servotwin.control.linear_law import LinearLaw
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge_process.config import TwinLink
 from servotwin.edge_process.config_file import edge_toml
@@ -120,6 +121,18 @@ def test_the_status_counts_in_the_units_of_the_machine(edge: RunningEdge) -> Non
     )  # fmt: skip
     assert not {"tolerance_m", "velocity_gain"} & status.keys()
     assert '"tolerance_rad":0.0' in edge.log().replace(" ", "")
+
+
+@pytest.mark.slow
+def test_the_status_of_a_linear_law_counts_in_the_units_of_the_machine(edge: RunningEdge) -> None:
+    law = LinearLaw((), (), (), (2.0, 0.0, -2.0), feedforward=0.3, sample_rate=RATE)
+    edge.write(controller=law, command_unit="N m", position_unit="rad", twin=None)
+    edge.start()
+    until(lambda: edge.status().get("samples", 0) > 0)
+    assert edge.signal(signal.SIGTERM) == 0
+    status = edge.status()
+    assert (status["feedforward_n_m"], status["gain"], status["integral_share"]) == (0.3, 1.0, 1.0)
+    assert "feedforward" not in status
 
 
 @pytest.mark.slow

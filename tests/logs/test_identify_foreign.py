@@ -56,6 +56,13 @@ def test_a_bad_log_is_one_sentence(tmp_path, made, kind):
     assert re.search(message, result.stderr)
 
 
+def test_a_motor_in_counts_is_told_to_leave_the_lead_out(tmp_path, made):
+    path = csv(tmp_path / "log.csv", rows(made), "t [s],motor [counts],load [mm]")
+    result = CliRunner().invoke(app, ["identify", str(path), "--lead-mm", "5"])
+    assert "motor in 'counts': with --lead-mm give --motor-unit" in result.stderr
+    assert "of counts, leave --lead-mm out: the travel per count is fitted" in result.stderr
+
+
 def test_identify_from_a_log_to_json(tmp_path, made):
     path = csv(tmp_path / "log.csv", rows(made), "t [s],motor [rad],load [mm]")
     result = CliRunner().invoke(app, ["identify", str(path), "--json"])

@@ -254,6 +254,26 @@ def test_two_encoders_on_a_slow_bus_show_the_lost_motion(tmp_path):
     assert found.lag == pytest.approx(2e-3, abs=2e-4)
 
 
+def test_a_load_that_is_sampled_less_often_leaves_its_cells_empty(tmp_path):
+    """Two sampling rates in one table; the motor turns by 0.6 turns between two samples of the load."""
+    made = recording(gap=GAP, seconds=12.0, rate=1000.0)
+    motor = 20.0 * made.motor
+    step = np.max(np.abs(motor[12:] - motor[:-12]))
+    turn = step / 0.6
+    table = rows(replace(made, motor=np.mod(motor, turn) * (2.0 * np.pi / turn)))
+    lines = [list(map(str, row)) for row in table]
+    for number, line in enumerate(lines):
+        if number % 12 and number > 0:
+            line[2] = ""
+    path = tmp_path / "log.csv"
+    path.write_text("t [s],motor [rad],load [mm]\n" + "".join(",".join(line) + "\n" for line in lines))
+    log = read_recording(path, RecordingColumns())
+    assert log.found["rows between the samples of a slower channel"] == made.time.size - log.recording.time.size
+    assert np.allclose(log.recording.load, made.load[::12])
+    moved = log.recording.motor * turn / (2.0 * np.pi) - motor[::12]
+    assert np.ptp(moved) < 1e-6
+
+
 def test_an_encoder_of_few_counts_is_not_taken_for_one_that_is_held(made):
     load = np.round(made.load / 0.02) * 0.02
     found = cleaned(made.time, {"motor": made.motor, "load": load}, {})

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.signal import TransferFunction
 
 import servotwin as st
 from benchmarks.workloads import knocking_drive
@@ -31,6 +32,20 @@ def cascade(**changes: object) -> st.Cascade:
         (lambda: TWO_MASS.replace(controller=cascade(velocity_gain=None)), "velocity_gain = None: is missing"),
         (lambda: TWO_MASS.replace(controller=cascade(ratio=5.0)), "ratio = 5.0: the transmission's travel"),
         (lambda: STEPPER.replace(controller=cascade(ratio=STEPPER.p)), "a stepper goes to its commanded angle"),
+        (
+            lambda: BALL_SCREW.replace(
+                transmission=st.Transmission(BALL_SCREW.p, 5e7, 0.0, "held"),
+                actuator=st.TorqueDrive(J=1e-4, coulomb=0.1),
+            ),
+            "coulomb_friction_n_m = 0.1 N m: an elastic transmission that is held in the gap",
+        ),
+        (
+            lambda: TWO_MASS.replace(
+                controller=st.LinearLaw.from_system(TransferFunction([1.0], [1.0, 1.0])),
+                sensors=st.Sensors(feedback="motor"),
+            ),
+            "the controller reads y_load, the load's encoder",
+        ),
         (lambda: Axis.preset("telescope").replace(controller=cascade(ratio=5e-4)), "must be absent: the drive closes"),
         (
             lambda: TWO_MASS.replace(
@@ -74,6 +89,12 @@ def test_what_does_not_fit_is_refused_in_a_sentence(make: object, words: str) ->
     with pytest.raises(InvalidInput, match=words) as error:
         make()  # type: ignore[operator]
     assert "\n" not in str(error.value)
+
+
+def test_the_joint_estimator_names_the_one_for_axes() -> None:
+    window = st.Window(np.zeros(400), np.zeros(400), sample_rate=1000.0)
+    with pytest.raises(InvalidInput, match="this is an axis made of parts; estimate_gap fits the shaft"):
+        st.estimate_jointly(window, BALL_SCREW)  # type: ignore[arg-type]
 
 
 def test_a_version_does_not_depend_on_how_a_number_is_typed() -> None:

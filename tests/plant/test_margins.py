@@ -229,3 +229,14 @@ def test_the_sensitivity_peak_alone_is_that_of_all_margins(preset):
     assert sensitivity_peak(servo.loop(), servo.closed_loop()) == servo.margins().Ms
     unstable = servo.replace(Kp=1e3 * servo.controller.Kp)
     assert sensitivity_peak(unstable.loop(), unstable.closed_loop()) == math.inf
+
+
+def test_states_in_units_many_powers_of_ten_apart_give_the_response_without_a_word() -> None:
+    """An axis of nanometres in hours; scipy warned of what is an exact division by powers of two."""
+    near = np.array([[-1.0, 2.0, 0.5], [0.3, -2.0, 1.0], [0.2, 0.7, -3.0]])
+    units = np.array([1.0, 1e12, 1e-12])
+    far = near * units[:, None] / units
+    B, C, unknown = units * np.array([1.0, 0.0, 1.0]), np.array([0.0, 1.0, 1.0]) / units, np.full(4, np.inf)
+    omega = np.geomspace(0.1, 10.0, 7)
+    wanted = [C @ (units * np.linalg.solve(1j * w * np.eye(3) - near, B / units)) for w in omega]
+    np.testing.assert_allclose(LinearSystem(far, B, C, 0.0, unknown, unknown).response(omega), wanted, rtol=1e-12)

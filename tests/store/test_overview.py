@@ -1,8 +1,10 @@
 """Queries of the dashboard."""
 
+import msgspec
 import pytest
 from store_cases import claim, letter, outcome, window
 
+from servotwin.dashboard.series import machine_series
 from servotwin.store import overview
 from servotwin.store.overview import StorePosition
 from servotwin.store.records import EvidenceRecord
@@ -97,6 +99,19 @@ def test_gaps_come_oldest_first_with_their_evidence(filled):
     assert [record.body for record in newest[0].evidence] == [b"", b"", b""]
     before = filled.reading(lambda c: overview.gaps(c, "a", 10, before=found[1].window.id))
     assert [each.window.sequence for each in before] == [1]
+
+
+def test_the_machine_is_known_while_its_newest_window_waits(store):
+    """`servotwin audit` showed a rotary machine that is behind in um and V."""
+    axis = '[actuator]\nkind = "torque"\n[load]\nkind = "rotary"\n[transmission]\nratio = 2.0\n'
+    context = msgspec.json.encode({"model.axis": repr(axis)}).decode()
+    store.put([window("a", 1)])
+    (lease,) = claim(store, servo="a")
+    found = EvidenceRecord("estimate", lease.messages[0].id, b"", 0, 0.1, 0.01, "ok", context="here")
+    store.commit([outcome(lease, found, contexts=(("here", context),))], 300.0)
+    store.put([window("a", 2)])
+    machine = store.reading(lambda connection: machine_series(connection, "a", 1))["machine"]
+    assert (machine.travel_unit, machine.command_unit, machine.travel) == ("rad", "N m", 0.5)
 
 
 def test_decisions_are_in_order(filled):

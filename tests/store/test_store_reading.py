@@ -4,6 +4,7 @@ import pytest
 import sqlalchemy as sa
 from store_cases import NewAddress, bodies_of, claim, letter, outcome, verification, window
 
+from servotwin.messages import Reason
 from servotwin.store.records import Backlog, EvidenceRecord, MessageKind, OutgoingMessage
 from servotwin.store.store import Store, open_store
 
@@ -135,6 +136,18 @@ def test_the_evidence_chain(store: Store) -> None:
     assert [link.window.sequence for link in store.audit("a", limit=1)] == [4]
     assert [link.window.sequence for link in store.audit("a", before=acted.window.id)] == [1]
     assert store.audit("a", since=100.5) == store.audit("nobody") == []
+
+
+def test_a_refused_update_has_no_effect_although_a_fallback_took_its_number(store: Store) -> None:
+    store.put([window(sequence=1)])
+    estimate = EvidenceRecord("estimate", 0, b"e1", version=0, gap=0.2, std=0.01, status="ok", tail=8e-4)
+    process(store, estimate, EvidenceRecord("update", 0, b"u", version=1))
+    store.put([letter(body=b"receipt")])
+    process(store, EvidenceRecord("receipt", 0, b"r", version=1, status=Reason.OLD_VERSION.value))
+    store.put([window(sequence=2)])
+    process(store, EvidenceRecord("glance", 0, b"g2", version=1, gap=0.2, status="calm", tail=1e-3))
+    (step,) = store.audit("a")[1].steps
+    assert (step.answers[0].status, step.effect) == ("version not newer than the one in force", None)
 
 
 def test_a_window_that_is_not_yet_processed_is_in_the_chain(store: Store) -> None:

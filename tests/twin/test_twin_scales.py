@@ -97,6 +97,17 @@ def test_the_command_of_a_stepper_is_no_evidence() -> None:
     assert found.effort_floor == math.inf
 
 
+def test_a_command_that_friction_holds_is_no_evidence_against_settings_that_predict_none() -> None:
+    """A joint at rest under the integral of its own law fell back again and again."""
+    joint, fallback = Axis.preset("robot-joint"), FallbackSet(Setting(1e-6))
+    verified, ruled = (
+        supervision_of(joint, TwinSettings(policy=policy), fallback).watch for policy in ("certified", "hysteresis")
+    )
+    assert verified is not None
+    assert ruled is not None
+    assert ruled.effort_floor - verified.effort_floor == pytest.approx(0.4)  # N m of its motor's friction
+
+
 def test_what_a_file_states_counts() -> None:
     stated = replace(
         SETTINGS,

@@ -32,7 +32,7 @@ function row(trace, step, unit, machine) {
     cell(String(step.update.version), true), cell(stamp(step.update.created), true), cell(`${trace.window.sequence}`, true),
     cell(gapText(body.gap ?? null, half), true), cell(settingText(body.setting ?? {}, unit, machine)),
     cell(verification ? `${verification.members} simulated machines` : "not simulated"),
-    cell(answerText(step)), cell(effectText(step.effect, unit), true));
+    cell(answerText(step)), cell(refused(step) ? "" : effectText(step.effect, unit), true));
 }
 
 // Setting of the version in force: of its update, or as the edge stated it at its start; null: unknown.
@@ -42,19 +42,26 @@ export function settingInForce(traces, events, version) {
   return steps.at(-1)?.update.body?.setting ?? hello?.body?.setting ?? null;
 }
 
-function settingText(setting, unit, { command_unit: command, travel_unit: travel }) {
+// Dead zone and gains of an update, of any law, with their units.
+export function settingText(setting, unit, { command_unit: command, travel_unit: travel }) {
   const parts = [setting.tolerance ? `dead zone ${brief(setting.tolerance * unit.factor)} ${unit.name}` : "no dead zone"];
   const gains = setting.gains ?? {};
   const units = { Kp: `${command}/${travel}`, Ki: `${command}/(${travel} s)`, Kd: `${command} s/${travel}` };
   const named = Object.keys(units).filter((name) => typeof gains[name] === "number");
   if (named.length) parts.push(named.map((name) => `${name} ${brief(gains[name])} ${units[name]}`).join(", "));
-  if (gains.feedforward) parts.push(`feedforward ${brief(gains.feedforward)} ${command}`);
+  const law = setting.law ?? {}, shown = { position_gain: "1/s", velocity_gain: `${command} s/rad`, integral_time: "s", gain: "", integral_share: "" };
+  const numbers = Object.keys(shown).filter((name) => typeof law[name] === "number" && (law[name] || name === "integral_share"));
+  if (numbers.length) parts.push(numbers.map((name) => `${name.replace("_", " ")} ${brief(law[name])} ${shown[name]}`.trim()).join(", "));
+  const fed = gains.feedforward || law.feedforward;
+  if (fed) parts.push(`feedforward ${brief(fed)} ${command}`);
   return parts.join("; ");
 }
 
+const answer = (step, kind) => step.answers.find((one) => one.kind === kind);
+const refused = (step) => !answer(step, "fallback") && answer(step, "receipt")?.body?.applied === false;
+
 function answerText(step) {
-  const receipt = step.answers.find((answer) => answer.kind === "receipt");
-  const fallback = step.answers.find((answer) => answer.kind === "fallback");
+  const receipt = answer(step, "receipt"), fallback = answer(step, "fallback");
   if (fallback) return `left it for its fallback set: ${fallback.status}`;
   if (!receipt) return "has not answered yet";
   return receipt.body?.applied ? "applied it" : `refused it: ${receipt.status}`;

@@ -169,9 +169,14 @@ def estimate_jointly(
     Raises
     ------
     InvalidInput
-        Unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short; an elastic screw; no
-        window at all, or some with theta_m and some without.
+        An axis made of parts; unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short;
+        an elastic screw; no window at all, or some with theta_m and some without.
     """
+    if not isinstance(servo, Servo):
+        raise InvalidInput(
+            "the joint estimator knows the combination of the paper (Servo), and this is an axis made of parts; "
+            "estimate_gap fits the shaft of an axis together with its gap"
+        )
     given = (settings or JointSettings()).on(scales(servo).time)
     windows = _windows(window)
     names = _free(windows[0], free)

@@ -95,7 +95,7 @@ def units_of(recording: EncoderRecording, travel: StatedTravel) -> tuple[float, 
         if unit not in known:
             raise InvalidInput(
                 f"{recording.source}: {part} in {unit!r}: with {travel.said} give --{part}-unit, one of "
-                f"{', '.join(known)}"
+                f"{', '.join(known)}; of counts, leave {travel.said} out: the travel per count is fitted"
             )
     return ANGLES[recording.motor_unit], travel.units[recording.load_unit]
 
