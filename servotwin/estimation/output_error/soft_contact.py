@@ -20,18 +20,20 @@ from servotwin.plant.signals import Array
 
 _LENGTH = 0.25  # of the shaft's largest stretch: way on which it becomes as stiff as farther on
 _DIFFERENCE = 1e-4  # makes a derivative
+_SURE = 2.0  # standard deviations of a change by chance
 
 
 def moved_by_contact(found: Search) -> float:
     """Change of the half gap (m or rad at the load), linearised, if the stiffness at first contact were free.
 
-    Root of the squares of the change and of its standard deviation by noise and rounding.
+    Beyond what noise and rounding make of it.
     """
     problem, whole = found.problem, np.arange(found.best.residual.size)
     if not isinstance(problem, Problem) or not isinstance(problem.model, ShaftModel):
         return 0.0
     (without, *known), (given, *open_) = influence(found, whole), influence(_with_soft_contact(found, problem), whole)
-    return math.hypot(given - without, math.sqrt(max(0.0, math.hypot(*open_) ** 2 - math.hypot(*known) ** 2)))
+    chance = max(0.0, math.hypot(*open_) ** 2 - math.hypot(*known) ** 2)
+    return math.sqrt(max(0.0, (given - without) ** 2 - _SURE**2 * chance))
 
 
 def _with_soft_contact(found: Search, problem: Problem) -> Search:
