@@ -20,7 +20,7 @@ from servotwin.plant.signals import Array
 
 _LENGTH = 0.25  # of the shaft's largest stretch: way on which it becomes as stiff as farther on
 _DIFFERENCE = 1e-4  # makes a derivative
-_SURE = 2.0  # standard deviations of a change by chance
+_SURE = 4.0  # computed standard deviations of a change by chance: two, each twice the computed one as in `verdict`
 
 
 def moved_by_contact(found: Search) -> float:
