@@ -22,6 +22,7 @@ from rich.table import Table
 from benchmarks.batch import Batch
 from benchmarks.log_files import WRITERS, damaged
 from benchmarks.preset_machines import DUTIES
+from servotwin.control.cascade import Cascade
 from servotwin.errors import InvalidInput
 from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
@@ -129,7 +130,9 @@ def _drawn(name: str, seed: tuple[int, ...]) -> LogCase:
     random, model, duty = np.random.default_rng([*seed, 0]), Axis.preset(name), DUTIES[name]
     plant = model.scaled({each: 1.0 + width * random.uniform(-1.0, 1.0) for each, width in _ERRORS.items()})
     if random.random() < 0.5:
-        plant = plant.replace(sensors=replace(plant.sensors, feedback="motor"))
+        law = plant.controller
+        on_motor = replace(law, on="motor") if isinstance(law, Cascade) else law
+        plant = plant.replace(sensors=replace(plant.sensors, feedback="motor"), controller=on_motor)
     healthy = duty.gap / model.p
     count = max(model.sensors.encoder_resolution, model.sensors.position_resolution / model.p)
     kind = random.random()

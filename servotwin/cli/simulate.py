@@ -142,7 +142,9 @@ def _run(scenario: Path) -> tuple[str, Loop]:
     """Read and co-simulate a scenario under a progress bar."""
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.percentage:3.0f} %"))
     console = Console(stderr=True)
-    with Progress(*columns, TimeElapsedColumn(), console=console, transient=True) as progress:
+    with Progress(
+        *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
+    ) as progress:
         bar = progress.add_task("looking for a verified fallback set", total=None)
         text, described = _read(scenario)
         progress.update(bar, description="simulating", total=1.0)
