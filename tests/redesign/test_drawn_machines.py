@@ -1,4 +1,4 @@
-"""Steps up and down: where a bias or a force pushes one way, settings are verified both ways."""
+"""Machines drawn for a verification, and steps up and down where a bias or a force pushes one way."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import confirm
 from servotwin.redesign.certified.demands import Beyond, Demands
-from servotwin.redesign.certified.machines import draw, draw_independently
+from servotwin.redesign.certified.machines import draw, draw_independently, drawn_plants
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty
@@ -32,6 +33,61 @@ KNOWN = Uncertainty(
     friction=(0.95 * SERVO.torque_of(FRICTION), 1.05 * SERVO.torque_of(FRICTION)),
 )
 TRIAL = Trial(20.0, 4.0, 50.0)
+
+
+# --- ranges
+
+
+def test_machines_fill_their_ranges_and_hold_the_corners() -> None:
+    known = Uncertainty(gap=(2.0 * DEG, 8.0 * DEG), input_bias=(-0.1, 0.3), friction=(0.0, 1e-3))
+    members = draw(SERVO, known, 16, 8)
+    assert members.plants[0] == SERVO
+    assert members.count == 128
+    for values, (low, high) in (
+        (members.gap, known.gap),
+        (members.step, known.step),
+        (members.input_bias, known.input_bias),
+        (members.friction, known.friction),
+    ):
+        assert low - 1e-12 <= values.min() < low + 0.1 * (high - low)
+        assert high - 0.1 * (high - low) < values.max() <= high + 1e-12
+    assert np.all(members.gap[:, 0] == known.gap[1])
+    assert np.all(members.input_bias[:, 1] == known.input_bias[0])
+    assert np.all(np.abs(members.theta_d0) <= 0.5 * members.gap)
+
+
+def test_plants_stay_within_the_stated_widths() -> None:
+    plants = drawn_plants(SERVO, Uncertainty(k=0.1, c=0.5, k_B=0.0, m=0.02), 64, 3)
+    ratios = np.array([[p.k / SERVO.k, p.c / SERVO.c, p.k_B / SERVO.k_B, p.m / SERVO.m] for p in plants])
+    assert np.all(np.abs(ratios - 1.0) <= [0.1, 0.5, 1e-15, 0.02])
+    assert np.all(np.abs(ratios - 1.0).max(axis=0)[[0, 1, 3]] > [0.08, 0.4, 0.016])
+
+
+def test_equal_calls_draw_equal_machines() -> None:
+    first, second = (draw(SERVO, Uncertainty(), 8, 4, seed=5) for _ in range(2))
+    assert np.array_equal(first.gap, second.gap)
+    assert first.plants == second.plants
+    assert not np.array_equal(first.gap, draw(SERVO, Uncertainty(), 8, 4, seed=6).gap)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"k": 1.0}, "uncertainty k = 1.0"),
+        ({"gap": (2.0, 1.0)}, "uncertainty gap = \\(2.0, 1.0\\) rad"),
+        ({"step": (0.0, 1e-3)}, "must be two numbers, each a positive number"),
+        ({"input_bias": (0.0, math.inf)}, "input_bias = \\(0.0, inf\\) V"),
+        ({"friction": (-1e-3, 0.0)}, "must be two numbers, each a number, at least 0"),
+    ],
+)
+def test_wrong_ranges_are_named(changes: dict[str, object], words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        Uncertainty(**changes)  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match="no value named 'kk'"):
+        Uncertainty().replace(kk=0.1)
+
+
+# --- directions
 
 
 def voltage_held(direction: float) -> float:
