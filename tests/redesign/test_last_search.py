@@ -14,13 +14,14 @@ from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Setting
+from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as policies
 from servotwin.redesign.certified.certificate import NotVerified
 from servotwin.redesign.certified.demands import Beyond, Demands
-from servotwin.redesign.certified.last_search import LastSearch
+from servotwin.redesign.certified.last_search import LastSearch, ranges_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
-from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.redesign.certified.uncertainty import Region, Uncertainty
 from servotwin.redesign.design import Design, decoded_part
 from servotwin.redesign.policy import Evidence, Redesign
 
@@ -160,6 +161,16 @@ def test_a_fallback_set_in_force_is_not_sent_again(searches: Searches) -> None:
     assert other.setting is not None
     assert other.setting.gains is not None
     assert other.setting.gains.feedforward == pytest.approx(-0.06)
+
+
+@pytest.mark.parametrize("preset", AXES)
+def test_every_axis_has_a_question(preset: str) -> None:
+    """A drive in velocity mode and a stepper hold no torque by their command."""
+    axis = Axis.preset(preset)
+    found = ranges_of(axis, POLICY.uncertainty, SMALL, Region((0.0, 0.1), 0.0, (-0.1, 0.1), (0.0, 1e-3), 0.0))
+    assert ("friction" in found) == (axis.torque_of(1.0) != 0.0)
+    assert all(math.isfinite(end) for ends in found.values() for end in ends)
+    assert found["bias"][0] < 0.0 < found["bias"][1]
 
 
 def test_the_memory_keeps_every_bit(searches: Searches) -> None:

@@ -79,13 +79,17 @@ def digest_of(servo: Plant, uncertainty: Uncertainty, demands: Demands, trial: T
 
 def ranges_of(servo: Plant, known: Uncertainty, demands: Demands, region: Region) -> dict[str, Range]:
     """Ranges of a region: lost motion in what counts as arrived after the smallest step, bias and friction in what
-    counts as a known bias, usual steps in the smallest one; of the noise it counts only if there is any."""
+    counts as a known bias, usual steps in the smallest one; of the noise it counts only if there is any.
+
+    Friction counts where a command holds a torque, which it does not of a drive in velocity mode or a stepper.
+    """
     bias, least = known_bias(servo, known, demands), known.step[0]
+    torque = float(servo.torque_of(bias))
     low, high = (end + region.feedforward for end in region.input_bias)
     return {
         "gap": _in(NEAR * least / servo.p, region.gap),
         "bias": _in(bias, (low, high)),
-        "friction": _in(float(servo.torque_of(bias)), region.friction),
+        **({"friction": _in(torque, region.friction)} if torque else {}),
         **({"noise": (1.0, 1.0)} if region.noise else {}),
         **({} if region.usual_step is None else {"step": _in(least, region.usual_step)}),
     }
