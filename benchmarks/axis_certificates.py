@@ -19,11 +19,11 @@ from benchmarks.preset_machines import DUTIES, stated_ranges
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.attempt import share_at_least
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.machines import draw_independently
+from servotwin.redesign.certified.settling_test import share_at_least
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design

@@ -20,12 +20,12 @@ from servotwin.control.retuning import law_for_margins, without_integral
 from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified.assess import assess
-from servotwin.redesign.certified.attempt import share_at_least
 from servotwin.redesign.certified.certificate import NotVerified
 from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.margins import widened
+from servotwin.redesign.certified.settling_test import share_at_least
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Range, Uncertainty
 

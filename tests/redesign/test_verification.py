@@ -23,7 +23,6 @@ from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
-from servotwin.redesign.certified.attempt import share_at_least
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
@@ -31,6 +30,7 @@ from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.machines import draw, draw_independently, extreme_plants
 from servotwin.redesign.certified.margins import loop_margins, widened
 from servotwin.redesign.certified.policy import CertifiedPolicy
+from servotwin.redesign.certified.settling_test import share_at_least
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors, Uncertainty
 from servotwin.redesign.design import Design

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.retuning import filter_time, integrates, law_for_margins, only_integrates, rest_gain, static_gain
-from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import position_unit
 from servotwin.plant.law_loop import law_response
 from servotwin.plant.plants import Plant
@@ -24,6 +23,7 @@ from servotwin.redesign.certified.certificate import BeyondResult, Certificate, 
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.machines import SimulatedMachines, draw_independently
 from servotwin.redesign.certified.margins import margins_in_every_zone, own_static_gain, slow_response, widened
+from servotwin.redesign.certified.settling_test import SettlingTest
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty
@@ -38,7 +38,11 @@ ROUNDED = 1.0 + 1e-6
 # Machines that are simulated before the rest, in lots: a setting that leaves some of the gaps oscillating shows it on
 # them, and mostly on the first few.
 _LOTS = (12, 36, 75)
-_HARD = 4  # machines that a failed attempt leaves for the next candidates
+# Share of the machines beyond the stated ranges that comes to rest at least: 60 that all do show it with 95 %
+# confidence.
+_SETTLED_BEYOND = 0.95
+# Machines that a failed attempt leaves for the next candidates, and the share of them that a candidate may miss.
+_HARD, _MOST_HARD = 4, 0.5
 # Long runs where an integral may wind up against friction: machines, and length in that of the other runs.
 _LONG_MACHINES, _LONG = 60, 20.0
 
@@ -52,6 +56,16 @@ class Question:
     demands: Demands
     trial: Trial
     noise: float
+
+    @cached_property
+    def settling(self) -> SettlingTest:
+        """Test of the share that settles."""
+        return SettlingTest(self.demands.settled, self.demands.confidence, self.demands.machines)
+
+    @cached_property
+    def settling_beyond(self) -> SettlingTest:
+        """Test of the share that comes to rest beyond the stated ranges."""
+        return SettlingTest(_SETTLED_BEYOND, self.demands.confidence, self.demands.beyond.machines)
 
     @property
     def is_held(self) -> bool:
@@ -85,10 +99,15 @@ class Question:
         if tried.long is not None and tried.long.settled < 1.0:
             share, long = 100.0 * tried.long.settled, tried.long
             return f"stays at rest for {long.duration:.3g} s on {share:.1f} % of {long.machines} machines only"
-        if tried.beyond is not None and tried.beyond.settled < 1.0:
+        if tried.beyond is not None and self.misses_beyond(tried.beyond):
             share = 100.0 * tried.beyond.settled
             return f"comes to rest on {share:.1f} % of {tried.beyond.machines} machines beyond the stated ranges only"
         return ""
+
+    def misses_beyond(self, found: BeyondResult) -> bool:
+        """True where too few machines come to rest beyond the stated ranges; of so few that no share shows, all must."""
+        test = self.settling_beyond
+        return found.settled < 1.0 if test.allowed_first < 0 else found.settled_least < test.share
 
     def largest_error(self, setting: Design) -> float:
         """m, that may be left in the end."""
@@ -143,9 +162,11 @@ class Attempt:
         question, setting = self.question, self.setting
         if margins_missing(self._loop, setting.controller.sample_rate, question.demands):
             return True
+        count, missed = sum(machines.count for machines in hard), 0
         for machines in hard:
             (few,) = assess([setting], machines, question.trial)
-            if question.missed(setting, few).any():
+            missed += int(question.missed(setting, few).sum())
+            if missed > _MOST_HARD * count:
                 return True
         return self._ramp.settled < 1.0
 
@@ -158,19 +179,26 @@ class Attempt:
             return True
         if self._ramp.settled < 1.0 or (self._long is not None and self._long.settled < 1.0):
             return True
-        return self._beyond is not None and self._beyond.settled < 1.0
+        return self._beyond is not None and self.question.misses_beyond(self._beyond)
 
     def _refused_by(self, few: MachineMeasures) -> bool:
         """True where some of the machines show already that a demand is not met."""
         demands, allowed = self.question.demands, self.question.largest_error(self.setting)
-        if not _most_settle(demands, demands.machines - int(np.sum(~few.settled))):
+        if self.question.settling.is_refused(int(np.sum(~few.settled))):
             return True
         return bool(few.tail.max() > ROUNDED * allowed or few.overshoot.max() > demands.overshoot)
 
     def verified(self) -> Certificate | None:
         """Certificate of the setting, where it meets the demands."""
-        tried = self.certificate()
+        tried = self.decided()
         return None if self.question.shortcoming(tried) else tried
+
+    def decided(self) -> Certificate:
+        """Certificate of the setting, on further machines where the first ones leave open whether enough settle."""
+        first, test = self._measured(self.question.demands.machines), self.question.settling
+        if test.is_open(int(np.sum(~first.settled))) and not self.cannot_pass():
+            self._go_on()
+        return self.certificate()
 
     def reached(self) -> tuple[int, float]:
         """Machines on which the setting was simulated, and the share of these that settled."""
@@ -179,19 +207,18 @@ class Attempt:
 
     def missed(self) -> list[SimulatedMachines]:
         """Machines on which the setting was simulated so far and missed a demand: the first few; none where the demands
-        allow that one does."""
-        demands = self.question.demands
-        if self._measures is None or _most_settle(demands, demands.machines - 1):
+        allow in the first sample that one does."""
+        if self._measures is None or self.question.settling.allowed_first > 0:
             return []
-        places = np.flatnonzero(self.question.missed(self.setting, self._measures))[:_HARD]
+        places = np.flatnonzero(self.question.missed(self.setting, self._measures)[: self._members.count])[:_HARD]
         return [self._members.each(places)] if places.size else []
 
     def certificate(self) -> Certificate:
         """Certificate of the setting, whether or not it meets the demands."""
-        question, setting, loop, members = self.question, self.setting, self._loop, self._members
+        question, setting, loop = self.question, self.setting, self._loop
         known, law = question.uncertainty, law_for_margins(setting.controller)
-        measures = self._measured(members.count)
-        settled = int(measures.settled.sum())
+        measures = self._measured(question.demands.machines)
+        members, failures = len(measures.cost), int(np.sum(~measures.settled))
         friction = np.array(known.friction) + np.array(known.own_friction_of(question.servo))
         ends = (np.array(known.input_bias), friction, known.step[1])
         return Certificate(
@@ -200,8 +227,8 @@ class Attempt:
             input_bias=known.input_bias,
             step=known.step,
             friction=known.friction,
-            members=members.count,
-            settled=settled / members.count,
+            members=members,
+            settled=1.0 - failures / members,
             cost=question.cost(setting, measures.cost),
             tail=float(measures.tail.max()),
             tail_p95=_percentile_95(measures.tail),
@@ -217,7 +244,7 @@ class Attempt:
             saturated=bool(measures.saturated.any()),
             looked_at=0,
             seconds=0.0,
-            settled_least=share_at_least(settled, members.count, question.demands.confidence),
+            settled_least=question.settling.at_least(failures, members),
             confidence=question.demands.confidence,
             loop=loop,
             beyond=self._beyond,
@@ -250,6 +277,18 @@ class Attempt:
         self._measures = new if before is None else joined(before, new)
         return self._measures
 
+    def _go_on(self) -> None:
+        """Simulate further machines, in lots, until enough settle or too many do not."""
+        question, test, found = self.question, self.question.settling, self._measured(self.question.demands.machines)
+        largest = float(self._members.step.max())
+        further = draw_independently(question.servo, question.uncertainty, test.whole - test.first, self._seed + 2)
+        for begin in range(0, further.count, test.first):
+            part = further.part(begin, min(begin + test.first, further.count))
+            (new,) = assess([self.setting], part, question.trial, largest)
+            self._measures = found = joined(found, new)
+            if self._refused_by(found):
+                return
+
     @cached_property
     def _ramp(self) -> RampResult:
         question = self.question
@@ -279,15 +318,20 @@ class Attempt:
         force = max(known.friction[1], force) if servo.takes_friction else known.friction[1]
         wide = widened(known, question.demands)
         ranges = known.replace(k_T=wide.k_T, delay=wide.delay, friction=(known.friction[0], force))
-        members = draw_independently(servo, ranges, beyond.machines, self._seed + 1)
-        (measures,) = assess([self.setting], members, question.trial)
+        test = question.settling_beyond
+        members = draw_independently(servo, ranges, test.whole, self._seed + 1)
+        (measures,) = assess([self.setting], members.part(0, test.first), question.trial)
+        if test.is_open(int(np.sum(~measures.at_rest))):
+            (further,) = assess([self.setting], members.part(test.first, test.whole), question.trial)
+            measures = joined(measures, further)
         return BeyondResult(
             k_T=wide.k_T,
             delay=wide.delay,
             friction=force,
-            machines=members.count,
+            machines=len(measures.cost),
             settled=float(np.mean(measures.at_rest)),
             tail=float(measures.tail.max()),
+            settled_least=test.at_least(int(np.sum(~measures.at_rest)), len(measures.cost)),
         )
 
 
@@ -308,11 +352,6 @@ def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> 
     if loop.Ms_worst > ROUNDED * demands.Ms_worst:
         return f"has Ms = {loop.Ms_worst:.3g}{at} on a plant of the stated ranges, and {demands.Ms_worst:g} is allowed"
     return ""
-
-
-def _most_settle(demands: Demands, settled: int) -> bool:
-    """True where so many of the machines of a verification are the share that is demanded."""
-    return share_at_least(settled, demands.machines, demands.confidence) >= demands.settled
 
 
 def _lag(servo: Plant, law: AnyController) -> float:
@@ -344,28 +383,3 @@ def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) ->
     rest = with_feedforward(setting, 0.0), uncertainty.replace(input_bias=(0.0, 0.0))
     question = repr((servo.version, rest, left, seed))
     return int.from_bytes(hashlib.sha256(question.encode()).digest()[:7], "big")
-
-
-def share_at_least(successes: int, trials: int, confidence: float) -> float:
-    """Lower bound of a share (Clopper-Pearson): with that confidence at least so much of all succeeds.
-
-    Parameters
-    ----------
-    successes, trials : int
-        Of independent trials.
-    confidence : float
-        Within 0 .. 1.
-
-    Raises
-    ------
-    InvalidInput
-        The numbers are no sample.
-    """
-    if not 0 <= successes <= trials or trials == 0:
-        raise InvalidInput(f"{successes} successes in {trials} trials: must be 0 to all of at least 1")
-    if successes == 0:
-        return 0.0
-    from scipy.special import betaincinv
-
-    # The quantile of a beta distribution; without a failure it is (1 - confidence)^(1 / trials).
-    return float(betaincinv(successes, trials - successes + 1, 1.0 - confidence))

@@ -62,6 +62,8 @@ class BeyondResult:
         Share of the machines that came to rest; where friction holds them does not matter.
     tail : float
         m, largest error in the end.
+    settled_least : float
+        Lower bound of the share, at the certificate's confidence; 0 in certificates of versions that had none.
     """
 
     k_T: float
@@ -70,6 +72,7 @@ class BeyondResult:
     machines: int
     settled: float
     tail: float
+    settled_least: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -227,6 +230,7 @@ class Certificate:
                 f"and friction of up to {extra.friction:.3g} N m"
             )
             text += f", up to {extra.delay} samples late" if self.rate else ""
+            text += f", of which {100.0 * extra.settled:.4g} % come to rest" if extra.settled < 1.0 else ""
         return text
 
 

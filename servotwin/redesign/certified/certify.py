@@ -150,7 +150,7 @@ def confirm(
     disturbed = is_disturbed(servo, uncertainty, demands, setting.controller.feedforward)
     trial = trial or trial_for(servo, uncertainty, demands)
     question = Question(servo, uncertainty, _for_disturbance(demands, disturbed), trial, noise)
-    tried = replace(Attempt(question, setting).certificate(), looked_at=1, seconds=clock() - begin)
+    tried = replace(Attempt(question, setting).decided(), looked_at=1, seconds=clock() - begin)
     missing = question.shortcoming(tried)
     return NotVerified(f"the setting {missing}", tried) if missing else tried
 

@@ -87,7 +87,7 @@ class Demands:
     screened, conditions : int
         Plants that rank the candidates, and conditions of each.
     machines : int
-        Machines of the verification, drawn independently of one another and of those that rank.
+        Machines of the first sample of a verification, drawn independently of one another and of those that rank.
     attempts : int
         Candidates that are verified before the search gives up, each on machines of its own; then as many of each
         kind that settles most surely.
@@ -167,7 +167,7 @@ class Demands:
     screened: int = 4
     conditions: int = 8
     machines: int = 300
-    attempts: int = 4
+    attempts: int = 6
     seed: int = 0
 
     def __post_init__(self) -> None:
