@@ -100,12 +100,15 @@ class Question:
             share, long = 100.0 * tried.long.settled, tried.long
             return f"stays at rest for {long.duration:.3g} s on {share:.1f} % of {long.machines} machines only"
         if tried.beyond is not None and self.misses_beyond(tried.beyond):
-            share = 100.0 * tried.beyond.settled
-            return f"comes to rest on {share:.1f} % of {tried.beyond.machines} machines beyond the stated ranges only"
+            share, least = 100.0 * tried.beyond.settled, 100.0 * tried.beyond.settled_least
+            return (
+                f"comes to rest on {share:.1f} % of {tried.beyond.machines} machines beyond the stated ranges only, so "
+                f"that at least {least:.1f} % do, and {100.0 * _SETTLED_BEYOND:g} % are demanded"
+            )
         return ""
 
     def misses_beyond(self, found: BeyondResult) -> bool:
-        """True where too few machines come to rest beyond the stated ranges; of so few that no share shows, all must."""
+        """True where too few machines come to rest beyond the stated ranges; all must of so few that none may fail."""
         test = self.settling_beyond
         return found.settled < 1.0 if test.allowed_first < 0 else found.settled_least < test.share
 
