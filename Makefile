@@ -39,7 +39,8 @@ demo: $(STAMP)
 reproduce: $(STAMP)
 	$(BIN)/servotwin reproduce
 
-check: lint
+check: $(STAMP)
+	@$(MAKE) --no-print-directory -j 2 lint kernels
 	$(PYTEST_FAST) -m "not slow and not exploration"
 
 test: $(STAMP)

@@ -252,7 +252,9 @@ def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, limit
 
     More than rounding, that is: a loop at rest would otherwise be looked at step by step for ever.
     """
-    clean, thirds = limit, np.uint64(t.guard_count[mode] * rows)
+    # To numba a number that is now int64, now uint64 is a float, and with it every step that is counted from here on.
+    clean: Any = limit
+    thirds = np.uint64(t.guard_count[mode] * rows)
     for g in range(t.guard_count[mode]):
         least = LINGERING * rounding(t, mode, g, 0, x)
         first, beyond = np.uint64(g * rows), 0
@@ -268,7 +270,7 @@ def clean_intervals(t: Tables, mode: int, x: Array, out: Array, rows: int, limit
                 begin, end = out[at], out[at + np.uint64(1)]
                 second, third = begin + out[thirds + at], end - out[thirds + at + np.uint64(1)]
                 if max(max(begin, second), max(third, end)) > least:
-                    clean = int(k)
+                    clean = np.int64(k)
                     break
     return clean
 

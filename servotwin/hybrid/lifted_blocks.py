@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -19,7 +20,7 @@ def clean_part(
     less: float, squares: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
     """Number of intervals, at most `limit`, before the first in which some watch may leave its bounds."""
-    clean = limit
+    clean: Any = limit  # as in `clean_intervals`: int64 in every branch
     for watch in range(watches):
         size = dot_sizes(t.sizes, (slot * t.watches + watch) * t.states, z)
         room = (slack[watch] - less) * (SIGNIFICANT * size) - math.sqrt(max(squares[watch], 0.0))
@@ -39,7 +40,7 @@ def clean_part(
                 begin, end = out[a + k], out[a + k + np.uint64(1)]
                 second, third = begin + out[b + k], end - out[c + k]
                 if max(max(begin, second), max(third, end)) > top or min(min(begin, second), min(third, end)) < bottom:
-                    clean = int(k)
+                    clean = np.int64(k)
                     break
     return clean
 

@@ -13,6 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.axis import AXES
 
 ROOT = Path(__file__).parents[2]
+TEXTS = texts()
 PACKAGED = [
     *(("scenario", path) for path in sorted((ROOT / "servotwin/cosim/scenarios").glob("*.toml"))),
     *(
@@ -22,14 +23,14 @@ PACKAGED = [
 ]
 
 
-@pytest.mark.parametrize("name", texts())
+@pytest.mark.parametrize("name", TEXTS)
 def test_the_reference_is_up_to_date(name: str) -> None:
-    assert (ROOT / "docs" / name).read_text(encoding="utf-8") == texts()[name], "run `make reference`"
+    assert (ROOT / "docs" / name).read_text(encoding="utf-8") == TEXTS[name], "run `make reference`"
 
 
 @pytest.mark.parametrize(("kind", "path"), PACKAGED, ids=lambda value: getattr(value, "name", value))
 def test_a_packaged_file_fits_its_schema(kind: str, path: Path) -> None:
-    schema = json.loads(texts()[f"schemas/{kind}.json"])
+    schema = json.loads(TEXTS[f"schemas/{kind}.json"])
     values = tomllib.loads(path.read_text(encoding="utf-8").replace("= inf", "= 1e300"))  # JSON has no inf
     jsonschema_rs.validate(schema, values)
     assert not jsonschema_rs.is_valid(schema, {**values, "unknown_key": 1})
@@ -44,7 +45,7 @@ def test_an_edge_s_file_fits_its_schema_as_it_is_written() -> None:
     law = Controller(1377.7, 18907.6, -135.1, 0.1, sample_rate=1000.0)
     agent = AgentSettings("axis-1", UNBOOTED, 1000.0, controller=law)
     text = edge_toml(EdgeConfig(agent, "control", law, {"kind": "simulated", "address": "unix:s"}))
-    schema, values = json.loads(texts()["schemas/edge.json"]), tomllib.loads(text.replace("= inf", "= 1e300"))
+    schema, values = json.loads(TEXTS["schemas/edge.json"]), tomllib.loads(text.replace("= inf", "= 1e300"))
     jsonschema_rs.validate(schema, values)
     assert not jsonschema_rs.is_valid(schema, {**values, "unknown_key": 1})
 
@@ -53,7 +54,7 @@ def test_gains_stay_is_listed_only_where_it_is_read(tmp_path: Path) -> None:
     """In [own] and [supervision.fallback] of an edge's file; [start] and a scenario's [edge.fallback] refuse it."""
     from servotwin.edge_process.config_file import load
 
-    tables = json.loads(texts()["schemas/edge.json"])["properties"]
+    tables = json.loads(TEXTS["schemas/edge.json"])["properties"]
     listed = {
         "own": tables["own"]["properties"],
         "start": tables["start"]["properties"],
@@ -69,7 +70,7 @@ def test_gains_stay_is_listed_only_where_it_is_read(tmp_path: Path) -> None:
         else:
             with pytest.raises(InvalidInput, match=f"unknown key '{table}.gains_stay'"):
                 load(tmp_path / "edge.toml")
-    edge = json.loads(texts()["schemas/scenario.json"])["properties"]["edge"]["properties"]
+    edge = json.loads(TEXTS["schemas/scenario.json"])["properties"]["edge"]["properties"]
     assert "gains_stay" not in edge["fallback"]["properties"]
 
 
@@ -89,7 +90,7 @@ def test_a_twin_s_file_fits_its_schema() -> None:
         "ax-*" = "axis"
         """
     )
-    schema = json.loads(texts()["schemas/twin.json"])
+    schema = json.loads(TEXTS["schemas/twin.json"])
     jsonschema_rs.validate(schema, values)
     values["service"]["port"] = -1
     assert not jsonschema_rs.is_valid(schema, values)

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from exploration import explored
 from stage_scenario import MAY_PROBE, PROBED, stage
 
 from servotwin.cosim import Loop
@@ -21,11 +22,11 @@ def kinds(loop: Loop) -> list[tuple[str, bool]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [*TUNED_ON, *NOT_TUNED_ON])
+@pytest.mark.parametrize(("seed", "number"), explored([*TUNED_ON, *NOT_TUNED_ON], 0, 2, 3))
 def test_moves_of_different_lengths_are_requested_once_and_every_later_window_tells_the_gap(
-    seed: tuple[int, int],
+    seed: int, number: int
 ) -> None:
-    machine = stage(seed)
+    machine = stage((seed, number))
     loop = machine.run()
     refused = ("reference", False)
     assert kinds(loop) == [refused, refused, (TEACHING, True), *[("reference", True)] * 4]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -62,14 +63,21 @@ def test_one_window_of_moves_of_different_lengths_makes_steps_between_two_places
     assert abs(mean - math.log(RATIO)) < 3.0 * std < 1e-3
 
 
+@cache
+def taught_pitch(growth: float) -> tuple[float, float]:
+    """Logarithm of the ratio and its spread after moves of different lengths in a gap that grows."""
+    settings = TwinSettings(policy="paper", k_dz=0.0)
+    expected = Wear(0.0).expect(settings.trend, "boot", 1.0, 1.0, settings.learning)
+    told = estimator_of(STAGE, settings)(window(MANY_PLACES, 0.0, growth), expected).machine
+    assert told is not None
+    return FactorPrior.of_reading(told).pitch
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("growth", [0.05, 0.14])
 def test_a_gap_that_grows_while_moves_teach_the_ratio_widens_what_is_learnt(growth: float) -> None:
     """What it grows by would be taken for ratio, and later gaps be wrong with narrow intervals."""
-    settings = TwinSettings(policy="paper", k_dz=0.0)
-    expected = Wear(0.0).expect(settings.trend, "boot", 1.0, 1.0, settings.learning)
-    estimates = [estimator_of(STAGE, settings)(window(MANY_PLACES, 0.0, share), expected) for share in (0.0, growth)]
-    still, grown = (FactorPrior.of_reading(each.machine).pitch for each in estimates if each.machine is not None)
+    still, grown = taught_pitch(0.0), taught_pitch(growth)
     for mean, std in (still, grown):
         assert abs(mean - math.log(RATIO)) < 2.0 * std
     assert still[1] < 1e-4

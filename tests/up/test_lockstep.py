@@ -172,11 +172,11 @@ reorder = 0.2
 def test_a_deployed_axis_is_the_simulated_one(
     tmp_path: Path, axis: str, amplitude: str, period: float, gap: tuple[float, float]
 ) -> None:
-    twin, duration = 'policy = "paper"\nk_dz = 0.5\n', 4.0 * period
+    twin, duration = 'policy = "paper"\nk_dz = 0.5\n', 3.0 * period
     text = AXIS.format(axis=axis, amplitude=amplitude, period=period, gap=gap, duration=duration, twin=twin)
     (tmp_path / "scenario.toml").write_text(text)
     scenario = Scenario.load(tmp_path / "scenario.toml")
-    loop, result = cosimulate(scenario), deployed(tmp_path, scenario, twin, servo=axis)
+    loop, result = cosimulate(scenario), deployed(tmp_path, scenario, twin, servo=axis, thread=True)
     assert loop.updates
     check_deployed_is_simulated(loop, result, tmp_path)
 

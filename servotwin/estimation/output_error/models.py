@@ -328,7 +328,7 @@ def _least_parts(axis: Axis, interval: float) -> int:
 
 
 def _fastest(flows: Array) -> float:
-    return max(float(np.max(np.abs(np.linalg.eigvals(flow)))) for flow in flows)
+    return float(np.max(np.abs(np.linalg.eigvals(flows))))
 
 
 def _flows(axis: Axis, factors: tuple[float, ...]) -> tuple[Array, Array, float]:
