@@ -13,7 +13,7 @@ from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.estimation.estimate import NORMAL_95
-from servotwin.messages import Cause
+from servotwin.messages import Cause, Reason
 from servotwin.plant.display_units import DEGREES, MILLIMETRES, DisplayUnit
 
 DEG = 180.0 / math.pi
@@ -27,17 +27,27 @@ Entry = tuple[float, str, str]
 """Time (s since the epoch), boot (empty: of none), and the line."""
 
 
+_POSITIONS = {each.si: each.small for each in (MILLIMETRES, DEGREES)}
+_NO_UNIT = DisplayUnit("", 1.0, "")
+
+
 class Units(NamedTuple):
-    """Units of a machine's small lengths or angles, and of its command; volts are shown in mV."""
+    """Units of a machine's small lengths or angles, and of its command; volts are shown in mV. Those that are not known
+    yet have no name, and nothing is shown in them."""
 
     position: DisplayUnit = MILLIMETRES.small
     command: str = "V"
 
     @classmethod
     def of(cls, machine: JsonObject) -> Units:
-        """Units in the facts of a machine, as the API returns them; those of a linear servo where they are unknown."""
-        rotary = machine.get("travel_unit") == DEGREES.si
-        return cls((DEGREES if rotary else MILLIMETRES).small, str(machine.get("command_unit") or "V"))
+        """Units in the facts of a machine, as the API returns them."""
+        position = _POSITIONS.get(str(machine.get("travel_unit")), _NO_UNIT)
+        return cls(position, str(machine.get("command_unit") or ""))
+
+    @property
+    def known(self) -> bool:
+        """True where the machine is known."""
+        return bool(self.command and self.position.si)
 
     @property
     def head(self) -> str:
@@ -48,17 +58,19 @@ class Units(NamedTuple):
     @property
     def error(self) -> str:
         """Heading of the errors."""
-        return f"error, {self.position.name}"
+        return f"error, {self.position.name}" if self.position.name else "error"
 
     def of_gain(self, law: type, name: str, value: float) -> str:
         """A gain of a class of controllers, by its name, with its unit."""
+        if not self.known:
+            return f"{name} {value:.6g}"
         key = next((item.exact_name for item in items_of(law) if item.name == name), name)
         unit = unit_of(OwnUnits(self.command, self.position.si).key(key)).name
         return f"{name} {value:.6g} {unit}".rstrip()
 
     def of_command(self, value: float) -> str:
         """A small command with its unit."""
-        return f"{value * 1e3:.1f} mV" if self.command == "V" else f"{value:.4g} {self.command}"
+        return f"{value * 1e3:.1f} mV" if self.command == "V" else f"{value:.4g} {self.command}".rstrip()
 
 
 def lines_of(
@@ -144,6 +156,8 @@ def _wear(trend: JsonObject) -> str:
 
 
 def _disturbance(body: JsonObject, units: Units) -> str:
+    if not units.known:
+        return ""
     fields = (("bias", units.of_command, "input bias {}"), ("noise", units.position.text, "noise {}"))
     values = ((text, shown, body.get(name)) for name, shown, text in fields)
     return ", ".join(text.format(shown(x)) for text, shown, x in values if isinstance(x, float) and math.isfinite(x))
@@ -246,13 +260,14 @@ def _sent_update(update: JsonObject, units: Units) -> str:
     setting = body.get("setting") or {}
     tolerance = setting.get("tolerance", body.get("tolerance"))  # flat in updates of the version before
     gains, verification = setting.get("gains", body.get("controller")), body.get("verification", body.get("proof"))
-    zone = "no dead zone" if not tolerance else f"dead zone {units.position.text(tolerance, '.4g')}"
+    zone = "no dead zone" if not tolerance else f"dead zone {units.position.text(tolerance, '.4g')}".rstrip()
     parts = [] if tolerance is None else [zone]
     if gains:
         parts.append(", ".join(units.of_gain(Controller, name, gains[name]) for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {units.of_command(gains['feedforward'])}"] if gains.get("feedforward") else []
         moving, friction = gains.get("velocity_feedforward"), gains.get("friction_feedforward")
-        parts += [f"velocity feedforward {moving:.4g} {units.command} s/{units.position.si}"] if moving else []
+        per_speed = f" {units.command} s/{units.position.si}" if units.known else ""
+        parts += [f"velocity feedforward {moving:.4g}{per_speed}"] if moving else []
         parts += [f"friction feedforward {units.of_command(friction)}"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     law = setting.get("law") or {}
@@ -269,6 +284,9 @@ def _receipt(receipt: JsonObject) -> str:
     body = receipt["body"] or {}
     if body.get("applied"):
         return f"version {receipt['version']} applied at sample {body.get('sample')}"
+    if receipt["status"] == Reason.FELL_BACK:
+        in_force = body.get("parameter_version")
+        return f"version {receipt['version']} not applied: {receipt['status']}, as version {in_force}"
     return f"version {receipt['version']} REFUSED by the edge: {receipt['status']}"
 
 
@@ -301,6 +319,8 @@ def _measured(body: JsonObject, units: Units) -> str:
     small = units.position
     known = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, units.command)}
     scale, unit = known.get(body.get("cause", ""), (small.factor, small.name))
+    if not unit:
+        return ""
     try:
         return f", {body['measured'] * scale:.4g} {unit} where {body['allowed'] * scale:.4g} {unit} are allowed"
     except (KeyError, TypeError):
@@ -319,7 +339,9 @@ def _gap(estimate: JsonObject | None) -> str:
 
 
 def _error(estimate: JsonObject | None, units: Units) -> str:
-    return "?" if estimate is None or estimate["tail"] is None else f"{estimate['tail'] * units.position.factor:.1f}"
+    if estimate is None or estimate["tail"] is None or not units.position.name:
+        return "?"
+    return f"{estimate['tail'] * units.position.factor:.1f}"
 
 
 def _time(seconds: float) -> str:

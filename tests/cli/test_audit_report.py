@@ -1,12 +1,13 @@
 """The evidence chain as text."""
 
 import math
+import re
 from typing import Any
 
 import pytest
 
 from servotwin.cli.audit_report import Units, _sent_update, lines_of, servo_lines
-from servotwin.messages import Cause
+from servotwin.messages import Cause, Reason
 
 SERVO = {
     "servo": "ax-1",
@@ -132,6 +133,13 @@ def test_a_refused_version_shows_why() -> None:
     )
 
 
+def test_a_version_that_met_a_fallback_is_no_error() -> None:
+    body = {"applied": False, "parameter_version": 3}
+    receipt = found("receipt", Reason.FELL_BACK.value, version=3, body=body)
+    line = chain(link(1, estimate(), steps=[step(None, receipt)]))[-1].strip()
+    assert line == "version 3 not applied: the edge fell back meanwhile, as version 3"
+
+
 @pytest.mark.parametrize(
     ("cause", "measured", "allowed", "expected"),
     [
@@ -207,7 +215,7 @@ def test_an_update_of_a_linear_law_says_that_nothing_integrates() -> None:
 
 
 def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
-    """Its position is in rad, its command in N m; a servo of which nothing is known is a linear one on volts."""
+    """Its position is in rad, its command in N m."""
     units = Units.of({"travel_unit": "rad", "command_unit": "N m"})
     effect = {"window": {"sequence": 4}, "before": {"tail": 2e-4, "version": 2}, "after": {"tail": 1e-4, "version": 3}}
     disturbed = found("disturbance", body={"bias": 0.02, "noise": 2e-6})
@@ -224,4 +232,21 @@ def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
     assert ", 9 N m where 8 N m are allowed" in text
     window = next(line for line in lines if "version 3 sent" in line)
     assert window[: lines[4].index("what followed")].split()[-2:] == ["11.5", "2"]
-    assert Units.of({}) == Units()
+    assert Units.of({"travel_unit": "m", "command_unit": "V"}) == Units()
+
+
+@pytest.mark.parametrize("machine", [{}, {"travel_unit": "", "command_unit": ""}])
+def test_before_the_machine_is_known_nothing_has_a_unit(machine: dict[str, str]) -> None:
+    """Neither those of a linear servo, which a rotary axis does not have."""
+    unknown = estimate("failed: ValueError: no", gap=None, tail=None)
+    fallen = [
+        found("fallback", cause.value, version=0, body={"cause": cause, "measured": 9.0, "allowed": 8.0})
+        for cause in (Cause.EFFORT, Cause.LIMIT_CYCLE, Cause.SILENCE)
+    ]
+    disturbed = found("disturbance", body={"bias": 0.02, "noise": 2e-6})
+    text = "\n".join(
+        lines_of(SERVO, [link(1, unknown, disturbed, done=None, steps=[step(None)])], fallen, Units.of(machine))
+    )
+    assert "error " in text
+    assert "9 s where 8 s are allowed" in text
+    assert not re.search(r"\b(um|mdeg|mV|V|N m|m|rad)\b", text), text
