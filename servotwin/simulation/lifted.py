@@ -222,8 +222,8 @@ def vast_blocks(
     lifted = memory.lifted
     limit = min(COARSE, (end - place.at[0]) // BLOCK)
     clean = clean_ticks(
-        lifted, lifted.vast, lifted.vast_sizes, slot, watches, COARSE, limit, memory.low, memory.high, memory.slack, True,
-        memory.squares, memory.change, z, memory.out,
+        lifted, lifted.vast, lifted.vast_sizes, slot, watches, COARSE, limit, memory.low, memory.high, memory.slack,
+        True, memory.squares, memory.change, z, memory.out,
     )  # fmt: skip
     if clean > 0:
         note(segments, place.at[0], VAST - slot, z)

@@ -118,7 +118,7 @@ FELL_BACK = Fallback("axis", "boot-1", 2100, Cause.LIMIT_CYCLE, 1e-3, 1e-4, 1, 2
 @pytest.mark.parametrize("receipt_first", [False, True])
 @pytest.mark.parametrize("number", [2, 3])
 def test_an_update_that_met_a_fallback_is_followed_by_one_for_the_next_window(number, receipt_first):
-    twin, store = with_policy(eq_21())
+    twin, _ = with_policy(eq_21())
     _, first = twin.receive(window_message(1, 10.0), 0.0)
     twin.receive(receipt(first), 1.0)
     _, update = twin.receive(window_message(2, 20.0, version=1), 2.0)
