@@ -354,7 +354,7 @@ def plain(value: Any) -> Any:
         shown = [each for each in fields(value) if each.init]
         whole = [each.name for each in shown if type(each.default) is int]
         values = {each.name: getattr(value, each.name) for each in shown if each.name not in whole}
-        return replace(value, **{name: plain(given) for name, given in values.items()})  # type: ignore[type-var]
+        return replace(value, **{name: plain(given) for name, given in values.items()})
     if isinstance(value, tuple):
         return tuple(map(plain, value))
     is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
