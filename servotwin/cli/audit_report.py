@@ -18,8 +18,8 @@ from servotwin.plant.display_units import DEGREES, MILLIMETRES, DisplayUnit
 
 DEG = 180.0 / math.pi
 HOUR = 3600.0
-_STATUS_HEADS = f"{'gap ± 95 %, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'pending':>7}"
 _OPEN = "a setting was found and waits to be sent"
+_NO_ESTIMATE = "no estimate"
 _UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
 JsonObject = Mapping[str, Any]
 """A servo, the trace of a window or a piece of evidence, as the API returns it."""
@@ -94,7 +94,8 @@ def lines_of(
     changes : bool
         Only windows that led to more than an estimate.
     """
-    yield from _head(servo, traces, units)
+    events = list(events)
+    yield from _head(servo, traces, events, units)
     chosen = [trace for trace in traces if not changes or _matters(trace)]
     entries = [entry for trace in chosen for entry in _window(trace, units)]
     entries += [_event(event, units) for event in events]
@@ -110,17 +111,21 @@ def lines_of(
 
 def servo_lines(servos: Sequence[JsonObject]) -> Iterator[str]:
     """Head and rows of the table of servos."""
-    width = max(map(len, ["servo", *(servo["servo"] for servo in servos)]))
-    yield f"{'servo':{width}}  {_STATUS_HEADS}  last message, UTC"
-    yield from (_servo_line(servo, width) for servo in servos)
+    rows = [("servo", "gap ± 95 %, deg", "status", "version", "receipt", "pending", "last message, UTC")]
+    rows += [_servo_row(servo) for servo in servos]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{text:{align}{width}}" for text, align, width in zip(row, "<><><><", widths, strict=True))
+        yield "  ".join(cells).rstrip()
 
 
-def _servo_line(servo: JsonObject, width: int) -> str:
-    version = "-" if servo["version"] is None else servo["version"]
+def _servo_row(servo: JsonObject) -> tuple[str, ...]:
+    version = "-" if servo["version"] is None else str(servo["version"])
     received = "never" if servo["last_message"] is None else _time(servo["last_message"])
-    receipt = servo["receipt"][:12] or "-"
-    status = f"{_gap(servo) or '-':>15}  {_status(servo)[:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>7}"
-    return f"{servo['servo']:{width}}  {status}  {received}"
+    return (
+        servo["servo"], _gap(servo) or "-", _status(servo) or _NO_ESTIMATE, version, servo["receipt"] or "-",
+        str(servo["waiting"]), received,
+    )  # fmt: skip
 
 
 def _status(servo: JsonObject) -> str:
@@ -128,17 +133,44 @@ def _status(servo: JsonObject) -> str:
     return "unchanged" if servo["status"] == _UNCHANGED else str(servo["status"])
 
 
-def _head(servo: JsonObject, traces: Sequence[JsonObject], units: Units) -> Iterator[str]:
-    """Summary of the servo, and its newest trend and disturbance."""
+def _head(servo: JsonObject, traces: Sequence[JsonObject], events: Sequence[JsonObject], units: Units) -> Iterator[str]:
+    """Summary of the servo, its fallback set where that is in force, and its newest trend and disturbance."""
     gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg (95 %; {_status(servo) or 'unchanged'})"
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
-    receipt = f" ({servo['receipt']})" if servo["receipt"] else ""
+    answer = _newest_answer(servo, traces)
+    receipt = f" ({answer})" if answer else ""
     last = "" if servo["last_message"] is None else f", last message {_time(servo['last_message'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
     yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{last}"
+    if fallen := _in_force_since(traces, events):
+        yield f"  {fallen}"
     newest = _wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"), units)
     if any(newest):
         yield f"  {', '.join(filter(None, newest))}"
+
+
+def _newest_answer(servo: JsonObject, traces: Sequence[JsonObject]) -> str:
+    """Answer of the edge to the newest version; that to an earlier one may be the newest that has come."""
+    steps = (step for trace in traces for step in trace["steps"] if step["update"]["version"] == servo["version"])
+    step = next(steps, None)
+    if step is None:
+        return str(servo["receipt"])
+    receipts = [answer["status"] for answer in step["answers"] if answer["kind"] == "receipt"]
+    return receipts[-1] if receipts else "not answered yet"
+
+
+def _in_force_since(traces: Sequence[JsonObject], events: Sequence[JsonObject]) -> str:
+    """Sentence on the fallback set while it is in force, also of a later boot; empty: another version is."""
+    fallen = max((one for one in events if one["kind"] == "fallback"), key=lambda one: one["created"], default=None)
+    if fallen is None:
+        return ""
+    answers = (answer for trace in traces for step in trace["steps"] for answer in step["answers"])
+    applied = (one for one in answers if one["kind"] == "receipt" and (one["body"] or {}).get("applied"))
+    version = (fallen["body"] or {}).get("parameter_version")
+    others = (one for one in events if one["kind"] == "hello" and one["version"] != version)
+    if any(one["created"] > fallen["created"] for one in (*applied, *others)):
+        return ""
+    return f"the edge runs its fallback set since {_time(fallen['created'])} UTC: {fallen['status']}"
 
 
 def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
@@ -201,6 +233,8 @@ def _remarks(trace: JsonObject, units: Units) -> Iterator[str]:
             yield one["status"]
         elif one["kind"] == "redesign" and not one["status"] and not trace["steps"]:
             yield _OPEN
+        elif one["kind"] == "glance" and (one["body"] or {}).get("moved") and not _is_estimated(trace):
+            yield f"not estimated, for a newer window had come; screening: {one['status']}"
         elif repeated_by.get(one["kind"]) not in with_remark:
             yield from _remark(one)
     for step in trace["steps"]:
@@ -208,6 +242,10 @@ def _remarks(trace: JsonObject, units: Units) -> Iterator[str]:
         yield from (_receipt(answer) for answer in step["answers"] if answer["kind"] == "receipt")
         if step["effect"] is not None:
             yield _effect(step["effect"], units)
+
+
+def _is_estimated(trace: JsonObject) -> bool:
+    return any(one["kind"] == "estimate" for one in trace["evidence"])
 
 
 _REMARKS = {
@@ -302,7 +340,8 @@ def _event(one: JsonObject, units: Units) -> Entry:
     if kind == "hello":
         text = f"edge connected: boot {one['status']}, version {one['version']} in force"
     elif kind == "fallback":
-        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body, units)}"
+        now = f"; version {body['parameter_version']} in force" if "parameter_version" in body else ""
+        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body, units)}{now}"
     elif kind == "answer":
         text = f"the edge answers a request: {one['status']}"
     elif kind == "alarm":
