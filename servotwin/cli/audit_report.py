@@ -180,6 +180,8 @@ def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
 
 
 def _wear(trend: JsonObject) -> str:
+    if trend.get("updates", 2) < 2:  # one window alone tells nothing of wear
+        return ""
     try:
         rate, spread = trend["mean"][1] * DEG * HOUR, math.sqrt(trend["covariance"][4]) * DEG * HOUR
         return f"wear {rate:.3g} ± {NORMAL_95 * spread:.3g} deg/h (95 %)"

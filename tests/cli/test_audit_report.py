@@ -258,6 +258,13 @@ def test_before_the_machine_is_known_nothing_has_a_unit(machine: dict[str, str])
     assert not re.search(r"\b(um|mdeg|mV|V|N m|m|rad)\b", text), text
 
 
+def test_one_window_alone_tells_no_wear() -> None:
+    numbers = {"mean": [0.1, 1e-6, 0.0], "covariance": [0.0, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 0.0]}
+    for updates in (1, 2):
+        lines = report_of(link(1, estimate(), found("trend", body={**numbers, "updates": updates})))
+        assert any("wear" in line for line in lines) is (updates > 1)
+
+
 def test_the_summary_shows_the_answer_to_the_newest_version() -> None:
     earlier = found("receipt", Reason.FELL_BACK.value, version=2, body={"applied": False})
     applied = found("receipt", "applied", version=3, body={"applied": True})
