@@ -111,7 +111,9 @@ def lines_of(
 
 def servo_lines(servos: Sequence[JsonObject]) -> Iterator[str]:
     """Head and rows of the table of servos."""
-    rows = [("servo", "gap ± 95 %, deg", "status", "version", "receipt", "pending", "last message, UTC")]
+    rows: list[tuple[str, ...]] = [
+        ("servo", "gap ± 95 %, deg", "status", "version", "receipt", "pending", "last message, UTC")
+    ]
     rows += [_servo_row(servo) for servo in servos]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
