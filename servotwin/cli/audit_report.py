@@ -13,13 +13,13 @@ from servotwin.config.units import unit_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.estimation.estimate import NORMAL_95
-from servotwin.messages import Cause
+from servotwin.messages import Cause, Reason
 from servotwin.plant.display_units import DEGREES, MILLIMETRES, DisplayUnit
 
 DEG = 180.0 / math.pi
 HOUR = 3600.0
-_STATUS_HEADS = f"{'gap ± 95 %, deg':>15}  {'status':14}  {'version':>7}  {'receipt':12}  {'pending':>7}"
 _OPEN = "a setting was found and waits to be sent"
+_NO_ESTIMATE = "no estimate"
 _UNCHANGED = "nothing moved"  # status that the store holds where screening found no new information
 JsonObject = Mapping[str, Any]
 """A servo, the trace of a window or a piece of evidence, as the API returns it."""
@@ -27,17 +27,27 @@ Entry = tuple[float, str, str]
 """Time (s since the epoch), boot (empty: of none), and the line."""
 
 
+_POSITIONS = {each.si: each.small for each in (MILLIMETRES, DEGREES)}
+_NO_UNIT = DisplayUnit("", 1.0, "")
+
+
 class Units(NamedTuple):
-    """Units of a machine's small lengths or angles, and of its command; volts are shown in mV."""
+    """Units of a machine's small lengths or angles, and of its command; volts are shown in mV. Those that are not known
+    yet have no name, and nothing is shown in them."""
 
     position: DisplayUnit = MILLIMETRES.small
     command: str = "V"
 
     @classmethod
     def of(cls, machine: JsonObject) -> Units:
-        """Units in the facts of a machine, as the API returns them; those of a linear servo where they are unknown."""
-        rotary = machine.get("travel_unit") == DEGREES.si
-        return cls((DEGREES if rotary else MILLIMETRES).small, str(machine.get("command_unit") or "V"))
+        """Units in the facts of a machine, as the API returns them."""
+        position = _POSITIONS.get(str(machine.get("travel_unit")), _NO_UNIT)
+        return cls(position, str(machine.get("command_unit") or ""))
+
+    @property
+    def known(self) -> bool:
+        """True where the machine is known."""
+        return bool(self.command and self.position.si)
 
     @property
     def head(self) -> str:
@@ -48,17 +58,19 @@ class Units(NamedTuple):
     @property
     def error(self) -> str:
         """Heading of the errors."""
-        return f"error, {self.position.name}"
+        return f"error, {self.position.name}" if self.position.name else "error"
 
     def of_gain(self, law: type, name: str, value: float) -> str:
         """A gain of a class of controllers, by its name, with its unit."""
+        if not self.known:
+            return f"{name} {value:.6g}"
         key = next((item.exact_name for item in items_of(law) if item.name == name), name)
         unit = unit_of(OwnUnits(self.command, self.position.si).key(key)).name
         return f"{name} {value:.6g} {unit}".rstrip()
 
     def of_command(self, value: float) -> str:
         """A small command with its unit."""
-        return f"{value * 1e3:.1f} mV" if self.command == "V" else f"{value:.4g} {self.command}"
+        return f"{value * 1e3:.1f} mV" if self.command == "V" else f"{value:.4g} {self.command}".rstrip()
 
 
 def lines_of(
@@ -82,7 +94,8 @@ def lines_of(
     changes : bool
         Only windows that led to more than an estimate.
     """
-    yield from _head(servo, traces, units)
+    events = list(events)
+    yield from _head(servo, traces, events, units)
     chosen = [trace for trace in traces if not changes or _matters(trace)]
     entries = [entry for trace in chosen for entry in _window(trace, units)]
     entries += [_event(event, units) for event in events]
@@ -98,17 +111,23 @@ def lines_of(
 
 def servo_lines(servos: Sequence[JsonObject]) -> Iterator[str]:
     """Head and rows of the table of servos."""
-    width = max(map(len, ["servo", *(servo["servo"] for servo in servos)]))
-    yield f"{'servo':{width}}  {_STATUS_HEADS}  last message, UTC"
-    yield from (_servo_line(servo, width) for servo in servos)
+    rows: list[tuple[str, ...]] = [
+        ("servo", "gap ± 95 %, deg", "status", "version", "receipt", "pending", "last message, UTC")
+    ]
+    rows += [_servo_row(servo) for servo in servos]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        cells = (f"{text:{align}{width}}" for text, align, width in zip(row, "<><><><", widths, strict=True))
+        yield "  ".join(cells).rstrip()
 
 
-def _servo_line(servo: JsonObject, width: int) -> str:
-    version = "-" if servo["version"] is None else servo["version"]
+def _servo_row(servo: JsonObject) -> tuple[str, ...]:
+    version = "-" if servo["version"] is None else str(servo["version"])
     received = "never" if servo["last_message"] is None else _time(servo["last_message"])
-    receipt = servo["receipt"][:12] or "-"
-    status = f"{_gap(servo) or '-':>15}  {_status(servo)[:14]:14}  {version:>7}  {receipt:12}  {servo['waiting']:>7}"
-    return f"{servo['servo']:{width}}  {status}  {received}"
+    return (
+        servo["servo"], _gap(servo) or "-", _status(servo) or _NO_ESTIMATE, version, servo["receipt"] or "-",
+        str(servo["waiting"]), received,
+    )  # fmt: skip
 
 
 def _status(servo: JsonObject) -> str:
@@ -116,17 +135,44 @@ def _status(servo: JsonObject) -> str:
     return "unchanged" if servo["status"] == _UNCHANGED else str(servo["status"])
 
 
-def _head(servo: JsonObject, traces: Sequence[JsonObject], units: Units) -> Iterator[str]:
-    """Summary of the servo, and its newest trend and disturbance."""
+def _head(servo: JsonObject, traces: Sequence[JsonObject], events: Sequence[JsonObject], units: Units) -> Iterator[str]:
+    """Summary of the servo, its fallback set where that is in force, and its newest trend and disturbance."""
     gap = "no gap known" if servo["gap"] is None else f"gap {_gap(servo)} deg (95 %; {_status(servo) or 'unchanged'})"
     version = "no version sent" if servo["version"] is None else f"version {servo['version']}"
-    receipt = f" ({servo['receipt']})" if servo["receipt"] else ""
+    answer = _newest_answer(servo, traces)
+    receipt = f" ({answer})" if answer else ""
     last = "" if servo["last_message"] is None else f", last message {_time(servo['last_message'])} UTC"
     yield f"servo {servo['servo']}: {gap}, {version}{receipt}"
     yield f"  windows: {servo['windows']} stored, {servo['waiting']} messages pending{last}"
+    if fallen := _in_force_since(traces, events):
+        yield f"  {fallen}"
     newest = _wear(_newest(traces, "trend")), _disturbance(_newest(traces, "disturbance"), units)
     if any(newest):
         yield f"  {', '.join(filter(None, newest))}"
+
+
+def _newest_answer(servo: JsonObject, traces: Sequence[JsonObject]) -> str:
+    """Answer of the edge to the newest version; that to an earlier one may be the newest that has come."""
+    steps = (step for trace in traces for step in trace["steps"] if step["update"]["version"] == servo["version"])
+    step = next(steps, None)
+    if step is None:
+        return str(servo["receipt"])
+    receipts = [answer["status"] for answer in step["answers"] if answer["kind"] == "receipt"]
+    return receipts[-1] if receipts else "not answered yet"
+
+
+def _in_force_since(traces: Sequence[JsonObject], events: Sequence[JsonObject]) -> str:
+    """Sentence on the fallback set while it is in force, also of a later boot; empty: another version is."""
+    fallen = max((one for one in events if one["kind"] == "fallback"), key=lambda one: one["created"], default=None)
+    if fallen is None:
+        return ""
+    answers = (answer for trace in traces for step in trace["steps"] for answer in step["answers"])
+    applied = (one for one in answers if one["kind"] == "receipt" and (one["body"] or {}).get("applied"))
+    version = (fallen["body"] or {}).get("parameter_version")
+    others = (one for one in events if one["kind"] == "hello" and one["version"] != version)
+    if any(one["created"] > fallen["created"] for one in (*applied, *others)):
+        return ""
+    return f"the edge runs its fallback set since {_time(fallen['created'])} UTC: {fallen['status']}"
 
 
 def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
@@ -136,6 +182,8 @@ def _newest(traces: Sequence[JsonObject], kind: str) -> JsonObject:
 
 
 def _wear(trend: JsonObject) -> str:
+    if trend.get("updates", 2) < 2:  # one window alone tells nothing of wear
+        return ""
     try:
         rate, spread = trend["mean"][1] * DEG * HOUR, math.sqrt(trend["covariance"][4]) * DEG * HOUR
         return f"wear {rate:.3g} ± {NORMAL_95 * spread:.3g} deg/h (95 %)"
@@ -144,6 +192,8 @@ def _wear(trend: JsonObject) -> str:
 
 
 def _disturbance(body: JsonObject, units: Units) -> str:
+    if not units.known:
+        return ""
     fields = (("bias", units.of_command, "input bias {}"), ("noise", units.position.text, "noise {}"))
     values = ((text, shown, body.get(name)) for name, shown, text in fields)
     return ", ".join(text.format(shown(x)) for text, shown, x in values if isinstance(x, float) and math.isfinite(x))
@@ -187,6 +237,8 @@ def _remarks(trace: JsonObject, units: Units) -> Iterator[str]:
             yield one["status"]
         elif one["kind"] == "redesign" and not one["status"] and not trace["steps"]:
             yield _OPEN
+        elif one["kind"] == "glance" and (one["body"] or {}).get("moved") and not _is_estimated(trace):
+            yield f"not estimated, for a newer window had come; screening: {one['status']}"
         elif repeated_by.get(one["kind"]) not in with_remark:
             yield from _remark(one)
     for step in trace["steps"]:
@@ -194,6 +246,10 @@ def _remarks(trace: JsonObject, units: Units) -> Iterator[str]:
         yield from (_receipt(answer) for answer in step["answers"] if answer["kind"] == "receipt")
         if step["effect"] is not None:
             yield _effect(step["effect"], units)
+
+
+def _is_estimated(trace: JsonObject) -> bool:
+    return any(one["kind"] == "estimate" for one in trace["evidence"])
 
 
 _REMARKS = {
@@ -246,13 +302,14 @@ def _sent_update(update: JsonObject, units: Units) -> str:
     setting = body.get("setting") or {}
     tolerance = setting.get("tolerance", body.get("tolerance"))  # flat in updates of the version before
     gains, verification = setting.get("gains", body.get("controller")), body.get("verification", body.get("proof"))
-    zone = "no dead zone" if not tolerance else f"dead zone {units.position.text(tolerance, '.4g')}"
+    zone = "no dead zone" if not tolerance else f"dead zone {units.position.text(tolerance, '.4g')}".rstrip()
     parts = [] if tolerance is None else [zone]
     if gains:
         parts.append(", ".join(units.of_gain(Controller, name, gains[name]) for name in ("Kp", "Ki", "Kd", "Tf")))
         parts += [f"feedforward {units.of_command(gains['feedforward'])}"] if gains.get("feedforward") else []
         moving, friction = gains.get("velocity_feedforward"), gains.get("friction_feedforward")
-        parts += [f"velocity feedforward {moving:.4g} {units.command} s/{units.position.si}"] if moving else []
+        per_speed = f" {units.command} s/{units.position.si}" if units.known else ""
+        parts += [f"velocity feedforward {moving:.4g}{per_speed}"] if moving else []
         parts += [f"friction feedforward {units.of_command(friction)}"] if friction else []
         parts += [f"notch {gains['notch_hz']:.3g} Hz"] if gains.get("notch_hz") else []
     law = setting.get("law") or {}
@@ -269,6 +326,9 @@ def _receipt(receipt: JsonObject) -> str:
     body = receipt["body"] or {}
     if body.get("applied"):
         return f"version {receipt['version']} applied at sample {body.get('sample')}"
+    if receipt["status"] == Reason.FELL_BACK:
+        in_force = body.get("parameter_version")
+        return f"version {receipt['version']} not applied: {receipt['status']}, as version {in_force}"
     return f"version {receipt['version']} REFUSED by the edge: {receipt['status']}"
 
 
@@ -284,7 +344,8 @@ def _event(one: JsonObject, units: Units) -> Entry:
     if kind == "hello":
         text = f"edge connected: boot {one['status']}, version {one['version']} in force"
     elif kind == "fallback":
-        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body, units)}"
+        now = f"; version {body['parameter_version']} in force" if "parameter_version" in body else ""
+        text = f"FALLBACK from version {one['version']}: {one['status']}{_measured(body, units)}{now}"
     elif kind == "answer":
         text = f"the edge answers a request: {one['status']}"
     elif kind == "alarm":
@@ -301,6 +362,8 @@ def _measured(body: JsonObject, units: Units) -> str:
     small = units.position
     known = {Cause.SILENCE: (1.0, "s"), Cause.EFFORT: (1.0, units.command)}
     scale, unit = known.get(body.get("cause", ""), (small.factor, small.name))
+    if not unit:
+        return ""
     try:
         return f", {body['measured'] * scale:.4g} {unit} where {body['allowed'] * scale:.4g} {unit} are allowed"
     except (KeyError, TypeError):
@@ -319,7 +382,9 @@ def _gap(estimate: JsonObject | None) -> str:
 
 
 def _error(estimate: JsonObject | None, units: Units) -> str:
-    return "?" if estimate is None or estimate["tail"] is None else f"{estimate['tail'] * units.position.factor:.1f}"
+    if estimate is None or estimate["tail"] is None or not units.position.name:
+        return "?"
+    return f"{estimate['tail'] * units.position.factor:.1f}"
 
 
 def _time(seconds: float) -> str:

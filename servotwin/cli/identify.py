@@ -113,7 +113,7 @@ def _followed_without_wear(
 ) -> tuple[tuple[GapEstimate, ...], Trend | None]:
     """The same of an axis of which nobody states the wear: it grows by what the log shows, and by itself in 40 windows.
 
-    The wear decides which windows are accepted, and these show the wear: the log is read again until it is consistent.
+    The wear decides which windows are accepted, and these show the wear: they are estimated again until both agree.
     """
     over, growth = log.whole.duration, 0.0
     share = min(1.0, over / (_WEAR * windows[0].duration))

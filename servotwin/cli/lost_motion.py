@@ -24,6 +24,7 @@ from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
 from servotwin.estimation.kinematic.travel import StatedTravel, in_stated_unit
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
+from servotwin.logs.formats import WRITTEN
 from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
 from servotwin.plant.plants import Plant, resolve_plant
@@ -36,6 +37,8 @@ _PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
 
 def describes_its_machine(path: Path) -> bool:
     """True for a log that holds its servo, as `servotwin simulate` writes it."""
+    if path.suffix.lower() not in WRITTEN:
+        return False
     return isinstance(read_columns(path, ()).metadata.get("servo"), str)
 
 

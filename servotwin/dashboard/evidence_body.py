@@ -47,12 +47,14 @@ def finite(value: object) -> float | None:
 
 
 def wear_rate(record: StoredEvidence | None) -> WearRate | None:
-    """Read evidence of the kind trend."""
+    """Read evidence of the kind trend; None: there is none that tells a rate, which one window alone does not."""
     if record is None:
         return None
     body = body_of(record)
     try:
         mean, covariance = body["mean"], body["covariance"]
+        if body.get("updates", 2) < 2:
+            return None
         read = (body["time"], mean[0], covariance[0], mean[1], covariance[4])
     except (KeyError, TypeError, IndexError):
         return None

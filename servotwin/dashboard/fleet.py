@@ -72,7 +72,7 @@ class FleetRow:
     connected : bool or None
         The edge holds a connection to this twin; None: cannot be known, as over MQTT.
     alarms : tuple of FleetAlarm
-        Of the last day, newest first, each sentence once.
+        Of the last day, newest first, each sentence once; before them that the fallback set runs, as long as it does.
     """
 
     servo: str
@@ -109,7 +109,7 @@ def fleet_row(facts: ServoFacts, contexts: Mapping[str, str], connected: bool | 
     connected : bool or None
     """
     summary, newest, window = facts.summary, facts.newest, facts.window
-    context = context_key(facts)
+    context, in_force = context_key(facts), version_in_force(newest, "" if window is None else window.boot)
     machine = machine_facts(contexts[context]) if context in contexts else UNKNOWN
     trend = wear_rate(newest.get("trend"))
     until, until_interval = time_until_limit(trend, machine.gap_limit)
@@ -127,14 +127,14 @@ def fleet_row(facts: ServoFacts, contexts: Mapping[str, str], connected: bool | 
         travel_unit=machine.travel_unit,
         command_unit=machine.command_unit,
         version_sent=summary.version,
-        version_in_force=version_in_force(newest, "" if window is None else window.boot),
+        version_in_force=in_force,
         receipt=summary.receipt,
         windows=summary.windows,
         waiting=summary.waiting,
         last_window=None if window is None else LastWindow(window.boot, window.sequence, window.received),
         last_message=summary.last_message,
         connected=connected,
-        alarms=_alarms(facts.alarms),
+        alarms=(*_fallen(newest.get("fallback"), in_force), *_alarms(facts.alarms)),
     )
 
 
@@ -210,6 +210,13 @@ def _summary_interval(facts: ServoFacts) -> Interval | None:
     if interval is not None and facts.summary.status == "lower bound":
         return interval[0], None
     return interval
+
+
+def _fallen(fallback: StoredEvidence | None, in_force: int | None) -> tuple[FleetAlarm, ...]:
+    """Tell that the edge runs its fallback set; nothing where another version is in force."""
+    if fallback is None or in_force is None or _version_of(fallback, "fallback") != in_force:
+        return ()
+    return (FleetAlarm(fallback.created, f"the edge runs its fallback set: {fallback.status}"),)
 
 
 def _alarms(records: tuple[StoredEvidence, ...]) -> tuple[FleetAlarm, ...]:

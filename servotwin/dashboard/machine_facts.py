@@ -28,14 +28,15 @@ class MachineFacts:
     travel : float or None
         Travel of the load per radian of the gap, m/rad or rad/rad; None: unknown.
     travel_unit, command_unit : str
-        Units of the load's travel, "m" or "rad", and of the command to the actuator.
+        Units of the load's travel, "m" or "rad", and of the command to the actuator; empty: unknown, as before the
+        first estimate.
     """
 
     policy: str = ""
     gap_limit: float | None = None
     travel: float | None = None
-    travel_unit: str = "m"
-    command_unit: str = "V"
+    travel_unit: str = ""
+    command_unit: str = ""
 
 
 UNKNOWN = MachineFacts()
@@ -52,7 +53,9 @@ def machine_facts(context: str) -> MachineFacts:
     known = MachineFacts(policy if isinstance(policy, str) else "", _number(limit))
     if _AXIS in parts:
         return _of_axis(known, str(_literal(parts[_AXIS])))
-    return replace(known, travel=_number(_literal(parts.get("model.p"))))
+    if "model.p" not in parts:
+        return known
+    return replace(known, travel=_number(_literal(parts["model.p"])), travel_unit="m", command_unit="V")
 
 
 def _of_axis(known: MachineFacts, file: str) -> MachineFacts:

@@ -9,6 +9,7 @@ from typing import Any
 
 from servotwin.dashboard.fleet import FleetRow, Interval
 from servotwin.dashboard.machine_facts import MachineFacts
+from servotwin.messages import Reason
 from servotwin.report.page import page
 from servotwin.report.time_chart import BLUE, GREEN, ORANGE, RED, ChartLine, ChartMark, TimeChart
 
@@ -33,7 +34,7 @@ def machine_report(row: FleetRow, series: dict[str, Any], traces: Sequence[Trace
         s since the epoch.
     """
     machine: MachineFacts = series["machine"]
-    unit, factor = ("deg", DEG) if machine.travel_unit == "rad" else ("mm", 1e3)
+    unit, factor = _UNITS[machine.travel_unit]
     count = len(series["windows"]["received"])
     return page(
         "machine.html",
@@ -115,7 +116,8 @@ def _updates(traces: Iterable[Trace], factor: float) -> list[tuple[str, ...]]:
     return [_update(trace, step, factor) for trace, step in steps]
 
 
-_REFUSED = "refused it"
+_UNITS = {"rad": ("deg", DEG), "m": ("mm", 1e3), "": ("m or rad", 1.0)}
+_REFUSED, _MET = "refused it", "did not apply it"
 
 
 def _update(trace: Trace, step: Trace, factor: float) -> tuple[str, ...]:
@@ -131,7 +133,7 @@ def _update(trace: Trace, step: Trace, factor: float) -> tuple[str, ...]:
         _brief(tolerance * factor) if tolerance else "none",
         f"{verification['members']} simulated machines" if verification else "not simulated",
         _answer(step),
-        "" if _answer(step).startswith(_REFUSED) else _effect(step["effect"], factor),
+        "" if _answer(step).startswith((_REFUSED, _MET)) else _effect(step["effect"], factor),
     )
 
 
@@ -142,7 +144,10 @@ def _answer(step: Trace) -> str:
     if "receipt" not in answers:
         return "has not answered yet"
     receipt = answers["receipt"]
-    return "applied it" if (receipt["body"] or {}).get("applied") else f"{_REFUSED}: {receipt['status']}"
+    body = receipt["body"] or {}
+    if receipt["status"] == Reason.FELL_BACK:
+        return f"{_MET}: {receipt['status']}, as version {body.get('parameter_version')}"
+    return "applied it" if body.get("applied") else f"{_REFUSED}: {receipt['status']}"
 
 
 def _effect(effect: Trace | None, factor: float) -> str:

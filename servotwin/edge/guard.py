@@ -265,6 +265,8 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
     checks = (
         (update.servo == here.servo, Reason.WRONG_SERVO),
         (update.window[0] == here.boot, Reason.OTHER_BOOT),
+        # The number of a fallback may be that of an update that was on its way: only base and data tell them apart.
+        (not (current.chosen_by_edge and _is_older(update, current)), Reason.FELL_BACK),
         (update.version > current.version, Reason.OLD_VERSION),
         (KNOWN_FIELDS.issuperset(update.needs), Reason.NOT_KNOWN),
         (update.data_time > current.data_time, Reason.OLD_DATA),
@@ -283,6 +285,11 @@ def judge(update: Update, current: Parameters, limits: Limits, here: Instant, ow
     if reason is not Reason.APPLIED or update.setting.gains is None:
         return reason
     return Reason.NO_GAINS if own is None else _judge_gains(update.setting.gains, current, limits, own, since)
+
+
+def _is_older(update: Update, current: Parameters) -> bool:
+    """True for an update that replaces, or whose data come from, what was before the parameters in force."""
+    return update.base_version < current.version or update.data_time <= current.data_time
 
 
 def _judge_gains(gains: AnyGains, current: Parameters, limits: Limits, own: AnyGains, since: float) -> Reason:

@@ -56,6 +56,11 @@ class Parameters:
         if self.version < 0:
             raise InvalidInput(f"version in force = {self.version!r}: must be at least 0")
 
+    @property
+    def chosen_by_edge(self) -> bool:
+        """True where the edge itself put them in force in this boot: its fallback set, or those of before an update."""
+        return self.window is None and self.data_time > -inf
+
 
 @settings("fallback")
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,8 @@ One update is pending at a time. A newer one that may be applied takes its place
 applied an update is judged once more, and refused where it has expired.
 
 The fallback set gets a version of its own. So every update in flight is refused whose base is the version it replaced,
-or whose data are from before the fallback. After each further fallback, updates are refused for twice as long.
+or whose data are from before the fallback: the twin, which may have given the same number to an update meanwhile, reads
+in the receipt that the edge fell back. After each further fallback, updates are refused for twice as long.
 """
 
 from dataclasses import dataclass, replace
@@ -139,13 +140,13 @@ def restore(state: Switch, former: Parameters, here: Instant) -> Transition:
 
 def refuse_pending(state: Switch, here: Instant) -> Transition:
     """Refuse the pending update; the parameters in force stay."""
-    return Transition(replace(state, pending=None), _refused_pending(state, state.current, here))
+    return Transition(replace(state, pending=None), _refused_pending(state, Reason.AFTER_FALLBACK, state.current, here))
 
 
-def _refused_pending(state: Switch, current: Parameters, here: Instant) -> tuple[Receipt, ...]:
+def _refused_pending(state: Switch, reason: Reason, current: Parameters, here: Instant) -> tuple[Receipt, ...]:
     if state.pending is None:
         return ()
-    return (receipt(state.pending.update, Reason.AFTER_FALLBACK, here.sample, current, here),)
+    return (receipt(state.pending.update, reason, here.sample, current, here),)
 
 
 def _replace(
@@ -160,7 +161,9 @@ def _replace(
     message = Fallback(
         here.servo, here.boot, here.sample, *violation, old.version, version, Setting.of(new.setting.tolerance, gains)
     )
-    return Transition(Switch(new, None, state.fallbacks + 1), (*_refused_pending(state, new, here), message))
+    return Transition(
+        Switch(new, None, state.fallbacks + 1), (*_refused_pending(state, Reason.FELL_BACK, new, here), message)
+    )
 
 
 def is_safe(old: Parameters, new: Parameters, controller: AnyController | None, error: float | None) -> bool:

@@ -45,6 +45,7 @@ class LiftedTables(NamedTuple):
     jump_coarse: Array  # S * N * 16 * N: M**(8 j) - I
     jump_vast: Array  # S * N * 16 * N: M**(128 j) - I
     sizes: Array  # S * W * N: a watch below this part of abs(z) times `SIGNIFICANT` is rounding
+    vast_sizes: Array  # the same on the vast scale
     settling: Array  # S * N * N: M**k - I after two million ticks
     uneven: Array  # S * N: 1.0 for a state of which something is left then that does not move evenly
 
@@ -82,6 +83,7 @@ def lifted_counts(states: int, watches: int, slots: int) -> tuple[int, ...]:
         FINE * n2,
         COARSE * n2,
         COARSE * n2,
+        watches * states,
         watches * states,
         n2,
         states,
@@ -246,6 +248,7 @@ def _fill_rows(n: int, intervals: int, watch: int, w: LiftedWorkspace) -> None:
 def _fill_level(
     t: LiftedTables,
     table: Array,
+    sizes: Array,
     slot: int,
     watch: int,
     watches: int,
@@ -263,7 +266,7 @@ def _fill_level(
             table[column + i] = value
             largest = max(largest, abs(value))
         size = (slot * t.watches + watch) * n + j
-        t.sizes[size] = max(t.sizes[size], _ROUNDING * largest)
+        sizes[size] = max(sizes[size], _ROUNDING * largest)
         column += intervals + 1
         for i in range(intervals):
             table[column + i] = length * w.rows[starts + i * n + j]
@@ -324,8 +327,8 @@ def _rebase(n: int, intervals: int, following: int, w: LiftedWorkspace) -> None:
 
 @subroutine
 def fill_scale(
-    t: LiftedTables, table: Array, jumps: Array, slot: int, watches: int, intervals: int, length: int, last: bool,
-    w: LiftedWorkspace,
+    t: LiftedTables, table: Array, jumps: Array, sizes: Array, slot: int, watches: int, intervals: int, length: int,
+    last: bool, w: LiftedWorkspace,
 ) -> None:  # fmt: skip
     """One scale, from the first of its powers and the sums of one interval; the sums become those of the next scale's
     interval, but for the last."""
@@ -342,7 +345,7 @@ def fill_scale(
         power *= 2
     for watch in range(watches):
         _fill_rows(n, intervals, watch, w)
-        _fill_level(t, table, slot, watch, watches, intervals, float(length), w)
+        _fill_level(t, table, sizes, slot, watch, watches, intervals, float(length), w)
         if not last:
             add_deviation(n, watch, watches, intervals, float(length), length == 1 and w.discrete[watch] > 0.0, w)
 
@@ -361,6 +364,6 @@ def fill_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -> N
             w.powers[i * FINE * n + k] = w.map[i * n + k]
     find_moving(n, w)
     # Literals would have the function compiled once for each.
-    fill_scale(t, t.fine, t.jump_fine, slot, watches, int(FINE), 1, False, w)
+    fill_scale(t, t.fine, t.jump_fine, t.sizes, slot, watches, int(FINE), 1, False, w)
     _rebase(n, int(FINE), int(COARSE), w)
-    fill_scale(t, t.coarse, t.jump_coarse, slot, watches, int(COARSE), int(FINE), True, w)
+    fill_scale(t, t.coarse, t.jump_coarse, t.sizes, slot, watches, int(COARSE), int(FINE), True, w)

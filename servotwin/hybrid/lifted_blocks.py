@@ -16,13 +16,13 @@ from servotwin.hybrid.tables import VECTOR
 
 @inlined
 def clean_part(
-    t: LiftedTables, slot: int, watches: int, intervals: int, limit: int, low: Array, high: Array, slack: Array,
-    less: float, squares: Array, z: Array, out: Array,
+    t: LiftedTables, sizes: Array, slot: int, watches: int, intervals: int, limit: int, low: Array, high: Array,
+    slack: Array, less: float, squares: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
     """Number of intervals, at most `limit`, before the first in which some watch may leave its bounds."""
     clean: Any = limit  # as in `clean_intervals`: int64 in every branch
     for watch in range(watches):
-        size = dot_sizes(t.sizes, (slot * t.watches + watch) * t.states, z)
+        size = dot_sizes(sizes, (slot * t.watches + watch) * t.states, z)
         room = (slack[watch] - less) * (SIGNIFICANT * size) - math.sqrt(max(squares[watch], 0.0))
         top, bottom = high[watch] + room, low[watch] - room
         a = np.uint64(watch * (3 * intervals + 1 + t.states))
@@ -67,8 +67,8 @@ def settled_squares(
 
 @inlined
 def clean_ticks(
-    t: LiftedTables, table: Array, slot: int, watches: int, intervals: int, limit: int, low: Array, high: Array,
-    slack: Array, settles: bool, squares: Array, change: Array, z: Array, out: Array,
+    t: LiftedTables, table: Array, sizes: Array, slot: int, watches: int, intervals: int, limit: int, low: Array,
+    high: Array, slack: Array, settles: bool, squares: Array, change: Array, z: Array, out: Array,
 ) -> int:  # fmt: skip
     """Number of intervals of a block, at most `limit`, before the first in which some watch may leave its bounds.
 
@@ -94,7 +94,7 @@ def clean_ticks(
                 break
             # What rests deviates by rounding only.
             less = 1.0
-        clean = clean_part(t, slot, watches, intervals, limit, low, high, slack, less, squares, z, out)
+        clean = clean_part(t, sizes, slot, watches, intervals, limit, low, high, slack, less, squares, z, out)
         if clean == limit or not settles:
             break
     return clean

@@ -36,7 +36,7 @@ def _find_uneven(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) -
             sizes[j] = 0.0
         for k in range(n):
             own = math.sqrt(max(t.vast[square + k * stride + k], 0.0))
-            size = SIGNIFICANT * t.sizes[(slot * t.watches + watch) * n + k] + _EVEN * own
+            size = SIGNIFICANT * t.vast_sizes[(slot * t.watches + watch) * n + k] + _EVEN * own
             for j in range(n):
                 sizes[j] += size * abs(w.product[k * n + j])
         for i in range(n):
@@ -91,6 +91,8 @@ def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) ->
             w.powers[i * COARSE * n + k] = t.jump_coarse[((slot * n + k + 1) * COARSE - 1) * n + i]
     for watch in range(watches):
         for j in range(n):
+            size = (slot * t.watches + watch) * n + j
+            t.vast_sizes[size] = t.sizes[size]
             at = (slot * n + j) * stride + watch * (3 * COARSE + 1 + n)
             for i in range(COARSE + 1):
                 w.rows[i * n + j] = t.coarse[at + i]
@@ -100,5 +102,5 @@ def deepen_slot(t: LiftedTables, slot: int, watches: int, w: LiftedWorkspace) ->
             for i in range(n):
                 w.sums[(i * watches + watch) * n + j] = t.coarse[at + 3 * COARSE + 1 + i]
         add_deviation(n, watch, watches, int(COARSE), float(FINE), False, w)
-    fill_scale(t, t.vast, t.jump_vast, slot, watches, int(COARSE), int(BLOCK), True, w)
+    fill_scale(t, t.vast, t.jump_vast, t.vast_sizes, slot, watches, int(COARSE), int(BLOCK), True, w)
     _find_settling(t, slot, watches, w)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -12,6 +12,15 @@ import numpy as np
 from servotwin.plant.signals import Array
 
 _MOST_ROWS = 64  # of a matrix, each of which is a column
+
+
+Requested = Collection[str] | Callable[[Sequence[str]], Collection[str]]
+"""Names of the columns that are wanted, or a choice of them, made among the names of all columns of the file."""
+
+
+def among(requested: Requested, names: Sequence[str]) -> Collection[str]:
+    """Names of the wanted columns of a file that has columns of these names."""
+    return requested(names) if callable(requested) else requested
 
 
 class LogColumns(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -13,7 +13,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import LogColumns, SignalTable, parsed
+from servotwin.logs.columns import LogColumns, Requested, SignalTable, among, parsed
 from servotwin.logs.dates import time_of
 from servotwin.plant.signals import Array
 
@@ -53,7 +53,7 @@ class _Layout(NamedTuple):
     metadata: Mapping[str, Any]
 
 
-def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
+def read_csv(path: Path, requested: Requested) -> LogColumns:
     """Read the requested columns whole, as `csv_blocks` reads them in parts."""
     blocks = list(csv_blocks(path, requested))
     first = blocks[0]
@@ -62,7 +62,7 @@ def read_csv(path: Path, requested: Collection[str]) -> LogColumns:
     return LogColumns(values, first.names, first.metadata, damaged, blocks[-1].ends_within_line)
 
 
-def csv_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+def csv_blocks(path: Path, requested: Requested) -> Iterator[LogColumns]:
     """Read the requested columns in blocks of rows, at least one; a cell that is no number becomes NaN.
 
     Each block describes the first such cell of each column. The metadata are JSON in the first row of a last column
@@ -70,6 +70,7 @@ def csv_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
     begins with #.
     """
     layout = _layout(path)
+    requested = among(requested, layout.names)
     wanted = [name for name in layout.names if name in requested]
     metadata = layout.metadata
     with path.open(encoding=layout.encoding, errors="replace") as file:

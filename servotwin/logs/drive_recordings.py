@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -100,9 +100,13 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
     InvalidInput
         The file cannot be read, a column is missing or no numbers, a unit is unknown, or too few samples are left.
     """
-    names = tuple(read_columns(path, ()).names)
-    chosen = _chosen(path, names, wanted)
-    table = read_columns(path, tuple(chosen.values()))
+    chosen: dict[str, str] = {}
+
+    def choose(names: Sequence[str]) -> Collection[str]:
+        chosen.update(_chosen(path, tuple(names), wanted))
+        return chosen.values()
+
+    table = read_columns(path, choose)
     arrays = {part: numbers_of(path, name, table) for part, name in chosen.items()}
     sizes = {values.size for values in arrays.values()}
     if len(sizes) > 1:

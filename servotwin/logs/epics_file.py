@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import LogColumns
+from servotwin.logs.columns import LogColumns, Requested, among
 from servotwin.logs.dates import time_of
 from servotwin.plant.signals import Array
 
@@ -22,7 +21,7 @@ def looks_like_epics(line: str) -> bool:
     return _LINE.match(line) is not None
 
 
-def read_epics(path: Path, requested: Collection[str]) -> LogColumns:
+def read_epics(path: Path, requested: Requested) -> LogColumns:
     """Read one column for each process variable and `time_s`; between its events a variable is interpolated or held.
 
     A position that was quiet for long is held until shortly before its next event; one that moves is interpolated.
@@ -48,6 +47,7 @@ def read_epics(path: Path, requested: Collection[str]) -> LogColumns:
     if not events:
         raise InvalidInput(f"log {path}: no line reads NAME YYYY-MM-DD HH:MM:SS VALUE, as camonitor writes")
     names = [TIME, *events]
+    requested = among(requested, names)
     wanted = [name for name in events if name in requested] or list(events)
     time = np.unique(np.concatenate([np.sort(events[name][0]) for name in wanted]))
     columns: dict[str, Array] = {name: _between(time, *map(np.array, events[name])) for name in wanted}

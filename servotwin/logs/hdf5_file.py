@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import ColumnPlace, LogColumns, places_of
+from servotwin.logs.columns import ColumnPlace, LogColumns, Requested, among, places_of
 from servotwin.logs.own_times import with_unit
 from servotwin.runtime.extras import require
 
 _UNITS = ("unit", "units", "Unit", "Units")
 
 
-def read_hdf5(path: Path, requested: Collection[str]) -> LogColumns:
+def read_hdf5(path: Path, requested: Requested) -> LogColumns:
     """Read data sets by their path without the first slash; matrices and records as `places_of` calls their columns.
 
     An attribute `unit` or `units` of a data set stands in brackets behind the name.
@@ -30,6 +29,7 @@ def read_hdf5(path: Path, requested: Collection[str]) -> LogColumns:
     try:
         with h5py.File(path, "r") as file:
             file.visititems(visit)
+            requested = among(requested, tuple(places))
             values = {name: place.of(file[place.array]) for name, place in places.items() if name in requested}
     except OSError as error:
         raise InvalidInput(f"log {path}: is not an HDF5 file that can be read ({str(error).splitlines()[0]})") from None

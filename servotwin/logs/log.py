@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from servotwin.config.table import did_you_mean
 from servotwin.config.units import SIGNAL_COLUMNS, unit_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
-from servotwin.logs.columns import LogColumns, SignalTable
+from servotwin.logs.columns import LogColumns, Requested, SignalTable
 from servotwin.logs.formats import FORMATS, WRITTEN
 from servotwin.plant.signals import Array
 from servotwin.runtime import files
@@ -69,8 +69,8 @@ def read_log(path: Path) -> Log:
     return Log(whole, columns.metadata, names)
 
 
-def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
-    """Read columns by name from a log of any known format.
+def read_columns(path: Path, requested: Requested) -> LogColumns:
+    """Read columns by name, or those that are chosen among all names, from a log of any known format.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def read_columns(path: Path, requested: Collection[str]) -> LogColumns:
     return next(_reading(path, requested, whole=True))
 
 
-def read_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
+def read_blocks(path: Path, requested: Requested) -> Iterator[LogColumns]:
     """Read columns by name, a part of the rows at a time where the format allows it.
 
     Raises
@@ -91,7 +91,7 @@ def read_blocks(path: Path, requested: Collection[str]) -> Iterator[LogColumns]:
     return _reading(path, requested, whole=False)
 
 
-def _reading(path: Path, requested: Collection[str], whole: bool) -> Iterator[LogColumns]:
+def _reading(path: Path, requested: Requested, whole: bool) -> Iterator[LogColumns]:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
@@ -100,6 +100,8 @@ def _reading(path: Path, requested: Collection[str], whole: bool) -> Iterator[Lo
     form = FORMATS[suffix]
     form.check_installed(f"log {path}")
     try:
+        if callable(requested) and not form.chooses:
+            requested = requested(form.read(path, ()).names)
         if form.blocks is not None and not whole:
             yield from form.blocks(path, requested)
         else:

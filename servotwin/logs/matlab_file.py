@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import ColumnPlace, LogColumns, places_of
+from servotwin.logs.columns import ColumnPlace, LogColumns, Requested, among, places_of
 from servotwin.logs.hdf5_file import read_hdf5
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
-def read_matlab(path: Path, requested: Collection[str]) -> LogColumns:
+def read_matlab(path: Path, requested: Requested) -> LogColumns:
     """Read numeric arrays, those of structures as `structure/field`; row or column i of a matrix is called name[i]."""
     with path.open("rb") as file:
         head = file.read(1024)
@@ -35,6 +35,7 @@ def read_matlab(path: Path, requested: Collection[str]) -> LogColumns:
     places: dict[str, ColumnPlace] = {}
     for name, array in flat.items():
         places |= places_of(name, array.shape, array.dtype)
+    requested = among(requested, tuple(places))
     values = {name: place.of(flat[place.array]) for name, place in places.items() if name in requested}
     return LogColumns(values, tuple(places), {})
 

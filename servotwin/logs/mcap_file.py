@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.logs.columns import LogColumns
+from servotwin.logs.columns import LogColumns, Requested
 from servotwin.logs.own_times import TimedChannel, one_table
 from servotwin.plant.signals import Array
 from servotwin.runtime.extras import require
@@ -68,7 +67,7 @@ def joint_state(data: bytes) -> JointState:
     return JointState(seconds + 1e-9 * nanoseconds, names, *numbers)
 
 
-def read_mcap(path: Path, requested: Collection[str]) -> LogColumns:
+def read_mcap(path: Path, requested: Requested) -> LogColumns:
     """Read joints as topic/joint.position, topic/joint.velocity and topic/joint.effort; with one topic without it.
 
     Times are the messages' own stamps, or those of the recording where a topic is not stamped.

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from servotwin.logs.columns import LogColumns
+from servotwin.logs.columns import LogColumns, Requested, among
 from servotwin.plant.signals import Array
 
 TIME = "time [s]"
@@ -22,12 +22,13 @@ class TimedChannel(NamedTuple):
     values: Any
 
 
-def one_table(names: Sequence[str], requested: Collection[str], read: Callable[[str], TimedChannel]) -> LogColumns:
+def one_table(names: Sequence[str], requested: Requested, read: Callable[[str], TimedChannel]) -> LogColumns:
     """Bring the requested channels to the times of the one with most samples, by straight lines between samples.
 
     Where a channel jumps by more than half its range the nearer sample counts; one whose time goes back is left out.
     `read` gives a channel by its name; the column `TIME` holds the times.
     """
+    requested = among(requested, (TIME, *names))
     channels = {name: read(name) for name in names if name in requested}
     if not channels:
         return LogColumns({}, (TIME, *names), {})

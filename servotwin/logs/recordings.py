@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from servotwin.logs.cleaning import BETWEEN, OUT_OF_ORDER, REPEATED, SAME_TIME, 
 from servotwin.logs.clocks import LogClock
 from servotwin.logs.columns import LogColumns
 from servotwin.logs.gathering import PARTED, THINNED, Gathering
-from servotwin.logs.log import read_blocks, read_columns
+from servotwin.logs.log import read_blocks
 from servotwin.logs.names import given_column, guessed_column, known_unit, named_unit
 from servotwin.plant.signals import Array
 
@@ -94,8 +95,16 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
         A file that cannot be read, columns that are missing or hold no numbers, neither times nor a rate, or too few
         samples.
     """
-    names = tuple(read_columns(path, ()).names)
-    chosen = _chosen(path, names, wanted)
+    chosen: dict[str, str] = {}
+
+    def choose(names: Sequence[str]) -> Collection[str]:
+        chosen.update(_chosen(path, tuple(names), wanted))
+        return chosen.values()
+
+    blocks = read_blocks(path, choose)
+    first = next(blocks, None)
+    if first is None:
+        raise InvalidInput(f"log {path}: holds no row of numbers below the names of its columns")
     units = {part: named_unit(name) for part, name in chosen.items()}
     motor_unit = known_unit(wanted.motor_unit or units["motor"]) or "motor unit"
     load_unit = known_unit(wanted.load_unit or units["load"]) or "load unit"
@@ -104,7 +113,7 @@ def read_recording(path: Path, wanted: RecordingColumns, progress: Callable[[int
     clock = LogClock(path, units.get("time", ""), wanted.rate)
     gathering, damaged, counts = Gathering(turns), dict[str, str](), dict[str, float]()
     cut = turned = False
-    for table in _oldest_first(_tables(path, chosen, clock)):
+    for table in _oldest_first(_tables(path, chosen, clock, chain([first], blocks))):
         damaged, cut, turned = {**table.damaged, **damaged}, table.cut, table.turned
         for begin in range(0, len(table.time), _BLOCK):
             part = {name: values[begin : begin + _BLOCK] for name, values in table.channels.items()}
@@ -146,8 +155,8 @@ class _Table(NamedTuple):
     turned: bool = False
 
 
-def _tables(path: Path, chosen: Mapping[str, str], clock: LogClock) -> Iterator[_Table]:
-    for columns in read_blocks(path, tuple(chosen.values())):
+def _tables(path: Path, chosen: Mapping[str, str], clock: LogClock, blocks: Iterator[LogColumns]) -> Iterator[_Table]:
+    for columns in blocks:
         arrays = _arrays(path, chosen, columns)
         time = clock.seconds(arrays.pop("time", None), len(arrays["motor"]))
         yield _Table(time, arrays, columns.damaged, columns.ends_within_line)

@@ -10,8 +10,9 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text
 
-PROTOCOL = 2
-"""Version of the protocol between edge and twin: 1 had no claims and did not tell its number."""
+PROTOCOL = 3
+"""Version of the protocol between edge and twin: 1 had no claims and did not tell its number; 2 had no reason of its
+own for an update that meets a fallback."""
 
 
 class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):

@@ -29,6 +29,7 @@ class Reason(StrEnum):
     NO_GAINS = "this edge changes no gains"
     SUPERSEDED = "a newer update came before it could be applied"
     AFTER_FALLBACK = "too soon after a fallback"
+    FELL_BACK = "the edge fell back meanwhile"
     NOT_KNOWN = "needs what this edge does not know"
 
 

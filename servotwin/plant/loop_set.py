@@ -195,8 +195,9 @@ class PlantSet:
     def stable(self, law: AnyController, delay: int = 0) -> NDArray[np.bool_]:
         """(P,) stability of the closed loop, from the turns of 1 + L about zero (Nyquist); by its poles where a plant's
         frequencies do not resolve them."""
-        if ("decay", law, delay) in self._stored:
-            return np.asarray(self.decays(law, delay) > 0.0)
+        return self._once("stable", law, delay, lambda: self._stable(law, delay))
+
+    def _stable(self, law: AnyController, delay: int) -> NDArray[np.bool_]:
         integrators = self._grid.integrators + integrates(law)
         circled, resolved = encirclements(self._returned(law, delay), integrators)
         stable = circled == 0

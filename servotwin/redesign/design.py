@@ -93,3 +93,10 @@ def decoded_part(kind: type, values: Any) -> Any:
     if kind is StoredController:  # type: ignore[comparison-overlap]
         return msgspec.convert(values, kind_of_stored(values))
     raise NotImplementedError(f"{kind} is not stored")
+
+
+def with_feedforward(setting: Design, feedforward: float) -> Design:
+    """The setting with another feedforward, V."""
+    if setting.controller.feedforward == feedforward:
+        return setting
+    return Design(setting.controller.replace(feedforward=feedforward), setting.tolerance)

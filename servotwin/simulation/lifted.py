@@ -31,8 +31,8 @@ tick = verbatim(law.tick)
 
 UNFILLED = 3
 """Status of a run that needs the tables of the mode and branch where it is."""
-# The vast scale's tables pay after so many calm ticks, and where so many more are to come; filled, they are used
-# earlier.
+# The vast scale's tables pay after so many calm ticks, and where so many more are to come. A run uses them from there
+# on, also where another run has filled them: they round otherwise, and no run may depend on the others.
 _PAYS, _WORTH, _CALM = 32 * BLOCK, 16 * COARSE * BLOCK, FINE
 # Longest time in ticks until a block is tried again of which again and again not even the first interval was clean.
 _LONGEST = 8 * FINE
@@ -209,9 +209,9 @@ def note(segments: Segments, k: int, slot: int, z: Array) -> None:
 
 
 @inlined
-def deepens(place: Place, end: int, filled: int) -> bool:
+def deepens(place: Place, end: int, vast: int) -> bool:
     """True where a run has been calm, and goes on so long that the tables of the vast scale pay."""
-    return filled < 2 and place.at[5] >= _PAYS and end - place.at[0] >= _WORTH
+    return vast == 0 and place.at[5] >= _PAYS and end - place.at[0] >= _WORTH
 
 
 @inlined
@@ -222,8 +222,8 @@ def vast_blocks(
     lifted = memory.lifted
     limit = min(COARSE, (end - place.at[0]) // BLOCK)
     clean = clean_ticks(
-        lifted, lifted.vast, slot, watches, COARSE, limit, memory.low, memory.high, memory.slack, True,
-        memory.squares, memory.change, z, memory.out,
+        lifted, lifted.vast, lifted.vast_sizes, slot, watches, COARSE, limit, memory.low, memory.high, memory.slack,
+        True, memory.squares, memory.change, z, memory.out,
     )  # fmt: skip
     if clean > 0:
         note(segments, place.at[0], VAST - slot, z)
@@ -241,9 +241,9 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
     low, high, slack, out = memory.low, memory.high, memory.slack, memory.out
     squares, change = memory.squares, memory.change
     while end - place.at[0] >= 2 and segments.size[0] + 4 < len(segments.tick):
-        filled, k = memory.filled[slot], place.at[0]
-        settles = filled == 2 and place.at[5] >= _CALM
-        if deepens(place, end, filled):
+        vast, k = memory.vast[slot], place.at[0]
+        settles = vast == 1 and place.at[5] >= _CALM
+        if deepens(place, end, vast):
             break
         if settles and k >= again and end - k >= BLOCK:
             if vast_blocks(z, place, slot, watches, end, segments, memory):
@@ -253,8 +253,9 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
         if place.at[5] >= FINE and k >= later and end - k >= FINE:
             limit = min(COARSE, (end - k) // FINE)
             clean = clean_ticks(
-                lifted, lifted.coarse, slot, watches, COARSE, limit, low, high, slack, settles, squares, change, z, out
-            )
+                lifted, lifted.coarse, lifted.sizes, slot, watches, COARSE, limit, low, high, slack, settles, squares,
+                change, z, out,
+            )  # fmt: skip
             if clean > 0:
                 note(segments, k, slot, z)
                 jump(n, lifted.jump_coarse, slot, COARSE, clean, z, change)
@@ -265,8 +266,9 @@ def advance_block(z: Array, place: Place, watches: int, end: int, segments: Segm
             later, wait = (k + wait, min(2 * wait + FINE, _LONGEST)) if clean == 0 else (k, 0)
         limit = min(FINE, end - k)
         clean = clean_ticks(
-            lifted, lifted.fine, slot, watches, FINE, limit, low, high, slack, settles, squares, change, z, out
-        )
+            lifted, lifted.fine, lifted.sizes, slot, watches, FINE, limit, low, high, slack, settles, squares,
+            change, z, out,
+        )  # fmt: skip
         if clean > 0:
             note(segments, k, slot, z)
             jump(n, lifted.jump_fine, slot, FINE, clean, z, change)
@@ -304,16 +306,18 @@ def run_lifted(
         set_reference(places, coefficients, at[0] / rate - origin, z)
         least = _LASTS if places.counted >= 0 and at[8] < _LASTS else 1
         if at[5] >= least and end - at[0] >= 2:
-            filled = memory.filled[slot_of(at[1], at[2] == 1, at[3])]
-            at[6] = 1 if deepens(place, end, filled) else 0
-            if filled == 0 or at[6] == 1:
+            slot = slot_of(at[1], at[2] == 1, at[3])
+            at[6] = 1 if deepens(place, end, memory.vast[slot]) else 0
+            if memory.filled[slot] <= at[6]:
                 return UNFILLED
+            if at[6] == 1:
+                memory.vast[slot] = 1
             watches = set_bounds(t, loop, places, place, memory)
             if advance_block(z, place, watches, end, segments, memory) > 0:
                 if at[0] >= end:
                     break
                 set_reference(places, coefficients, at[0] / rate - origin, z)
-                if deepens(place, end, filled):
+                if deepens(place, end, memory.vast[slot]):
                     continue
         active, mode, side, kind, sign = at[2], at[1], at[4], at[3], place.sign[0]
         error = take_tick(loop, places, z, place)

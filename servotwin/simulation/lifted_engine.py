@@ -139,6 +139,7 @@ def memory_around(tables: Sequence[Array], places: Places, modes: int, watches: 
         lifted_in(tables, n, watches),
         new_lifted_workspace(n, watches),
         np.zeros(slots, dtype=np.int8),
+        np.zeros(slots, dtype=np.int8),
         np.zeros(slots * n),
         np.zeros(watches),
         np.zeros(watches),

@@ -126,7 +126,7 @@ def sample_lifted(
             for o in range(outputs):
                 traces[o, first] = dot(rows[o], 0, start)
             continue
-        if stride > 1 and slot >= 0 and memory.filled[slot] == 1:
+        if stride > 1 and slot >= 0 and memory.vast[slot] == 0:
             _sample_states(memory, places, slot, rows, begin, stop, stride, start, traces)
             continue
         parts = 1

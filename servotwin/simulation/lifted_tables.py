@@ -65,6 +65,7 @@ class LiftedMemory(NamedTuple):
     lifted: LiftedTables
     workspace: LiftedWorkspace
     filled: NDArray[np.int8]  # (slots,): 1, or 2 with the vast scale
+    vast: NDArray[np.int8]  # (slots,): 1 where the present run uses the vast scale
     voltage_rows: Array  # slots * N: the applied voltage after a tick, of the state before it
     low: Array
     high: Array

@@ -126,6 +126,9 @@ def run_one(
     for i in range(len(worker.place.at)):
         worker.place.at[i] = 0
     worker.place.at[1], worker.place.at[2], worker.place.sign[0] = family.mode, 1, 0.0
+    # What a run uses must not depend on the runs before it: neither would its rounding.
+    for slot in range(len(worker.lifted.vast)):
+        worker.lifted.vast[slot] = 0
     past, direction = z[places.position], 0.0
     segments.size[0] = segments.size[1] = record.size[0] = record.size[1] = 0
     for piece in range(len(family.times)):

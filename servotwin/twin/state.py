@@ -98,6 +98,9 @@ class Versions(Struct, frozen=True):
         pending = now.pending
         if self.has_ended(receipt.boot) or pending is None:
             return now, None
+        if receipt.reason is Reason.FELL_BACK and receipt.version >= now.root:
+            # Its data are from before the fallback: the next window's are not.
+            return now.without_pending(), None
         if now._breaks(receipt, pending):
             rebased = now._rebased(pending)
             return rebased, rebased.pending

@@ -26,6 +26,7 @@ from servotwin.messages import (
     LearntResponse,
     Message,
     ParameterMessage,
+    Reason,
     Receipt,
     Update,
     WindowMessage,
@@ -142,8 +143,7 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
         case WindowArrival():
             return _take_window(model, state, event, now)
         case Receipt():
-            versions, again = state.versions.after_receipt(event)
-            return _send(replace(state, versions=versions), again, now, (event,))
+            return _take_receipt(state, event, now)
         case Fallback():
             return take_fallback(state, event)
         case Hello():
@@ -155,6 +155,15 @@ def step(model: TwinModel, state: TwinState, event: Event, now: float) -> StepRe
         case Wake():
             return take_wake(model, state, now)
     raise InvalidMessage(f"a twin does not receive {type(event).__name__} messages")
+
+
+def _take_receipt(state: TwinState, receipt: Receipt, now: float) -> StepResult:
+    """Note what an edge did with an update; after a fallback the next window is worth an estimate in any case."""
+    versions, again = state.versions.after_receipt(receipt)
+    doubted = state.triage
+    if state.triage is not None and receipt.reason in (Reason.FELL_BACK, Reason.AFTER_FALLBACK):
+        doubted = state.triage.doubted(f"version {receipt.version} was refused: {receipt.reason.value}")
+    return _send(replace(state, versions=versions, triage=doubted), again, now, (receipt,))
 
 
 def next_wake(model: TwinModel, state: TwinState) -> float | None:

@@ -126,6 +126,11 @@ class AccessControl:
         except RequestRejected:
             return ""
 
+    def owner_of(self, token: bytes | None) -> str:
+        """Name of the servo, operator or engineer with a token; empty: it is nobody's."""
+        servo = self.servo_of(token)
+        return servo if servo or not self.knows(token) else f"operator {self.operator_of(token)}"
+
     @property
     def open(self) -> bool:
         """True where nobody needs a token."""

@@ -59,6 +59,8 @@ class HttpRequest:
     Attributes
     ----------
     method : str
+    address : str
+        Of the client, or of the proxy before it; empty: unknown.
     path : dict of str to str
         Parameters in the path, percent-decoded.
     receive : callable
@@ -67,10 +69,11 @@ class HttpRequest:
         Ends the connection at once, whatever is still to be sent.
     """
 
-    __slots__ = ("_headers", "_query", "_query_string", "abort", "method", "path", "receive")
+    __slots__ = ("_headers", "_query", "_query_string", "abort", "address", "method", "path", "receive")
 
     def __init__(self, scope: Scope, receive: Receive, path: dict[str, str]) -> None:
         self.method, self.path, self.receive = scope["method"], path, receive
+        self.address: str = (scope.get("client") or ("",))[0]
         self.abort: Callable[[], None] = scope.get("extensions", {}).get(ABORT, _no_connection)
         self._headers, self._query_string = scope["headers"], scope["query_string"]
         self._query: dict[str, str] | None = None
@@ -324,7 +327,7 @@ class HttpApp:
             handler = handlers.get(scope["method"])
             if handler is None:
                 allowed = {"allow": ", ".join(sorted(handlers))}
-                return await self._no_route(405, "this path does not know that method", allowed)
+                return await self._no_route(scope, receive, 405, "this path does not know that method", allowed)
             request = HttpRequest(scope, receive, match.groupdict())
             try:
                 if self._own_names and _is_domain(request.host):
@@ -334,11 +337,14 @@ class HttpApp:
                 return await handler(request)
             except RequestRejected as rejected:
                 return await self._rejection(request, rejected)
-        return await self._no_route(404, "there is no such path")
+        return await self._no_route(scope, receive, 404, "there is no such path")
 
-    async def _no_route(self, status: int, detail: str, headers: Mapping[str, str] | None = None) -> HttpResponse:
+    async def _no_route(
+        self, scope: Scope, receive: Receive, status: int, detail: str, headers: Mapping[str, str] | None = None
+    ) -> HttpResponse:
         code = Refusal.NOT_UNDERSTOOD
-        await self._refusals.count(code)
+        self._refusals.count(code)
+        await self._hold_back(HttpRequest(scope, receive, {}))
         return json_response({"code": code.value, "detail": detail}, status, headers)
 
     async def _rejection(self, request: HttpRequest, rejected: RequestRejected) -> HttpResponse:
@@ -347,13 +353,16 @@ class HttpApp:
         servo, shown = request.path.get("servo", "")[:64], request.token is not None
         about = {"why": rejected.detail, "method": request.method, "status": status}
         self._refusals.log(rejected.refusal, servo, shown, **about)
-        await self._refusals.count(rejected.refusal)
+        await self._hold_back(request)
         headers = {"retry-after": "1"} if status in (429, 503) else {}
         if status == 401:
             headers["www-authenticate"] = "Bearer"
         if rejected.close:
             headers["connection"] = "close"
         return json_response({"code": code, "detail": rejected.detail}, status, headers)
+
+    async def _hold_back(self, request: HttpRequest) -> None:
+        await self._refusals.hold_back(self._refusals.sender(request.token, request.address))
 
     async def _run_lifespan(self, receive: Receive, send: Send) -> None:
         phase = "startup"

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import logging
 from collections.abc import Callable
+from typing import NamedTuple
 from uuid import uuid4
 
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
@@ -35,7 +36,7 @@ from servotwin.twin_service.http_edge import LongPolls, seal_messages
 from servotwin.twin_service.ingest import Ingest
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.live_views import LiveIntake
-from servotwin.twin_service.monitoring import Metrics, RefusalLog
+from servotwin.twin_service.refusals import Refusals
 
 log = logging.getLogger(__name__)
 
@@ -47,6 +48,23 @@ _MAX_IN_FLIGHT = 1000
 """Unacknowledged requests to one twin."""
 _RESPONSE_EXPIRY_S = 60.0
 """A response that is older is worthless: its edge has repeated the request."""
+_MOST_HELD_BACK = 1000
+"""Answers to refused requests that are held back at once; further ones are left out, since nobody waits for so many."""
+
+
+class MqttAnswer(NamedTuple):
+    """Answer to a request.
+
+    Attributes
+    ----------
+    data : bytes or None
+        The response; None: none is possible.
+    refused : str
+        Sender of a request that is refused; empty: it is not.
+    """
+
+    data: bytes | None
+    refused: str = ""
 
 
 class MqttRequestHandler:
@@ -61,9 +79,7 @@ class MqttRequestHandler:
     live : LiveIntake
     wake : callable
         Wakes the dispatcher after a new message.
-    metrics : Metrics
-    wrong_token : callable
-        Called with the servo of a request whose seal, or its servo's lack of a token, is refused.
+    refusals : Refusals
     """
 
     def __init__(
@@ -74,15 +90,13 @@ class MqttRequestHandler:
         claims: EdgeClaims,
         live: LiveIntake,
         wake: Callable[[], None],
-        metrics: Metrics,
-        wrong_token: Callable[[str], None],
+        refusals: Refusals,
     ) -> None:
-        self._gate, self._ingest, self._polls, self._wake, self._metrics = gate, ingest, polls, wake, metrics
-        self._claims, self._live = claims, live
-        self._refusals, self._wrong_token = RefusalLog(log), wrong_token
+        self._gate, self._ingest, self._polls, self._wake = gate, ingest, polls, wake
+        self._claims, self._live, self._refusals = claims, live, refusals
 
-    def decode(self, servo: str, data: bytes) -> ReceivedRequest | bytes | None:
-        """Decode a request; where that fails, return the bytes of the response, or None where none is possible."""
+    def decode(self, servo: str, data: bytes) -> ReceivedRequest | MqttAnswer:
+        """Decode a request; where that fails, return the answer to it."""
         verifier = self._gate.find_verifier(servo)
         try:
             if verifier is None:
@@ -90,19 +104,28 @@ class MqttRequestHandler:
             return decode_request(key_of(verifier), servo, data)
         except InvalidMessage as error:
             too_large = error.refusal is Refusal.TOO_LARGE
-            self._count(servo, Refusal.TOO_LARGE if too_large else Refusal.BAD_TOKEN, str(error))
-            return None if too_large else encode_unknown_peer(data)
+            self._refusals.log(Refusal.TOO_LARGE if too_large else Refusal.BAD_TOKEN, servo, True, why=str(error))
+            # Anybody on the broker may write the name of an edge, which must not slow down that edge.
+            return MqttAnswer(None if too_large else encode_unknown_peer(data), f"name {servo}")
 
-    async def respond(self, request: ReceivedRequest) -> bytes | None:
-        """Handle a request; returns the bytes of the response, or None where its token was revoked."""
+    async def respond(self, request: ReceivedRequest) -> MqttAnswer:
+        """Handle a request; the answer has no response where its token was revoked."""
+        refused = ""
         try:
             response = await self._handle(request)
         except RequestRejected as rejected:
-            self._count(request.servo, rejected.refusal, rejected.detail)
+            self._refusals.log(rejected.refusal, request.servo, True, why=rejected.detail)
+            refused = f"owner {request.servo}"
             busy = rejected.refusal in (Refusal.TOO_MANY, Refusal.UNAVAILABLE)
             response = RefusedResponse(rejected.refusal, rejected.detail, _RETRY_AFTER_S if busy else 0.0)
         verifier = self._gate.find_verifier(request.servo)
-        return None if verifier is None else encode_response(key_of(verifier), request.servo, request.serial, response)
+        if verifier is None:
+            return MqttAnswer(None, refused)
+        return MqttAnswer(encode_response(key_of(verifier), request.servo, request.serial, response), refused)
+
+    async def hold_back(self, sender: str) -> None:
+        """Hold the answer to a refused request back, as over HTTP."""
+        await self._refusals.hold_back(sender)
 
     async def _handle(self, request: ReceivedRequest) -> MqttResponse:
         servo, question = request.servo, request.content
@@ -125,12 +148,6 @@ class MqttRequestHandler:
             self._wake()
         return PutResponse()
 
-    def _count(self, servo: str, code: Refusal, why: str) -> None:
-        self._metrics.rejected.add(code.value)
-        self._refusals.write(code.value, servo=servo, why=why)
-        if code is Refusal.BAD_TOKEN:
-            self._wrong_token(servo)
-
 
 class MqttServer:
     """Receives requests from a broker; acknowledges each to the broker only once it is handled.
@@ -150,6 +167,7 @@ class MqttServer:
     def __init__(self, broker: Broker, handler: MqttRequestHandler, group: str) -> None:
         self._broker, self._handler, self._group = broker, handler, group
         self._tasks: set[asyncio.Task[None]] = set()
+        self._held_back = 0
         self._connection: Connection | None = None
         self.connected = False
 
@@ -198,14 +216,30 @@ class MqttServer:
         if polls:
             acknowledge()  # a long poll waits, and must not count as in flight meanwhile
         try:
-            response = await self._handler.respond(request) if isinstance(request, ReceivedRequest) else request
+            answer = await self._handler.respond(request) if isinstance(request, ReceivedRequest) else request
         except Exception:
             log.exception("request not answered", extra={"servo": servo})
-            response = None
+            answer = MqttAnswer(None)
         if not polls:
             acknowledge()
-        if response is not None and connection.publish(response_topic(servo), response, _RESPONSE_EXPIRY_S) is None:
+        if answer.data is None or (answer.refused and not await self._has_held_back(answer.refused)):
+            return
+        if connection.publish(response_topic(servo), answer.data, _RESPONSE_EXPIRY_S) is None:
             log.warning("response not sent: too much waits for the broker", extra={"servo": servo})
+
+    async def _has_held_back(self, sender: str) -> bool:
+        """Hold an answer back; False: too many are held back already.
+
+        The request is acknowledged before: of those in flight the broker allows a number.
+        """
+        if self._held_back >= _MOST_HELD_BACK:
+            return False
+        self._held_back += 1
+        try:
+            await self._handler.hold_back(sender)
+        finally:
+            self._held_back -= 1
+        return True
 
     def _on_connected(self, _session_lost: bool) -> None:
         self.connected = True

@@ -92,6 +92,7 @@ class TwinService:
         self._clock = ClockCheck(store, self.executor, self.clocks.wall)
         repeat = WebhookConfig.repeat if config.webhook is None else config.webhook.repeat
         self.wrong_tokens = WrongTokens(self._is_enrolled, repeat, self.clocks.monotonic)
+        self._refusals = Refusals(self.metrics, self.wrong_tokens.note, self.access.owner_of, self.clocks.monotonic)
         self._shared = not config.store.startswith(SQLITE)
         # On a shared database another process may run: only a name of its own tells whose leases are whose.
         self._owner = uuid4().hex if self._shared else _SOLE_OWNER
@@ -126,8 +127,7 @@ class TwinService:
         if config.mqtt is not None:
             live = self.pages.live_intake
             handler = MqttRequestHandler(
-                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self.metrics,
-                self.wrong_tokens.note,
+                self.gate, self.ingest, self.polls, self.claims, live, self.dispatcher.wake, self._refusals
             )  # fmt: skip
             self._mqtt = MqttServer(config.mqtt.broker, handler, config.mqtt.group)
         self._tasks: list[asyncio.Task[None]] = []
@@ -201,8 +201,7 @@ class TwinService:
             lockstep = LockstepApi(self.gate, bodies, self.ingest, self.store, self.executor, self.dispatcher)
             routes += lockstep.routes()
         own_names = self.tokens is None
-        refusals = Refusals(self.metrics, self.wrong_tokens.note)
-        return HttpApp(routes, refusals, self._lifespan, own_names=own_names)
+        return HttpApp(routes, self._refusals, self._lifespan, own_names=own_names)
 
     async def start(self) -> None:
         """Release the leases that a crash left behind, start the workers and the dispatcher."""

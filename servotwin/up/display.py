@@ -15,7 +15,7 @@ from servotwin.up.plan import POLICIES
 from servotwin.up.speed import CORES, LIMIT, SLOWEST
 from servotwin.up.status import OK, ServoStatus, TwinStatus
 
-_NONE = "-"
+_NONE, _NO_ESTIMATE = "-", "no estimate yet"
 _HOUR = 3600.0
 
 
@@ -75,7 +75,7 @@ def line(snapshot: Snapshot) -> str:
     """One line of plain text."""
     parts = [_short(servo) for servo in snapshot.servos]
     head = f"{clock(snapshot.seconds)}  {_speed(snapshot)}  {_processor(snapshot)}"
-    return Text.from_markup("  |  ".join([head, *parts, _waits(snapshot.twin)])).plain
+    return Text.from_markup("  |  ".join([head, *parts, f"twin: {_waits(snapshot.twin)}"])).plain
 
 
 def clock(seconds: float) -> str:
@@ -85,10 +85,11 @@ def clock(seconds: float) -> str:
 
 
 def _short(servo: ServoStatus) -> str:
-    version, waiting = servo.edge.get("version", _NONE), _windows(servo).get("waiting", 0)
-    gap = _NONE if servo.machine is None else f"{servo.machine.gap_deg:.3f}"
+    waiting = _windows(servo).get("waiting", 0)
+    gap = "no machine yet" if servo.machine is None else f"gap {_gap(servo)} deg"
+    estimate = _NO_ESTIMATE if servo.estimate is None else f"est. {_estimate(servo)}"
     link = f", link cut, {waiting} wait" if servo.outage else ""
-    return f"{servo.plan.name} gap {gap} deg, est. {_estimate(servo)}, version {version}{link}"
+    return f"{servo.plan.name} {gap}, {estimate}, version {_version(servo)}{link}"
 
 
 def _speed(snapshot: Snapshot) -> str:
@@ -117,7 +118,7 @@ def _twin(snapshot: Snapshot) -> str:
 
 
 def _waits(twin: TwinStatus | None) -> str:
-    return "twin: no answer" if twin is None else f"{twin.waiting} in its queue"
+    return "no answer" if twin is None else f"{twin.waiting} in its queue"
 
 
 def _windows(servo: ServoStatus) -> dict[str, Any]:
@@ -221,6 +222,8 @@ def summary(snapshot: Snapshot) -> Iterable[str]:
         machine = _NONE if servo.machine is None else clock(servo.machine.time_s)
         windows = f"{servo.cut} cut, {_acknowledged(servo)} acknowledged, {_waiting(servo)} waiting"
         windows += f", {_dropped(servo)} dropped"
-        gap = f"gap {_gap(servo)} deg, estimated {_estimate(servo)} (± 95 %, error {_error(servo)})"
+        gap = f"gap {_gap(servo)} deg, {_NO_ESTIMATE}"
+        if servo.estimate is not None:
+            gap = f"gap {_gap(servo)} deg, estimated {_estimate(servo)} deg (95 %, error {_error(servo)})"
         line = f"{servo.plan.name}: {machine} of machine time, {gap}, version {_version(servo)}, windows: {windows}"
         yield Text.from_markup(line).plain

@@ -183,7 +183,7 @@ def newest_estimate(traces: list[dict[str, Any]]) -> ServoEstimate | None:
 
 def _wear(trend: dict[str, Any] | None) -> tuple[float, float]:
     """Wear rate and half of its 95 % interval; the trend's state is (gap, rate, offset)."""
-    if trend is None:
+    if trend is None or trend["body"].get("updates", 2) < 2:  # one window alone tells nothing of wear
         return nan, nan
     return trend["body"]["mean"][1], NORMAL_95 * sqrt(trend["body"]["covariance"][4])
 

@@ -1,12 +1,13 @@
 """The evidence chain as text."""
 
 import math
+import re
 from typing import Any
 
 import pytest
 
 from servotwin.cli.audit_report import Units, _sent_update, lines_of, servo_lines
-from servotwin.messages import Cause
+from servotwin.messages import Cause, Reason
 
 SERVO = {
     "servo": "ax-1",
@@ -105,6 +106,10 @@ def test_a_version_from_its_window_to_its_effect() -> None:
         (link(1, found("estimate", "failed: ValueError: no")), "failed: ValueError: no"),
         (link(1, found("glance", "nothing moved", gap=0.1)), "screening was enough: no new information"),
         (link(1, found("glance", "it moved"), estimate()), ""),
+        (
+            link(1, found("glance", "no window was estimated yet", body={"moved": True})),
+            "not estimated, for a newer window had come; screening: no window was estimated yet",
+        ),
         (link(1, estimate("lower bound", body={"estimate": {"reasons": ["one side"]}})), "lower bound: one side"),
         (link(1, estimate("lower bound")), "lower bound: no reason noted"),
         (link(1, estimate("lower bound"), found("redesign", "it is a lower bound")), "it is a lower bound"),
@@ -130,6 +135,13 @@ def test_a_refused_version_shows_why() -> None:
     assert (
         chain(link(1, estimate(), steps=[step(None, receipt)]))[-1].strip() == "version 3 REFUSED by the edge: expired"
     )
+
+
+def test_a_version_that_met_a_fallback_is_no_error() -> None:
+    body = {"applied": False, "parameter_version": 3}
+    receipt = found("receipt", Reason.FELL_BACK.value, version=3, body=body)
+    line = chain(link(1, estimate(), steps=[step(None, receipt)]))[-1].strip()
+    assert line == "version 3 not applied: the edge fell back meanwhile, as version 3"
 
 
 @pytest.mark.parametrize(
@@ -207,21 +219,90 @@ def test_an_update_of_a_linear_law_says_that_nothing_integrates() -> None:
 
 
 def test_a_rotary_axis_is_shown_in_its_own_units() -> None:
-    """Its position is in rad, its command in N m; a servo of which nothing is known is a linear one on volts."""
+    """Its position is in rad, its command in N m."""
     units = Units.of({"travel_unit": "rad", "command_unit": "N m"})
     effect = {"window": {"sequence": 4}, "before": {"tail": 2e-4, "version": 2}, "after": {"tail": 1e-4, "version": 3}}
     disturbed = found("disturbance", body={"bias": 0.02, "noise": 2e-6})
     fallen = found("fallback", "too large", version=3, body={"cause": Cause.EFFORT, "measured": 9.0, "allowed": 8.0})
     one = link(1, estimate(tail=2e-4), disturbed, steps=[step(effect)])
     lines = list(lines_of(SERVO, [one], [fallen], units))
-    assert "input bias 0.02 N m, noise 0.1 mdeg" in lines[2]
-    assert "error, mdeg" in lines[4]
+    head = units.head
+    assert "error, mdeg" in head
+    assert head in lines
     text = "\n".join(lines)
+    assert "input bias 0.02 N m, noise 0.1 mdeg" in text
     assert "dead zone 3.509 mdeg" in text
     assert "Kp 1377.7 N m/rad, Ki 0 N m/(rad s)" in text
     assert "feedforward -0.02 N m, velocity feedforward 94.25 N m s/rad" in text
     assert "error 11.5 -> 5.7 mdeg" in text
     assert ", 9 N m where 8 N m are allowed" in text
     window = next(line for line in lines if "version 3 sent" in line)
-    assert window[: lines[4].index("what followed")].split()[-2:] == ["11.5", "2"]
-    assert Units.of({}) == Units()
+    assert window[: head.index("what followed")].split()[-2:] == ["11.5", "2"]
+    assert Units.of({"travel_unit": "m", "command_unit": "V"}) == Units()
+
+
+@pytest.mark.parametrize("machine", [{}, {"travel_unit": "", "command_unit": ""}])
+def test_before_the_machine_is_known_nothing_has_a_unit(machine: dict[str, str]) -> None:
+    """Neither those of a linear servo, which a rotary axis does not have."""
+    unknown = estimate("failed: ValueError: no", gap=None, tail=None)
+    fallen = [
+        found("fallback", cause.value, version=0, body={"cause": cause, "measured": 9.0, "allowed": 8.0})
+        for cause in (Cause.EFFORT, Cause.LIMIT_CYCLE, Cause.SILENCE)
+    ]
+    disturbed = found("disturbance", body={"bias": 0.02, "noise": 2e-6})
+    text = "\n".join(
+        lines_of(SERVO, [link(1, unknown, disturbed, done=None, steps=[step(None)])], fallen, Units.of(machine))
+    )
+    assert "error " in text
+    assert "9 s where 8 s are allowed" in text
+    assert not re.search(r"\b(um|mdeg|mV|V|N m|m|rad)\b", text), text
+
+
+def test_one_window_alone_tells_no_wear() -> None:
+    numbers = {"mean": [0.1, 1e-6, 0.0], "covariance": [0.0, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 0.0]}
+    for updates in (1, 2):
+        lines = report_of(link(1, estimate(), found("trend", body={**numbers, "updates": updates})))
+        assert any("wear" in line for line in lines) is (updates > 1)
+
+
+def test_the_summary_shows_the_answer_to_the_newest_version() -> None:
+    earlier = found("receipt", Reason.FELL_BACK.value, version=2, body={"applied": False})
+    applied = found("receipt", "applied", version=3, body={"applied": True})
+    for answers, shown in (((), "version 3 (not answered yet)"), ((applied,), "version 3 (applied)")):
+        head = report_of(link(1, estimate(), steps=[step(None, *answers)]), receipt=earlier["status"])[0]
+        assert head.endswith(shown)
+
+
+FALLEN = found(
+    "fallback", "limit cycle", version=3, created=200.0,
+    body={"cause": Cause.LIMIT_CYCLE, "measured": 3e-4, "allowed": 1e-5, "parameter_version": 4, "boot": "b1"},
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("applied_at", "boot", "version", "runs"),
+    [
+        (100.0, "b1", 0, True),
+        (300.0, "b1", 0, False),
+        (100.0, "b2", 4, True),  # the edge begins with what it stored
+        (100.0, "b2", 0, False),
+    ],
+)
+def test_the_summary_says_that_the_fallback_set_runs(applied_at: float, boot: str, version: int, runs: bool) -> None:
+    applied = found("receipt", "applied", version=3, body={"applied": True}, created=applied_at)
+    hello = found("hello", boot, version=version, created=50.0 if boot == "b1" else 300.0)
+    lines = report_of(link(1, estimate(), steps=[step(None, applied)]), events=[FALLEN, hello])
+    said = "  the edge runs its fallback set since 1970-01-01 00:03:20 UTC: limit cycle"
+    assert (said in lines) is runs
+    reported = "FALLBACK from version 3: limit cycle, 300 um where 10 um are allowed; version 4 in force"
+    assert sum(reported in line for line in lines) == 1
+
+
+def test_the_list_of_servos_cuts_no_word() -> None:
+    new = {**SERVO, "servo": "ax-2", "gap": None, "status": "", "version": None, "receipt": "", "last_message": None}
+    refused = {**SERVO, "receipt": Reason.GAINS_STEP_TOO_LARGE.value}
+    head, *rows = servo_lines([refused, new])
+    assert Reason.GAINS_STEP_TOO_LARGE.value in rows[0]
+    assert rows[1].split("  ")[0] == "ax-2"
+    assert rows[1][head.index("status") :].startswith("no estimate ")
+    assert rows[1].endswith("never")

@@ -12,7 +12,7 @@ from dashboard_fleet import SILENT, WEARING, say_hello
 from service_system import ENGINEER, OPERATOR, OTHER, TOKEN, bearer, place, window
 
 from servotwin.link.seal import verifier_of
-from servotwin.messages import encode
+from servotwin.messages import Reason, encode
 from servotwin.store.store import open_store
 from servotwin.twin_service.auth import Verifiers, write_tokens
 
@@ -83,6 +83,55 @@ def test_gains_of_every_law_are_shown_with_their_units(open_page):
     assert page.evaluate(text, [linear]) == "no dead zone; gain 0.600, integral share 0; feedforward 0.0200 N m"
     cascade = {"type": "cascade", "position_gain": 20.0, "velocity_gain": 3.0, "integral_time": 0.0, "feedforward": 0.0}
     assert page.evaluate(text, [cascade]) == "no dead zone; position gain 20.0 1/s, velocity gain 3.00 N m s/rad"
+
+
+def test_a_version_in_force_that_a_fallback_took_has_the_setting_of_the_fallback(open_page):
+    page = open_page()
+    found = """([applied, fallback]) => import("/static/updates.js").then((updates) => {
+        const body = { applied, parameter_version: 4 }, status = applied ? "applied" : updates.FELL_BACK;
+        const update = { version: 4, body: { setting: { tolerance: 1 } } };
+        const traces = [{ steps: [{ update, answers: [{ kind: "receipt", status, body }] }] }];
+        const fell = { kind: "fallback", version: 3, body: { parameter_version: 4, setting: { tolerance: 2 } } };
+        const events = fallback ? [fell] : [];
+        return updates.settingInForce(traces, events, 4);
+    })"""
+    assert page.evaluate(found, [True, False]) == {"tolerance": 1}
+    assert page.evaluate(found, [False, True]) == {"tolerance": 2}
+    assert page.evaluate(found, [False, False]) is None
+
+
+def test_the_words_for_a_fallback_are_those_of_the_receipt(open_page):
+    page = open_page()
+    assert page.evaluate("import('/static/updates.js').then((updates) => updates.FELL_BACK)") == Reason.FELL_BACK.value
+
+
+def test_before_a_machine_is_known_its_units_are_not(open_page):
+    page = open_page()
+    units = """(machine) => import("/static/format.js").then((format) => [
+        format.positionUnit(machine).name, format.commandUnit(machine)])"""
+    assert page.evaluate(units, {"travel_unit": "", "command_unit": ""}) == ["m or rad", "SI unit"]
+    assert page.evaluate(units, None) == ["m or rad", "SI unit"]
+    assert page.evaluate(units, {"travel_unit": "rad", "command_unit": "N m"}) == ["deg", "N m"]
+    assert page.evaluate(units, {"travel_unit": "m", "command_unit": "V"}) == ["mm", "V"]
+
+
+def test_a_chart_of_one_window_spans_minutes(open_page):
+    """About a single time uPlot shows a thousand days."""
+    page = open_page()
+    span = """(times) => import("/static/charts.js").then(({ TimePlot }) => {
+        const place = document.body.appendChild(document.createElement("div"));
+        place.style.width = "400px";
+        const series = [{ label: "", color: "blue", points: true }];
+        const plot = new TimePlot(place, { time: true, xLabel: "", yLabel: "", series });
+        plot.show([times, times.map(() => 1)], "");
+        return new Promise((done) => setTimeout(() => {
+            const { min, max } = plot.plot.scales.x;
+            plot.close();
+            done([min, max]);
+        }, 200));
+    })"""
+    assert page.evaluate(span, [1.8e9]) == [1.8e9 - 60, 1.8e9 + 60]
+    assert page.evaluate(span, [1.8e9, 1.8e9 + 7]) == [1.8e9, 1.8e9 + 7]
 
 
 def test_a_list_on_the_screen_keeps_its_height_while_rows_come(open_page):

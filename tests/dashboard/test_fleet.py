@@ -68,6 +68,28 @@ def test_an_alarm_is_shown_once_at_its_newest_time():
     assert [(alarm.time, alarm.sentence) for alarm in shown] == [(3.0, "x"), (2.0, "y")]
 
 
+@pytest.mark.parametrize(
+    ("boot", "version", "runs"),
+    [("b", 0, True), ("c", 4, True), ("c", 0, False)],
+    ids=["same boot", "stored", "started anew"],
+)
+def test_an_edge_that_runs_its_fallback_set_has_an_alarm_as_long_as_it_does(boot, version, runs):
+    fallback = evidence(7, "fallback", {"parameter_version": 4, "boot": "b"}, 3, "limit cycle", created=70.0)
+    hello = evidence(9 if boot == "c" else 5, "hello", version=version, status=boot)
+    row = fleet_row(ServoFacts(NOTHING, None, {"fallback": fallback, "hello": hello}), {}, True)
+    expected = [(70.0, "the edge runs its fallback set: limit cycle")] if runs else []
+    assert [(alarm.time, alarm.sentence) for alarm in row.alarms] == expected
+    applied = evidence(11, "receipt", {"parameter_version": 5, "boot": boot}, 5)
+    newest = {"fallback": fallback, "hello": hello, "receipt": applied}
+    assert not fleet_row(ServoFacts(NOTHING, None, newest), {}, True).alarms
+
+
+def test_one_window_alone_tells_no_wear():
+    body = {"time": 0.0, "mean": [0.1, 0.0, 0.0], "covariance": [1e-6, 0, 0, 0, 1e3, 0, 0, 0, 0]}
+    assert wear_rate(evidence(1, "trend", {**body, "updates": 1})) is None
+    assert wear_rate(evidence(1, "trend", {**body, "updates": 2})).rate == 0.0
+
+
 def test_limit_and_travel_come_from_the_context():
     parts = {"settings.gap_limit": "0.35", "settings.policy": "'paper'", "model.p": "3e-4"}
     newest = {"trend": evidence(1, "trend", {"time": 0, "mean": [0.1, 0.01, 0], "covariance": [0] * 9}, context="k")}

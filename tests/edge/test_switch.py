@@ -130,7 +130,7 @@ def test_the_fallback_set_is_a_version_of_its_own() -> None:
     waiting = replace(UPDATE, version=6, base_version=4, data_time=21.0)
     state, _ = offer(state, waiting, RULES, at(22.0), 1.5e-4)
     state, replies = fall_back(state, SET, VERDICT, at(23.0))
-    assert reasons(replies[:1]) == [(6, Reason.AFTER_FALLBACK)]
+    assert reasons(replies[:1]) == [(6, Reason.FELL_BACK)]
     assert replies[1] == Fallback("axis-1", "b0", 115_000, Cause.LIMIT_CYCLE, 2e-4, 5e-5, 4, 7, Setting(0.0, CALM))
     assert (state.current.version, state.current.setting.gains, state.current.setting.band) == (7, CALM, BAND)
     assert state.current.fallback
@@ -139,9 +139,13 @@ def test_the_fallback_set_is_a_version_of_its_own() -> None:
 @pytest.mark.parametrize(
     ("changes", "seconds", "reason"),
     [
-        ({"version": 4, "base_version": 3}, 40.0, Reason.OLD_VERSION),
-        ({"version": 9, "base_version": 4, "data_time": 24.0}, 40.0, Reason.BASE_MISMATCH),
-        ({"version": 9, "base_version": 5, "data_time": 23.0}, 40.0, Reason.OLD_DATA),
+        ({"version": 4, "base_version": 3}, 40.0, Reason.FELL_BACK),
+        ({"version": 5, "base_version": 4}, 40.0, Reason.FELL_BACK),  # the twin's next, when it has not heard of it
+        ({"version": 6, "base_version": 5}, 40.0, Reason.FELL_BACK),  # and the one after that
+        ({"version": 9, "base_version": 4, "data_time": 24.0}, 40.0, Reason.FELL_BACK),
+        ({"version": 9, "base_version": 5, "data_time": 23.0}, 40.0, Reason.FELL_BACK),
+        ({"version": 9, "base_version": 6, "data_time": 24.0}, 40.0, Reason.BASE_MISMATCH),
+        ({"version": 5, "base_version": 5, "data_time": 24.0}, 40.0, Reason.OLD_VERSION),
         ({"version": 9, "base_version": 5, "data_time": 24.0}, 32.9, Reason.AFTER_FALLBACK),
         ({"version": 9, "base_version": 5, "data_time": 24.0}, 33.0, Reason.APPLIED),
     ],
@@ -152,7 +156,8 @@ def test_after_a_fallback_updates_need_newer_data_and_wait(
     state, _ = fall_back(Switch(Parameters(4, Setting(1e-4), 20.0)), SET, VERDICT, at(23.0))
     (receipt,) = offer(state, replace(UPDATE, **changes), RULES, at(seconds), 1e-3).messages
     assert isinstance(receipt, Receipt)
-    assert (receipt.reason, receipt.version) == (reason, changes["version"])
+    in_force = 5 if reason is not Reason.APPLIED else changes["version"]
+    assert (receipt.reason, receipt.version, receipt.parameter_version) == (reason, changes["version"], in_force)
 
 
 def test_each_further_fallback_refuses_twice_as_long() -> None:

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from recordings import csv, recording, rows
 
+from servotwin.cli.lost_motion import describes_its_machine
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
+from servotwin.logs import formats
 from servotwin.logs.cleaning import cleaned
-from servotwin.logs.columns import SignalTable
+from servotwin.logs.columns import LogColumns, SignalTable, among
 from servotwin.logs.log import read_log, write_log
 from servotwin.logs.recordings import RecordingColumns, read_recording
 
@@ -45,6 +47,26 @@ def test_tables_of_text(tmp_path, made):
     bare = tmp_path / "e.dat"
     np.savetxt(bare, values)
     seen(bare, made, RecordingColumns(time="col1", motor="col2", load="col3"))
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".txt", ".mat", ".h5", ".mcap"])
+def test_the_columns_of_a_log_are_chosen_while_it_is_read(suffix, tmp_path, made, monkeypatch):
+    """Formats that name their columns only at the end of the file would be read twice, which takes long."""
+    calls = []
+    values = {"time_s": made.time, "motor_rad": made.motor, "load_rad": made.load, "other": made.load}
+    form = formats.FORMATS[suffix]
+
+    def read(_path, requested):
+        calls.append(among(requested, tuple(values)))
+        return LogColumns({name: values[name] for name in calls[-1]}, tuple(values), {})
+
+    counted = form._replace(read=read, blocks=form.blocks and (lambda *args: iter([read(*args)])), library="")
+    monkeypatch.setitem(formats.FORMATS, suffix, counted)
+    path = tmp_path / f"log{suffix}"
+    path.touch()
+    assert not (suffix not in formats.WRITTEN and describes_its_machine(path))
+    seen(path, made)
+    assert [sorted(each) for each in calls] == [["load_rad", "motor_rad", "time_s"]]
 
 
 def test_structures_records_and_matrices(tmp_path, made):

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from servotwin.control.controller import Controller
 from servotwin.plant import loop as loops
+from servotwin.plant import loop_set
 from servotwin.plant.loop_set import PlantSet, SetMargins
 from servotwin.plant.servo import Servo
 
@@ -143,3 +144,11 @@ def test_the_turns_of_the_return_difference_tell_stability_as_the_poles_do(
     # Poles on the boundary to within what eigenvalues resolve belong to neither side.
     clear = np.abs(decays) > 1e-6
     assert np.array_equal(PlantSet.of(systems, rate).stable(law, late)[clear], decays[clear] > 0.0)
+
+
+def test_stability_does_not_depend_on_what_was_asked_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poles and turns may disagree at the boundary: one of the two must always decide."""
+    monkeypatch.setattr(loop_set, "encirclements", lambda loop, _: (np.ones(len(loop)), np.ones(len(loop), dtype=bool)))
+    plants = PlantSet.of([servo.plant() for servo in varied(3)], None)
+    assert (plants.decays(CALM) > 0.0).all()
+    assert not plants.stable(CALM).any()

@@ -23,6 +23,7 @@ from servotwin.plant.loop_set import PlantSet
 from servotwin.plant.servo import PRESETS, Servo
 from servotwin.plant.signals import PiecewiseCubic, SquareWave
 from servotwin.redesign.certified.assess import assess, stillness
+from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
@@ -51,6 +52,30 @@ def inert_axis(rate: float) -> Servo:
     """A stiff axis whose motor alone makes the dynamics: it crosses over at 120 rad/s in continuous time."""
     axis = SERVO.replace(m=20.0, k=1e9, c=2e4, Ki=0.0, Kd=0.0, sample_rate=rate)
     return axis.replace(Kp=120.0 * axis.k_B / axis.p)
+
+
+# --- equal questions
+
+
+@pytest.mark.parametrize(
+    ("known", "setting"),
+    [
+        (NARROW.replace(gap=tuple(map(np.float64, NARROW.gap))), Design(OWN)),
+        (NARROW.replace(friction=(0, 0)), Design(OWN)),
+        (NARROW.replace(friction=(-0.0, 0.0)), Design(OWN)),
+        (NARROW, Design(OWN.replace(Kp=np.float64(OWN.Kp)))),
+        (NARROW, Design(OWN.replace(feedforward=-0.0), -0.0)),
+        (NARROW, Design(OWN, 0)),
+    ],
+)
+def test_equal_questions_are_answered_on_the_same_machines(known: Uncertainty, setting: Design) -> None:
+    """Caches of a process take them for one question: the answer must not depend on which was asked first."""
+    trial = Trial()
+    assert (known, setting) == (NARROW, Design(OWN))
+    expected = Attempt(Question(SERVO, NARROW, SMALL, trial, 0.0), Design(OWN))._members
+    found = Attempt(Question(SERVO, known, SMALL, trial, 0.0), setting)._members
+    assert np.array_equal(found.gap, expected.gap)
+    assert found.plants == expected.plants
 
 
 # --- bounds of a share

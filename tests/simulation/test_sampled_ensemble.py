@@ -127,6 +127,23 @@ def test_threads_change_no_bit() -> None:
     assert np.array_equal(one, three)
 
 
+@pytest.mark.parametrize("sample_rate", [5e3, 50.0])
+def test_the_members_before_change_no_bit(sample_rate: float) -> None:
+    """Calm members make tables for the long rests, which later members of the same plant and law find filled."""
+    controller = PAPER.controller.replace(sample_rate=5e3, Ki=0.0)
+    gaps = np.array([0.0, 10.0, 10.0, 25.0]) * DEGREE
+    starts, duration = np.array([0.0, 0.01, -0.03, 0.1]), 20.0
+
+    def errors(which: slice, threads: int) -> np.ndarray:
+        cases = SampledCases(1e-3, gaps[which], 2e-5, starts[which], 0.01)
+        return simulate_sampled(PAPER, controller, duration, cases, ("error",), sample_rate, threads)["error"]
+
+    together = errors(slice(None), 1)
+    for member in range(gaps.size):
+        assert np.array_equal(errors(slice(member, member + 1), 1)[0], together[member]), member
+    assert np.array_equal(errors(slice(None), 3), together)
+
+
 @pytest.mark.parametrize(
     ("cases", "options", "message"),
     [

@@ -25,6 +25,7 @@ from servotwin.twin_service.limits import RateLimiter, SampleTimeLimiter
 from servotwin.twin_service.live_views import LiveIntake, LiveViews
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.mqtt import MqttRequestHandler, MqttServer
+from servotwin.twin_service.refusals import Refusals
 from servotwin.twin_service.store_executor import StoreExecutor
 
 CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
@@ -92,7 +93,7 @@ class Twin:
         self.views = LiveViews(self._loop.time, lambda _: None, 5, 5)
         live = LiveIntake(claims, self.views, self._loop.time)
         handler = MqttRequestHandler(
-            gate, ingest, self.polls, claims, live, lambda: None, self.metrics, self.wrong_tokens.append
+            gate, ingest, self.polls, claims, live, lambda: None, Refusals(self.metrics, self.wrong_tokens.append)
         )
         server = MqttServer(self._broker, handler, "twins")
         await server.start()

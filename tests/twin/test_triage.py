@@ -36,6 +36,7 @@ from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.evidence_rows import rows
 from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TriageSettings, TwinSettings, read_twin_settings
+from servotwin.twin.state import decode_state
 from servotwin.twin.triage import Glance, Triage, TriageState, due, glance
 from servotwin.twin.twin import Twin
 
@@ -252,6 +253,18 @@ def test_a_glance_is_all_there_is_of_a_window_that_says_nothing_new() -> None:
     assert not spared & {*store.estimates, *store.disturbances, *store.trends, *store.redesigns}
     assert len(spared) + len(store.estimates) == len(windows)
     assert twin.trend.updates == sum(estimate.ok for estimate in store.estimates.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("reason", [messages.Reason.FELL_BACK, messages.Reason.AFTER_FALLBACK, messages.Reason.APPLIED])
+def test_a_window_after_an_update_that_met_a_fallback_is_estimated_in_any_case(reason: messages.Reason) -> None:
+    windows = [msgspec.structs.replace(one, servo="servo") for one in calm_windows()]
+    twin, store = triaged(windows[:5])
+    newest = decode_state("servo", twin.state()).versions
+    applied = reason is messages.Reason.APPLIED
+    twin.receive(messages.Receipt("servo", newest.issued, applied, 10, reason, newest.issued, "boot-1"), 0.0)
+    twin.receive(windows[5], windows[5].start + 3.0)
+    assert (("servo", "boot-1", windows[5].sequence) in store.estimates) is not applied
 
 
 @pytest.mark.slow

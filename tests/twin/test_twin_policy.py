@@ -9,6 +9,10 @@ from twin_messages import PITCH, Rule, eq_21, known_gap, make, receipt, twin_of,
 
 from servotwin import messages
 from servotwin.control.gains import gains_of
+from servotwin.edge.guard import Instant, Limits
+from servotwin.edge.parameters import FallbackSet, Parameters
+from servotwin.edge.supervisor import Rules, Switch, fall_back, offer
+from servotwin.edge.watch import Violation
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapStatus
@@ -17,6 +21,7 @@ from servotwin.messages import (
     Band,
     Cause,
     Fallback,
+    Reason,
     Setting,
 )
 from servotwin.plant.servo import Servo
@@ -104,6 +109,56 @@ def test_after_a_fallback_nothing_is_insisted_on_and_its_setting_is_known():
     evidence = rule.consulted[-1]
     assert (evidence.gains.Ki, evidence.setting.tolerance, evidence.tuned_for) == (0.0, 2e-4, None)
     assert (again.version, again.base_version) == (4, 3)
+
+
+FELL_BACK = Fallback("axis", "boot-1", 2100, Cause.LIMIT_CYCLE, 1e-3, 1e-4, 1, 2, Setting(2e-4, gains_of(CALM)))
+"""From version 1, under the number that the twin gives to its next update meanwhile."""
+
+
+@pytest.mark.parametrize("receipt_first", [False, True])
+@pytest.mark.parametrize("number", [2, 3])
+def test_an_update_that_met_a_fallback_is_followed_by_one_for_the_next_window(number, receipt_first):
+    twin, _ = with_policy(eq_21())
+    _, first = twin.receive(window_message(1, 10.0), 0.0)
+    twin.receive(receipt(first), 1.0)
+    _, update = twin.receive(window_message(2, 20.0, version=1), 2.0)
+    fallback = msgspec.structs.replace(FELL_BACK, parameter_version=number)
+    letters = [fallback, receipt(update, Reason.FELL_BACK, in_force=number)]
+    for letter in letters[::-1] if receipt_first else letters:
+        assert twin.receive(letter, 3.0) == []
+    assert twin.next_wake() is None
+    _, again = twin.receive(window_message(3, 30.0, version=number), 4.0)
+    assert (again.version, again.base_version) == (number + 1, number)
+
+
+def test_twin_and_edge_agree_again_within_one_window_of_a_fallback():
+    twin, _ = with_policy(eq_21())
+    rules, switch = Rules(Limits(lifetime_s=math.inf), OWN), Switch(Parameters(setting=Setting(1e-4, gains_of(OWN))))
+    _, first = twin.receive(window_message(1, 10.0), 0.0)
+    switch, (applied,) = offer(switch, first, rules, Instant("axis", "boot-1", 1200, 100.0), 0.0)
+    twin.receive(applied, 1.0)
+    _, on_its_way = twin.receive(window_message(2, 20.0, version=1), 2.0)
+    violation = Violation(Cause.LIMIT_CYCLE, 1e-3, 1e-4)
+    calm = FallbackSet(Setting(0.0, gains_of(CALM)), refuse_s=0.0)
+    switch, (fallback,) = fall_back(switch, calm, violation, Instant("axis", "boot-1", 2200, 100.0))
+    assert fallback.parameter_version == on_its_way.version
+    switch, (answer,) = offer(switch, on_its_way, rules, Instant("axis", "boot-1", 2300, 100.0), 0.0)
+    assert (answer.reason, answer.parameter_version) == (Reason.FELL_BACK, fallback.parameter_version)
+    assert [twin.receive(letter, 3.0) for letter in (fallback, answer)] == [[], []]
+    _, anew = twin.receive(window_message(3, 30.0, version=fallback.parameter_version), 4.0)
+    switch, (applied,) = offer(switch, anew, rules, Instant("axis", "boot-1", 3200, 100.0), 0.0)
+    assert (applied.reason, switch.current.version) == (Reason.APPLIED, anew.version)
+
+
+def test_no_earlier_update_of_a_chain_that_met_a_fallback_is_sent_again():
+    twin, _ = with_policy(eq_21())
+    sent = [twin.receive(window_message(k, 10.0 * k), 0.0)[1] for k in (1, 2, 3)]
+    assert twin.receive(receipt(sent[0]), 1.0) == []
+    for update in sent[1:]:
+        assert twin.receive(receipt(update, Reason.FELL_BACK, in_force=2), 2.0) == []
+        assert twin.next_wake() is None
+    _, again = twin.receive(window_message(4, 40.0, version=2), 3.0)
+    assert (again.version, again.base_version) == (4, 2)
 
 
 def test_every_window_has_its_redesign_or_the_reason_why_not():

@@ -239,7 +239,9 @@ def test_the_table_of_nothing_known_yet_shows_dashes() -> None:
     assert "true gap, deg" in text
     assert "no answer" in text
     assert "news [x]" in text
-    assert display.line(shown)
+    assert "no machine yet, no estimate yet, version -" in display.line(shown)
+    assert display.line(shown).endswith("twin: no answer")
+    assert "no estimate yet, version -" in next(iter(display.summary(shown)))
 
 
 def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_terminal() -> None:
@@ -260,7 +262,8 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
         assert expected in text, expected
     assert "…" not in text
     assert len(text.splitlines()) <= 24
-    assert "link cut, 3 wait" in display.line(shown)
+    assert "version 7 fallback set, link cut, 3 wait" in display.line(shown)
+    assert display.line(shown).endswith("twin: 5 in its queue")
     assert "47 cut, 41 acknowledged, 3 waiting, 3 dropped" in next(iter(display.summary(shown)))
 
 

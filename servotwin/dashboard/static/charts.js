@@ -64,6 +64,7 @@ export class TimePlot {
     this.place.setAttribute("aria-label", about);
     if (this.plot) this.plot.setData(data);
     else this.make();
+    this.surround();
     this.relabel();
   }
 
@@ -112,7 +113,10 @@ export class TimePlot {
   }
 
   resize() {
-    if (!this.plot) return this.make();
+    if (!this.plot) {
+      this.make();
+      return this.surround();
+    }
     const width = this.place.clientWidth;
     if (this.rem !== rem()) return this.redraw(); // on another screen: fonts are fixed when a plot is made
     if (width && width !== this.width) {
@@ -130,6 +134,13 @@ export class TimePlot {
     this.plot?.destroy();
     this.plot = null;
     this.make();
+    this.surround();
+  }
+
+  // About a single time uPlot shows a thousand days; two minutes are enough.
+  surround() {
+    const [at] = this.data?.[0] ?? [];
+    if (this.plot && this.options.time && this.data[0].length === 1) this.plot.setScale("x", { min: at - 60, max: at + 60 });
   }
 
   close() {

@@ -60,9 +60,12 @@ export function travelText(gap, row) {
   return bound ? `≥ ${text}` : text;
 }
 
-// Unit in which positions of a machine are shown, and its factor.
-export const positionUnit = (machine) =>
-  machine && machine.travel_unit === "rad" ? { name: "deg", factor: DEG } : { name: "mm", factor: 1e3 };
+// Unit in which positions of a machine are shown, and its factor; before the first estimate the machine is not known.
+const POSITIONS = { rad: { name: "deg", factor: DEG }, m: { name: "mm", factor: 1e3 } };
+export const positionUnit = (machine) => POSITIONS[machine?.travel_unit] ?? { name: "m or rad", factor: 1 };
+
+// Unit of the command to a machine's actuator.
+export const commandUnit = (machine) => machine?.command_unit || "SI unit";
 
 // One unit for all wear rates of a table, after the largest.
 export function rateUnit(rates) {

@@ -3,7 +3,7 @@
 import * as api from "./api.js";
 import { legend, TimePlot } from "./charts.js";
 import { element, setText } from "./dom.js";
-import { positionUnit } from "./format.js";
+import { commandUnit, positionUnit } from "./format.js";
 
 const ASK_MS = 500, IDLE_MS = 3000, SHOWN_S = 30;
 const WORDS = {
@@ -84,10 +84,10 @@ export class LiveViewPanel {
 
   show() {
     const shown = Math.round(SHOWN_S / this.width);
-    const machine = this.machine() ?? { travel_unit: "m", command_unit: "V" }, unit = positionUnit(machine);
+    const machine = this.machine(), unit = positionUnit(machine);
     const time = Array.from({ length: shown }, (_, i) => (i - shown + 1) * this.width);
     const missing = new Array(shown - this.columns.length).fill(null);
-    const names = [["Position", unit.name, unit.factor], ["Error", unit.name, unit.factor], ["Command", machine.command_unit, 1]];
+    const names = [["Position", unit.name, unit.factor], ["Error", unit.name, unit.factor], ["Command", commandUnit(machine), 1]];
     names.forEach(([name, dimension, factor], k) => {
       const values = (which) => [...missing, ...this.columns.map((column) => (column[which] === null ? null : column[which] * factor))];
       this.plots[k].options.yLabel = `${name} (${dimension})`;

@@ -5,10 +5,10 @@ import * as api from "./api.js";
 import { ActsPanel } from "./acts.js";
 import { legend, loopPlot, TimePlot } from "./charts.js";
 import { element, fill, setText } from "./dom.js";
-import { ago, brief, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
+import { ago, brief, commandUnit, DEG, duration, gapText, limitInterval, limitText, linkOf, positionUnit, rateText, rateUnit, rowGapText, smallUnit, stamp, statusText, travelText } from "./format.js";
 import { LiveViewPanel } from "./live_view.js";
 import { ResidualPanel } from "./residual.js";
-import { chainTable, eventList, settingInForce, simulated } from "./updates.js";
+import { chainTable, eventList, FELL_BACK, settingInForce, simulated } from "./updates.js";
 import { WhatIfPanel } from "./what_if.js";
 
 const REFRESH_MS = 1500, EVERY = 20000, PART = 4 * EVERY; // samples that one answer holds undecimated
@@ -170,7 +170,7 @@ export class MachinePage {
     this.tile("gap", rowGapText(row), [statusText(row.status), travelText(row.gap, row)]);
     this.tile("rate", row.rate === null ? "–" : `${rateText(row.rate, row.rate_interval, unit)} ${unit.name}`, [row.rate === null ? "no trend yet" : "of machine time"]);
     this.tile("limit", limitText(row), [row.gap_limit === null ? "gap_limit_deg is not set" : `limit ${brief(row.gap_limit * DEG)} deg`, limitInterval(row)]);
-    this.tile("version", String(row.version_in_force ?? "–"), [row.version_sent === null ? "none was sent" : row.version_sent === row.version_in_force ? "the newest that was sent" : `${row.version_sent} was sent`, row.receipt && row.receipt !== "applied" ? `refused: ${row.receipt}` : ""]);
+    this.tile("version", String(row.version_in_force ?? "–"), versionNotes(row));
     this.tile("window", row.last_window ? ago(row.last_window.received, now) : "none yet", [row.last_window ? `number ${row.last_window.sequence} of boot ${row.last_window.boot}` : "", row.waiting ? (row.waiting === 1 ? "1 message waits" : `${row.waiting} messages wait`) : ""]);
     this.tile("link", link.word, [link.note ?? "", row.last_message === null ? "" : `last message ${ago(row.last_message, now)}`]);
     this.tiles.link[0].className = `mark ${link.kind}`;
@@ -206,7 +206,7 @@ export class MachinePage {
   marks() {
     if (!this.gaps) return [];
     const { versions, fallbacks } = this.gaps;
-    const marks = versions.filter((each) => each.applied !== null).map((each) => ({
+    const marks = versions.filter((each) => each.applied !== null && each.reason !== FELL_BACK).map((each) => ({
       at: each.answered, word: `v${each.version}`, color: each.applied ? "orange" : "red", dash: !each.applied,
     }));
     marks.push(...fallbacks.map((each) => ({ at: each.time, word: "fallback", color: "red", dash: true })));
@@ -333,8 +333,8 @@ export class MachinePage {
     this.positionPlot.show(stretch(joined(reference, position), [unit.factor, unit.factor]), `Reference and position in ${unit.name}`);
     const screw = position && machine.travel ? { time: position.time, values: position.values.map((value) => value / machine.travel) } : null;
     this.motorPlot.show(stretch(joined(motor, screw), [DEG, DEG]), "Angles of motor and screw in degrees");
-    this.voltagePlot.options.yLabel = `Command (${machine.command_unit})`;
-    this.voltagePlot.show(command ? [command.time, command.values] : [[], []], `Command in ${machine.command_unit}`);
+    this.voltagePlot.options.yLabel = `Command (${commandUnit(machine)})`;
+    this.voltagePlot.show(command ? [command.time, command.values] : [[], []], `Command in ${commandUnit(machine)}`);
     this.showLoop(motor, position, machine);
   }
 
@@ -384,6 +384,13 @@ function filled(values) {
     before = i;
   }
   return made.map((value) => (value === undefined ? null : value));
+}
+
+// What is known of the versions sent, beside the one in force. A fallback may have the number of an update that met it.
+function versionNotes({ version_sent: sent, version_in_force: inForce, receipt }) {
+  if (sent === null) return ["none was sent"];
+  if (receipt === FELL_BACK) return [FELL_BACK];
+  return [sent === inForce ? "the newest that was sent" : `${sent} was sent`, receipt && receipt !== "applied" ? `refused: ${receipt}` : ""];
 }
 
 const panel = (title, tools, ...children) =>

@@ -4,6 +4,8 @@ import { element } from "./dom.js";
 import { brief, DEG, gapText, stamp } from "./format.js";
 
 const cell = (content, number = false) => element("td", { class: number ? "number" : "" }, content);
+// Answer to an update that was on its way when the edge fell back: nothing is wrong with either.
+export const FELL_BACK = "the edge fell back meanwhile";
 const percent = (share) => `${brief(share * 100)} %`;
 
 export function chainTable(traces, gaps, unit) {
@@ -35,11 +37,12 @@ function row(trace, step, unit, machine) {
     cell(answerText(step)), cell(refused(step) ? "" : effectText(step.effect, unit), true));
 }
 
-// Setting of the version in force: of its update, or as the edge stated it at its start; null: unknown.
+// Setting of the version in force: of its update, or as the edge stated it at its start or when it fell back, which may
+// have taken the number of an update; null: unknown.
 export function settingInForce(traces, events, version) {
-  const steps = traces.flatMap((trace) => trace.steps).filter((step) => step.update.version === version);
-  const hello = events.find((one) => one.kind === "hello" && one.version === version);
-  return steps.at(-1)?.update.body?.setting ?? hello?.body?.setting ?? null;
+  const steps = traces.flatMap((trace) => trace.steps).filter((step) => step.update.version === version && !refused(step));
+  const stated = events.find((one) => (one.kind === "hello" && one.version === version) || (one.kind === "fallback" && one.body?.parameter_version === version));
+  return steps.at(-1)?.update.body?.setting ?? stated?.body?.setting ?? null;
 }
 
 // Dead zone and gains of an update, of any law, with their units.
@@ -64,6 +67,7 @@ function answerText(step) {
   const receipt = answer(step, "receipt"), fallback = answer(step, "fallback");
   if (fallback) return `left it for its fallback set: ${fallback.status}`;
   if (!receipt) return "has not answered yet";
+  if (receipt.status === FELL_BACK) return `did not apply it: ${FELL_BACK}, as version ${receipt.body?.parameter_version}`;
   return receipt.body?.applied ? "applied it" : `refused it: ${receipt.status}`;
 }
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +22,7 @@ from servotwin.redesign.certified.certificate import BeyondResult, Certificate, 
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.machines import SimulatedMachines, draw_independently
 from servotwin.redesign.certified.margins import margins_in_every_zone, own_static_gain, slow_response, widened
+from servotwin.redesign.certified.seeds import seed_of
 from servotwin.redesign.certified.settling_test import SettlingTest
 from servotwin.redesign.certified.tracking import follow_ramp
 from servotwin.redesign.certified.trial import Trial
@@ -157,7 +157,7 @@ class Attempt:
 
     def __init__(self, question: Question, setting: Design) -> None:
         self.question, self.setting = question, setting
-        self._seed = _seed(question.servo, question.uncertainty, setting, question.demands.seed)
+        self._seed = seed_of(question.servo, question.uncertainty, setting, question.demands.seed)
         self._measures: MachineMeasures | None = None
 
     def fails_early(self, hard: Sequence[SimulatedMachines]) -> bool:
@@ -338,13 +338,6 @@ class Attempt:
         )
 
 
-def with_feedforward(setting: Design, feedforward: float) -> Design:
-    """The setting with another feedforward, V."""
-    if setting.controller.feedforward == feedforward:
-        return setting
-    return Design(setting.controller.replace(feedforward=feedforward), setting.tolerance)
-
-
 def margins_missing(loop: LoopMargins, rate: float | None, demands: Demands) -> str:
     """Name the demand on margins that is not met; empty where all are met."""
     at = "" if rate is None else f" at {rate:g} Hz with up to {loop.delay} samples of delay"
@@ -374,15 +367,3 @@ def _lag(servo: Plant, law: AnyController) -> float:
     if integrates(law):
         return 0.0
     return abs(1.0 / (slow * abs(gain)) - running.velocity_feedforward) / abs(static_gain(law))
-
-
-def _seed(servo: Plant, uncertainty: Uncertainty, setting: Design, seed: int) -> int:
-    """Seed that depends on the whole question: equal ones are answered equally, others by other machines.
-
-    A feedforward counts by what it leaves of the bias.
-    """
-    fed = setting.controller.feedforward
-    left = [f"{bias + fed:.9g}" for bias in uncertainty.input_bias]
-    rest = with_feedforward(setting, 0.0), uncertainty.replace(input_bias=(0.0, 0.0))
-    question = repr((servo.version, rest, left, seed))
-    return int.from_bytes(hashlib.sha256(question.encode()).digest()[:7], "big")

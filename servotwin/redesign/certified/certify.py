@@ -19,7 +19,7 @@ from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates
 from servotwin.plant.plants import Plant, check_gap_in_loop
-from servotwin.redesign.certified.attempt import Attempt, Question, with_feedforward
+from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of, last_resort
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.demands import Demands
@@ -31,7 +31,7 @@ from servotwin.redesign.certified.margins import (
 from servotwin.redesign.certified.screening import Screening, has_widest_integral_zone, is_plain, opens_in_zone
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
-from servotwin.redesign.design import Design
+from servotwin.redesign.design import Design, with_feedforward
 
 _Gains = tuple[float, ...]
 # Gains with which integral action is tried: the best so many without it.

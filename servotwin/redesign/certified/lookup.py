@@ -23,12 +23,12 @@ from servotwin.messages import Setting
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
-from servotwin.redesign.certified.attempt import with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm, known_bias
 from servotwin.redesign.certified.learnt_servo import counts_learnt
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Range, Region, Uncertainty
+from servotwin.redesign.design import with_feedforward
 from servotwin.redesign.policy import Evidence, Redesign
 
 # Levels of width within which the running setting is preferred: a slightly cheaper one is not worth an update.

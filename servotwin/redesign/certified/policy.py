@@ -15,7 +15,6 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import NEAR
-from servotwin.redesign.certified.attempt import with_feedforward
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.demands import Demands
@@ -25,7 +24,7 @@ from servotwin.redesign.certified.last_search import Asked, LastSearch, digest_o
 from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import LearntFactors, Range, Region, Uncertainty
-from servotwin.redesign.design import Design
+from servotwin.redesign.design import Design, with_feedforward
 from servotwin.redesign.policy import Evidence, Redesign
 
 # Relative: a smaller change of a gain is not worth an update.
