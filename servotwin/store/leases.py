@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from servotwin.store.records import Lease, MessageKind, StoredMessage
-from servotwin.store.schema import VERIFICATIONS, WORK, bodies, messages, states, twins
+from servotwin.store.row_statement import RowStatement
+from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, messages, states, twins
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
@@ -70,9 +71,11 @@ def _taken(
         queues = [queues[n] for _, n in oldest]
     for query, share in queues:
         count = min(math.ceil(share * limit), limit - len(leased))
+        if not count:
+            break
         servos = connection.scalars(query, bound | {"_count": count}).all()
         if servos:
-            connection.execute(_LEASE, {"_servos": servos, **lease})
+            _LEASE.run(connection, ({"_servo": servo, **lease} for servo in sorted(servos)))
             leased += servos
     return leased
 
@@ -104,7 +107,7 @@ def load(
 ) -> list[Lease]:
     """State and pending messages of leased servos, in their order."""
     servos = [turn.servo for turn in turns]
-    rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos})}
+    rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos}).all()}
     pending = _pending(connection, servos, kinds, per_servo, newest_first)
     return [
         Lease(
@@ -162,11 +165,11 @@ def _pending(
 ) -> dict[str, list[StoredMessage]]:
     """Pending messages of each servo in the order of their commits; of the windows the first ones, or the newest."""
     pending: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
-    for queue in _NEWEST_FIRST if newest_first else _OLDEST_FIRST:
+    for queue in _WORK, _VERIFICATIONS:
         selected = queue & set(kinds)
         if selected:
-            query = _few_messages(selected, newest_first and MessageKind.WINDOW in selected)
-            for row in connection.execute(query, {"_servos": servos, "_per_servo": per_servo}):
+            query = _few_messages(selected, newest_first)
+            for row in connection.execute(query, {"_servos": servos, "_per_servo": per_servo}).all():
                 pending[row.servo].append(
                     StoredMessage(row.id, MessageKind(row.kind), row.body, row.encoding, row.received, row.key)
                 )
@@ -177,24 +180,29 @@ def _work_before_verifications(message: StoredMessage) -> tuple[bool, int]:
     return message.kind is MessageKind.VERIFICATION, message.id
 
 
-_OLDEST_FIRST = (frozenset(MessageKind) - {MessageKind.VERIFICATION}, frozenset({MessageKind.VERIFICATION}))
-_NEWEST_FIRST = tuple(frozenset({kind}) for kind in MessageKind)
-"""Kinds that share the places of a lease: where a part of the windows stays behind, no letter may."""
+_VERIFICATIONS = frozenset({MessageKind.VERIFICATION})
+_WORK = frozenset(MessageKind) - _VERIFICATIONS
 
 
 @lru_cache(maxsize=16)
 def _few_messages(kinds: frozenset[MessageKind], newest: bool) -> sa.Select[Any]:
-    """Query of the first, or newest, pending messages of each servo, of these kinds: verifications only, or others."""
-    verifications = MessageKind.VERIFICATION in kinds
-    order = messages.c.id.desc() if newest else messages.c.id.asc()
-    place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=order).label("place")
-    waiting = sa.select(messages.c.id, messages.c.servo, place)
-    waiting = waiting.where(VERIFICATIONS if verifications else WORK, messages.c.servo.in_(_SERVOS))
-    if len(kinds) == 1 and not verifications:
-        waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
+    """Query of the first pending messages of each servo, of these kinds: verifications only, or others.
+
+    `newest`: of the windows the last ones. Each kind then has places of its own: where a part of the windows stays
+    behind, no letter may.
+    """
+    sharing = ("servo", "kind") if newest else ("servo",)
+    order = sa.case((WINDOWS, -messages.c.id), else_=messages.c.id) if newest else messages.c.id
+    place = sa.func.row_number().over(partition_by=[messages.c[name] for name in sharing], order_by=order)
+    waiting = sa.select(messages.c.id, messages.c.servo, messages.c.kind, place.label("place"))
+    queue = VERIFICATIONS if kinds == _VERIFICATIONS else WORK
+    waiting = waiting.where(queue, messages.c.servo.in_(_SERVOS))
+    if kinds not in (_VERIFICATIONS, _WORK):
+        waiting = waiting.where(messages.c.kind.in_(sorted(kind.value for kind in kinds)))
     first = waiting.subquery()
     few = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
-    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=first.c.servo, order_by=first.c.place)
+    partition = [first.c[name] for name in sharing]
+    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=partition, order_by=first.c.place)
     sized = sa.select(first.c.id, first.c.place, so_far.label("so_far")).join(bodies, bodies.c.message == first.c.id)
     some = sized.where(few).subquery()
     known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
@@ -208,13 +216,15 @@ _NOBODY = "nobody"
 _SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
 _NOW = sa.bindparam("_now", type_=sa.Double)
 
-_LEASE = (
-    sa.update(twins)
-    .where(twins.c.servo.in_(_SERVOS))
-    .values(
-        lease_owner=sa.bindparam("_owner"),
-        lease_until=sa.bindparam("_until", type_=sa.Double),
-        attempts=twins.c.attempts + 1,
+_LEASE = RowStatement(
+    lambda _: (
+        sa.update(twins)
+        .where(twins.c.servo == sa.bindparam("_servo"))
+        .values(
+            lease_owner=sa.bindparam("_owner"),
+            lease_until=sa.bindparam("_until", type_=sa.Double),
+            attempts=twins.c.attempts + 1,
+        )
     )
 )
 _STATES = (
