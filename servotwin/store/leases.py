@@ -48,7 +48,11 @@ def acquire(
     new, estimates, backlogs = _queues(frozenset(kinds), only is not None)
     order = [(new, limit, False), (estimates, 1, True), (backlogs, limit, False)]
     for queues, most, estimate in [order[1], *order] if estimate_first else order:
-        servos = _taken(connection, queues, most, bound, {"_owner": owner, "_until": until})
+        granted = {"_owner": owner, "_until": until}
+        if most == 1:
+            servos = _taken_alone(connection, queues, bound, granted)
+        else:
+            servos = _taken(connection, queues, most, bound, granted)
         if servos:
             return [Turn(servo, estimate) for servo in servos]
     return []
@@ -62,22 +66,30 @@ def _taken(
     lease: dict[str, Any],
 ) -> list[str]:
     """Lease the next servos of queues that share `limit` places; returns their names."""
-    leased: list[str] = []
-    if limit == 1:
-        heads: list[tuple[Any, int]] = [
-            (connection.execute(query, bound | {"_count": 1}).one_or_none(), n) for n, (query, _) in enumerate(queues)
-        ]
-        oldest = sorted((head[1], n) for head, n in heads if head is not None)[:1]
-        queues = [queues[n] for _, n in oldest]
+    leased, emptied = list[str](), set[sa.Select[Any]]()
     for query, share in queues:
         count = min(math.ceil(share * limit), limit - len(leased))
-        if not count:
-            break
+        if not count or query in emptied:
+            continue
         servos = connection.scalars(query, bound | {"_count": count}).all()
-        if servos:
-            _LEASE.run(connection, ({"_servo": servo, **lease} for servo in sorted(servos)))
-            leased += servos
+        if len(servos) < count:
+            emptied.add(query)
+        _LEASE.run(connection, ({"_servo": servo, **lease} for servo in sorted(servos)))
+        leased += servos
     return leased
+
+
+def _taken_alone(
+    connection: sa.Connection, queues: Sequence[_Queue], bound: dict[str, Any], lease: dict[str, Any]
+) -> list[str]:
+    """Lease the servo that has waited longest in any of some queues; returns its name, where there is one."""
+    queries = dict.fromkeys(query for query, _ in queues)
+    heads: list[Any] = [connection.execute(query, bound | {"_count": 1}).one_or_none() for query in queries]
+    oldest = min((head for head in heads if head is not None), key=lambda head: head[1], default=None)
+    if oldest is None:
+        return []
+    _LEASE.run(connection, [{"_servo": oldest.servo, **lease}])
+    return [oldest.servo]
 
 
 def release(connection: sa.Connection, owner: str, servos: Collection[str] | None = None) -> None:
@@ -134,9 +146,8 @@ def _queues(kinds: frozenset[MessageKind], one: bool) -> tuple[list[_Queue], lis
         due, ready, estimate = twins.c.wake <= _NOW, twins.c.ready <= _NOW, twins.c.estimate_ready.is_not(None)
         # Half of the places at most before those with messages, the rest after them: neither queue can starve the
         # other.
-        new.append((_next(due, twins.c.wake, one), 0.5))
-        new.append((_next(ready, twins.c.ready, one), 1.0))
-        new.append((_next(due, twins.c.wake, one), 1.0))
+        woken = _next(due, twins.c.wake, one)
+        new += [(woken, 0.5), (_next(ready, twins.c.ready, one), 1.0), (woken, 1.0)]
         estimates.append((_next(estimate, twins.c.estimate_ready, one), 1.0))
         backlogs.append((_next(twins.c.ready.is_not(None), twins.c.ready, one), 1.0))
     if MessageKind.VERIFICATION in kinds:

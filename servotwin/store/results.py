@@ -142,7 +142,7 @@ _DONE = RowStatement(
     )
 )
 _ADD_CONTEXT = RowStatement(lambda dialect: insert_once(dialect, contexts), contexts.c.keys())
-_ADD_EVIDENCE = RowStatement(lambda _: sa.insert(evidence), [name for name in evidence.c.keys() if name != "id"])
+_ADD_EVIDENCE = RowStatement(lambda _: sa.insert(evidence), set(evidence.c.keys()) - {"id"})
 _ADD_OUTGOING = RowStatement(lambda _: sa.insert(outgoing), outgoing.c.keys())
 
 
@@ -165,7 +165,9 @@ def _advancing(names: tuple[str, ...]) -> RowStatement:
     queue = {
         "ready": _next_turn(), "verification_ready": _oldest_time(VERIFICATIONS), "estimate_ready": _next_estimate()
     }  # fmt: skip
-    return RowStatement(lambda _: sa.update(twins).where(twins.c.servo == sa.bindparam("_servo")).values(values | queue))
+    return RowStatement(
+        lambda _: sa.update(twins).where(twins.c.servo == sa.bindparam("_servo")).values(values | queue)
+    )
 
 
 def _upsert_state(dialect: str) -> Any:

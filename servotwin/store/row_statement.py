@@ -20,20 +20,22 @@ class RowStatement:
     Parameters
     ----------
     make : callable
-        Name of a dialect -> statement; called once for each.
+        Name of a dialect -> statement; called once for each database.
     columns : sequence of str
         Columns of an insert; none for an update, which names its parameters.
     """
 
     def __init__(self, make: Callable[[str], sa.Insert | sa.Update], columns: Iterable[str] = ()) -> None:
-        self._compiled = lru_cache(maxsize=2)(lambda dialect: _compile(make(dialect.name), dialect, list(columns)))
+        names = list(columns)
+        self._compiled = lru_cache(maxsize=8)(lambda dialect: _compile(make(dialect.name), dialect, names))
 
     def run(self, connection: sa.Connection, rows: Iterable[Row]) -> int:
         """Run it for each row, where there is one; returns the number of rows that were written."""
-        text, order, constants = self._compiled(connection.dialect)
-        bound: list[Any] = [{**constants, **row} for row in rows]
-        if not bound:
+        given = list(rows)
+        if not given:
             return 0
+        text, order, constants = self._compiled(connection.dialect)
+        bound: list[Any] = [{**constants, **row} for row in given]
         if order is not None:
             bound = [tuple(map(row.__getitem__, order)) for row in bound]
         return connection.exec_driver_sql(text, bound).rowcount

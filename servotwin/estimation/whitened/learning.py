@@ -221,7 +221,6 @@ def _take_turns(
     aligned: AlignedFit,
 ) -> LearntFit:
     """Fit factors, and gap and place, in turns; `aligned` is the fit with `factors`."""
-    here = adapted(servo, factors)
     for left in reversed(range(_TURNS)):
         whitened = aligned.whitened
         problem = FreeProblem(whitened.reduction, whitened.noise, servo, machine, aligned.largest)
@@ -232,4 +231,4 @@ def _take_turns(
         factors = free.factors
         here = adapted(servo, factors)
         aligned = align_and_fit(theta_m, position, rate, here, [free.point], settings, aligned)
-    return LearntFit(here, aligned, free, problem)
+    return LearntFit(adapted(servo, factors), aligned, free, problem)
