@@ -163,8 +163,8 @@ def test_a_window_that_does_not_show_the_gap_is_estimated() -> None:
     watch = watch_of(25.0 * DEG, boot=message.boot, version=message.parameter_version, time=message.middle)
     blind = glance(message, window, SERVO, watch)
     assert blind.moved
-    # Where nothing at all shows the gap, the plain fit may not even end.
-    reasons = ("at a glance the window shows the gap to", "the plain fit did not converge")
+    # Where nothing at all shows the gap, the quick fit may not even end.
+    reasons = ("at a glance the window shows the gap to", "the quick fit did not converge")
     assert any(reason in blind.why for reason in reasons)
     assert blind.std > 25.0 * DEG
     assert not glance(message, window, SERVO, watch, OFFSET).moved
