@@ -141,8 +141,9 @@ def _longest_good(rests: list[tuple[float, float, int, int]], fine: float) -> tu
 def _constant(window: Window) -> list[tuple[int, int]]:
     """(first, last) of every stretch with a constant reference."""
     assert window.reference is not None
-    changes = (np.flatnonzero(np.diff(window.reference)) + 1).tolist()
-    return list(pairwise([0, *changes, window.reference.size]))
+    reference = window.reference
+    changes = (np.flatnonzero(reference[1:] != reference[:-1]) + 1).tolist()
+    return list(pairwise([0, *changes, reference.size]))
 
 
 def _rests(

@@ -230,9 +230,9 @@ def _channel(where: str, name: str, values: ArrayLike) -> Array:
         raise InvalidInput(f"{where}{name} must be an array of numbers in {CHANNELS[name]}") from None
     if samples.ndim != 1 or samples.size < MINIMUM_SAMPLES:
         raise InvalidInput(f"{where}{name} has shape {samples.shape}: must be (n,) with n >= {MINIMUM_SAMPLES} samples")
-    wrong = np.flatnonzero(~np.isfinite(samples))
-    if wrong.size:
-        index = int(wrong[0])
+    finite = np.isfinite(samples)
+    if not finite.all():
+        index = int(np.argmin(finite))
         raise InvalidInput(
             f"{where}{name}[{index}] = {samples[index]} {CHANNELS[name]}: every sample must be a finite number"
         )

@@ -12,6 +12,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.engine import SQLITE
 from servotwin.store.records import Incoming, MessageKind, PutResult
+from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import bodies, messages, twins
 
 Name = tuple[str, str]
@@ -52,7 +53,7 @@ def _by_lock_order(items: Iterable[Incoming]) -> list[Incoming]:
 
 
 def _insert_servos(connection: sa.Connection, servos: Iterable[str]) -> None:
-    connection.execute(insert_once(connection.dialect.name, twins), [{"servo": servo} for servo in sorted(servos)])
+    _ADD_SERVO.run(connection, ({"servo": servo} for servo in sorted(servos)))
 
 
 def _insert(connection: sa.Connection, items: Sequence[Incoming]) -> dict[Name, int]:
@@ -60,9 +61,9 @@ def _insert(connection: sa.Connection, items: Sequence[Incoming]) -> dict[Name, 
     rows = connection.execute(_inserting(connection.dialect.name), [_row(item) for item in items])
     ids = {(servo, key): id_ for id_, servo, key in rows}
     # Bodies of new messages only: a repeated one has its body already.
-    filled = [{"message": ids[i.servo, i.key], "body": i.body} for i in items if (i.servo, i.key) in ids]
-    if filled:
-        connection.execute(sa.insert(bodies), filled)
+    _ADD_BODY.run(
+        connection, ({"message": ids[i.servo, i.key], "body": i.body} for i in items if (i.servo, i.key) in ids)
+    )
     return ids
 
 
@@ -83,8 +84,6 @@ def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
     The row is always written, changed or not: on PostgreSQL that waits for a result of the same servo that is being
     committed and has not seen these messages.
     """
-    if not new:
-        return
     windows = Counter(item.servo for item in new if item.kind is MessageKind.WINDOW)
     rows = [
         {
@@ -96,7 +95,7 @@ def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
         }
         for servo, group in _by_servo(new)
     ]
-    connection.execute(_MARK_READY, rows)
+    _MARK_READY.run(connection, rows)
 
 
 def _by_servo(items: Sequence[Incoming]) -> list[tuple[str, list[Incoming]]]:
@@ -135,15 +134,20 @@ def _earlier(column: sa.Column[Any], name: str) -> sa.ColumnElement[Any]:
     return sa.case((column.is_(None), value), (column > value, value), else_=column)
 
 
-_MARK_READY = (
-    sa.update(twins)
-    .where(twins.c.servo == sa.bindparam("_servo"))
-    .values(
-        windows=twins.c.windows + sa.bindparam("_windows", type_=sa.BigInteger),
-        # Not the latest time: a clock that was ahead and is right again would hide for as long that an edge is away.
-        last_message=sa.func.coalesce(sa.bindparam("_last_message", type_=sa.Double), twins.c.last_message),
-        ready=_earlier(twins.c.ready, "_ready"),
-        verification_ready=_earlier(twins.c.verification_ready, "_verification_ready"),
+_ADD_SERVO = RowStatement(lambda dialect: insert_once(dialect, twins), ("servo",))
+_ADD_BODY = RowStatement(lambda _: sa.insert(bodies), bodies.c.keys())
+_MARK_READY = RowStatement(
+    lambda _: (
+        sa.update(twins)
+        .where(twins.c.servo == sa.bindparam("_servo"))
+        .values(
+            windows=twins.c.windows + sa.bindparam("_windows", type_=sa.BigInteger),
+            # Not the latest time: a clock that was ahead and is right again would hide for as long that an edge is
+            # away.
+            last_message=sa.func.coalesce(sa.bindparam("_last_message", type_=sa.Double), twins.c.last_message),
+            ready=_earlier(twins.c.ready, "_ready"),
+            verification_ready=_earlier(twins.c.verification_ready, "_verification_ready"),
+        )
     )
 )
 

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import sqlalchemy as sa
 
 from servotwin.store.records import Lease, MessageKind, StoredMessage
-from servotwin.store.schema import VERIFICATIONS, WORK, bodies, messages, states, twins
+from servotwin.store.row_statement import RowStatement
+from servotwin.store.schema import VERIFICATIONS, WINDOWS, WORK, bodies, messages, states, twins
 
 MAX_LEASE_BYTES = 4 * 1024 * 1024
 """Bytes of the bodies in one lease; its first body may be larger."""
@@ -47,7 +48,11 @@ def acquire(
     new, estimates, backlogs = _queues(frozenset(kinds), only is not None)
     order = [(new, limit, False), (estimates, 1, True), (backlogs, limit, False)]
     for queues, most, estimate in [order[1], *order] if estimate_first else order:
-        servos = _taken(connection, queues, most, bound, {"_owner": owner, "_until": until})
+        granted = {"_owner": owner, "_until": until}
+        if most == 1:
+            servos = _taken_alone(connection, queues, bound, granted)
+        else:
+            servos = _taken(connection, queues, most, bound, granted)
         if servos:
             return [Turn(servo, estimate) for servo in servos]
     return []
@@ -61,20 +66,30 @@ def _taken(
     lease: dict[str, Any],
 ) -> list[str]:
     """Lease the next servos of queues that share `limit` places; returns their names."""
-    leased: list[str] = []
-    if limit == 1:
-        heads: list[tuple[Any, int]] = [
-            (connection.execute(query, bound | {"_count": 1}).one_or_none(), n) for n, (query, _) in enumerate(queues)
-        ]
-        oldest = sorted((head[1], n) for head, n in heads if head is not None)[:1]
-        queues = [queues[n] for _, n in oldest]
+    leased, emptied = list[str](), set[sa.Select[Any]]()
     for query, share in queues:
         count = min(math.ceil(share * limit), limit - len(leased))
+        if not count or query in emptied:
+            continue
         servos = connection.scalars(query, bound | {"_count": count}).all()
-        if servos:
-            connection.execute(_LEASE, {"_servos": servos, **lease})
-            leased += servos
+        if len(servos) < count:
+            emptied.add(query)
+        _LEASE.run(connection, ({"_servo": servo, **lease} for servo in sorted(servos)))
+        leased += servos
     return leased
+
+
+def _taken_alone(
+    connection: sa.Connection, queues: Sequence[_Queue], bound: dict[str, Any], lease: dict[str, Any]
+) -> list[str]:
+    """Lease the servo that has waited longest in any of some queues; returns its name, where there is one."""
+    queries = dict.fromkeys(query for query, _ in queues)
+    heads: list[Any] = [connection.execute(query, bound | {"_count": 1}).one_or_none() for query in queries]
+    oldest = min((head for head in heads if head is not None), key=lambda head: head[1], default=None)
+    if oldest is None:
+        return []
+    _LEASE.run(connection, [{"_servo": oldest.servo, **lease}])
+    return [oldest.servo]
 
 
 def release(connection: sa.Connection, owner: str, servos: Collection[str] | None = None) -> None:
@@ -104,7 +119,7 @@ def load(
 ) -> list[Lease]:
     """State and pending messages of leased servos, in their order."""
     servos = [turn.servo for turn in turns]
-    rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos})}
+    rows = {row.servo: row for row in connection.execute(_STATES, {"_servos": servos}).all()}
     pending = _pending(connection, servos, kinds, per_servo, newest_first)
     return [
         Lease(
@@ -131,9 +146,8 @@ def _queues(kinds: frozenset[MessageKind], one: bool) -> tuple[list[_Queue], lis
         due, ready, estimate = twins.c.wake <= _NOW, twins.c.ready <= _NOW, twins.c.estimate_ready.is_not(None)
         # Half of the places at most before those with messages, the rest after them: neither queue can starve the
         # other.
-        new.append((_next(due, twins.c.wake, one), 0.5))
-        new.append((_next(ready, twins.c.ready, one), 1.0))
-        new.append((_next(due, twins.c.wake, one), 1.0))
+        woken = _next(due, twins.c.wake, one)
+        new += [(woken, 0.5), (_next(ready, twins.c.ready, one), 1.0), (woken, 1.0)]
         estimates.append((_next(estimate, twins.c.estimate_ready, one), 1.0))
         backlogs.append((_next(twins.c.ready.is_not(None), twins.c.ready, one), 1.0))
     if MessageKind.VERIFICATION in kinds:
@@ -162,11 +176,11 @@ def _pending(
 ) -> dict[str, list[StoredMessage]]:
     """Pending messages of each servo in the order of their commits; of the windows the first ones, or the newest."""
     pending: dict[str, list[StoredMessage]] = {servo: [] for servo in servos}
-    for queue in _NEWEST_FIRST if newest_first else _OLDEST_FIRST:
+    for queue in _WORK, _VERIFICATIONS:
         selected = queue & set(kinds)
         if selected:
-            query = _few_messages(selected, newest_first and MessageKind.WINDOW in selected)
-            for row in connection.execute(query, {"_servos": servos, "_per_servo": per_servo}):
+            query = _few_messages(selected, newest_first)
+            for row in connection.execute(query, {"_servos": servos, "_per_servo": per_servo}).all():
                 pending[row.servo].append(
                     StoredMessage(row.id, MessageKind(row.kind), row.body, row.encoding, row.received, row.key)
                 )
@@ -177,24 +191,29 @@ def _work_before_verifications(message: StoredMessage) -> tuple[bool, int]:
     return message.kind is MessageKind.VERIFICATION, message.id
 
 
-_OLDEST_FIRST = (frozenset(MessageKind) - {MessageKind.VERIFICATION}, frozenset({MessageKind.VERIFICATION}))
-_NEWEST_FIRST = tuple(frozenset({kind}) for kind in MessageKind)
-"""Kinds that share the places of a lease: where a part of the windows stays behind, no letter may."""
+_VERIFICATIONS = frozenset({MessageKind.VERIFICATION})
+_WORK = frozenset(MessageKind) - _VERIFICATIONS
 
 
 @lru_cache(maxsize=16)
 def _few_messages(kinds: frozenset[MessageKind], newest: bool) -> sa.Select[Any]:
-    """Query of the first, or newest, pending messages of each servo, of these kinds: verifications only, or others."""
-    verifications = MessageKind.VERIFICATION in kinds
-    order = messages.c.id.desc() if newest else messages.c.id.asc()
-    place = sa.func.row_number().over(partition_by=messages.c.servo, order_by=order).label("place")
-    waiting = sa.select(messages.c.id, messages.c.servo, place)
-    waiting = waiting.where(VERIFICATIONS if verifications else WORK, messages.c.servo.in_(_SERVOS))
-    if len(kinds) == 1 and not verifications:
-        waiting = waiting.where(messages.c.kind.in_([kind.value for kind in kinds]))
+    """Query of the first pending messages of each servo, of these kinds: verifications only, or others.
+
+    `newest`: of the windows the last ones. Each kind then has places of its own: where a part of the windows stays
+    behind, no letter may.
+    """
+    sharing = ("servo", "kind") if newest else ("servo",)
+    order = sa.case((WINDOWS, -messages.c.id), else_=messages.c.id) if newest else messages.c.id
+    place = sa.func.row_number().over(partition_by=[messages.c[name] for name in sharing], order_by=order)
+    waiting = sa.select(messages.c.id, messages.c.servo, messages.c.kind, place.label("place"))
+    queue = VERIFICATIONS if kinds == _VERIFICATIONS else WORK
+    waiting = waiting.where(queue, messages.c.servo.in_(_SERVOS))
+    if kinds not in (_VERIFICATIONS, _WORK):
+        waiting = waiting.where(messages.c.kind.in_(sorted(kind.value for kind in kinds)))
     first = waiting.subquery()
     few = first.c.place <= sa.bindparam("_per_servo", type_=sa.Integer)
-    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=first.c.servo, order_by=first.c.place)
+    partition = [first.c[name] for name in sharing]
+    so_far = sa.func.sum(sa.func.length(bodies.c.body)).over(partition_by=partition, order_by=first.c.place)
     sized = sa.select(first.c.id, first.c.place, so_far.label("so_far")).join(bodies, bodies.c.message == first.c.id)
     some = sized.where(few).subquery()
     known = (messages.c[name] for name in ("servo", "id", "kind", "encoding", "received", "key"))
@@ -208,13 +227,15 @@ _NOBODY = "nobody"
 _SERVOS: sa.BindParameter[Any] = sa.bindparam("_servos", expanding=True)
 _NOW = sa.bindparam("_now", type_=sa.Double)
 
-_LEASE = (
-    sa.update(twins)
-    .where(twins.c.servo.in_(_SERVOS))
-    .values(
-        lease_owner=sa.bindparam("_owner"),
-        lease_until=sa.bindparam("_until", type_=sa.Double),
-        attempts=twins.c.attempts + 1,
+_LEASE = RowStatement(
+    lambda _: (
+        sa.update(twins)
+        .where(twins.c.servo == sa.bindparam("_servo"))
+        .values(
+            lease_owner=sa.bindparam("_owner"),
+            lease_until=sa.bindparam("_until", type_=sa.Double),
+            attempts=twins.c.attempts + 1,
+        )
     )
 )
 _STATES = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from itertools import groupby
 from typing import Any
@@ -13,6 +13,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from servotwin.store.engine import SQLITE
 from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
 from servotwin.store.records import EvidenceRecord, MessageKind, WorkResult
+from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import VERIFICATIONS, WORK, contexts, evidence, messages, outgoing, states, twins
 
 BACKLOG_LATER_S = 60.0
@@ -52,43 +53,33 @@ def _valid(connection: sa.Connection, results: Sequence[WorkResult]) -> dict[int
 
 def _write(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], now: float) -> None:
     results = [result for result, _ in valid]
-    _advance(connection, valid)
-    _states(connection, results)
+    _PUT_STATE.run(connection, ({"servo": result.servo, "state": result.state} for result in results))
     _done(connection, results, now)
     known = {key: text for result in results for key, text in result.contexts}
-    _insert_all(
-        connection,
-        insert_once(connection.dialect.name, contexts),
-        ({"key": key, "text": text} for key, text in sorted(known.items())),
-    )
+    _ADD_CONTEXT.run(connection, ({"key": key, "text": text} for key, text in sorted(known.items())))
     records = [(result.servo, record) for result in results for record in result.evidence]
     windows = _windows(connection, records)
-    _insert_all(connection, sa.insert(evidence), (_evidence_row(servo, each, windows, now) for servo, each in records))
-    _insert_all(
-        connection, sa.insert(outgoing), (row for result, last in valid for row in _outgoing_rows(result, last, now))
-    )
+    _ADD_EVIDENCE.run(connection, (_evidence_row(servo, each, windows, now) for servo, each in records))
+    _ADD_OUTGOING.run(connection, (row for result, last in valid for row in _outgoing_rows(result, last, now)))
     put(connection, [item for result in results for item in result.enqueue])
-    connection.execute(_RESCHEDULE, _places_in_queue(results, now))
+    _advance(connection, valid, now)
 
 
-def _advance(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]]) -> None:
-    """Advance the servos' serials, end their leases and update their summaries.
+def _advance(connection: sa.Connection, valid: Sequence[tuple[WorkResult, int]], now: float) -> None:
+    """Advance the servos' serials, end their leases, update their summaries and give them their places in the queue.
 
-    Consecutive results that set the same columns share one statement.
+    Consecutive servos that set the same columns share one statement. It comes last, so that it sees which messages are
+    left. On PostgreSQL the rows are locked since `_valid`: messages put before that are seen here; a later put waits
+    for the lock and marks the servo itself.
     """
-    rows = [(_summary(result.evidence), result, last) for result, last in valid]
-    for names, alike in groupby(rows, lambda row: tuple(sorted(row[0]))):
-        bound = [
-            {f"_{name}": value for name, value in known.items()}
-            | {"_servo": result.servo, "_serial": result.serial + 1, "_posted": last, "_wake": result.wake}
-            for known, result, last in alike
-        ]
-        connection.execute(_advancing(names), bound)
-
-
-def _states(connection: sa.Connection, results: Sequence[WorkResult]) -> None:
-    rows = [{"servo": result.servo, "state": result.state} for result in results]
-    connection.execute(_upsert_state(connection.dialect.name), rows)
+    summaries: dict[str, dict[str, Any]] = {}
+    rows = _places_in_queue([result for result, _ in valid], now)
+    for result, last in valid:
+        summaries[result.servo] = summaries.get(result.servo, {}) | _summary(result.evidence)
+        rows[result.servo] |= {"_serial": result.serial + 1, "_posted": last, "_wake": result.wake}
+    for names, alike in groupby(rows, lambda servo: tuple(sorted(summaries[servo]))):
+        bound = (rows[servo] | {f"_{name}": summaries[servo][name] for name in names} for servo in alike)
+        _advancing(names).run(connection, bound)
 
 
 def _done(connection: sa.Connection, results: Sequence[WorkResult], now: float) -> None:
@@ -98,15 +89,9 @@ def _done(connection: sa.Connection, results: Sequence[WorkResult], now: float) 
         for message in dict.fromkeys(result.done)
     ]
     # Every message is completed once: a result that covers another's message would make an effect happen twice.
-    if rows and connection.execute(_DONE, rows).rowcount != len(rows):
+    if _DONE.run(connection, rows) != len(rows):
         servos = ", ".join(sorted({result.servo for result in results}))
         raise ValueError(f"work result of {servos}: covers a message that is not an unprocessed one of its own")
-
-
-def _insert_all(connection: sa.Connection, statement: Any, rows: Iterable[dict[str, Any]]) -> None:
-    bound = list(rows)
-    if bound:
-        connection.execute(statement, bound)
 
 
 def _windows(connection: sa.Connection, records: Sequence[tuple[str, EvidenceRecord]]) -> dict[tuple[str, str], int]:
@@ -147,11 +132,18 @@ def _summary(records: Sequence[EvidenceRecord]) -> dict[str, Any]:
 
 _WINDOW_IDS = select_by_name(messages.c.id, messages.c.kind)
 
-_DONE = (
-    sa.update(messages)
-    .where(messages.c.id == sa.bindparam("_id"), messages.c.servo == sa.bindparam("_servo"), messages.c.done.is_(None))
-    .values(done=sa.bindparam("_now", type_=sa.Double))
+_DONE = RowStatement(
+    lambda _: (
+        sa.update(messages)
+        .where(
+            messages.c.id == sa.bindparam("_id"), messages.c.servo == sa.bindparam("_servo"), messages.c.done.is_(None)
+        )
+        .values(done=sa.bindparam("_now", type_=sa.Double))
+    )
 )
+_ADD_CONTEXT = RowStatement(lambda dialect: insert_once(dialect, contexts), contexts.c.keys())
+_ADD_EVIDENCE = RowStatement(lambda _: sa.insert(evidence), set(evidence.c.keys()) - {"id"})
+_ADD_OUTGOING = RowStatement(lambda _: sa.insert(outgoing), outgoing.c.keys())
 
 
 @lru_cache(maxsize=2)
@@ -166,22 +158,29 @@ def _locked_serials(dialect: str) -> sa.Select[Any]:
 
 
 @lru_cache(maxsize=32)
-def _advancing(names: tuple[str, ...]) -> sa.Update:
-    """Update of a servo's serial and of these columns."""
+def _advancing(names: tuple[str, ...]) -> RowStatement:
+    """Update of a servo's serial, of these columns, and of its places in the queue."""
     new = {name: sa.bindparam(f"_{name}", type_=twins.c[name].type) for name in ("serial", "posted", "wake", *names)}
     values = {"attempts": 0, "lease_owner": None, "lease_until": None} | new
-    return sa.update(twins).where(twins.c.servo == sa.bindparam("_servo")).values(values)
+    queue = {
+        "ready": _next_turn(), "verification_ready": _oldest_time(VERIFICATIONS), "estimate_ready": _next_estimate()
+    }  # fmt: skip
+    return RowStatement(
+        lambda _: sa.update(twins).where(twins.c.servo == sa.bindparam("_servo")).values(values | queue)
+    )
 
 
-@lru_cache(maxsize=2)
 def _upsert_state(dialect: str) -> Any:
     """Insert or replace a servo's state."""
     new = (sqlite.insert if dialect == SQLITE else postgresql.insert)(states)
     return new.on_conflict_do_update(index_elements=[states.c.servo], set_={"state": new.excluded.state})
 
 
-def _places_in_queue(results: Sequence[WorkResult], now: float) -> list[dict[str, Any]]:
-    """Parameters of `_RESCHEDULE`: of each servo the newest message that was looked at, and the one deferred."""
+_PUT_STATE = RowStatement(_upsert_state, states.c.keys())
+
+
+def _places_in_queue(results: Sequence[WorkResult], now: float) -> dict[str, dict[str, Any]]:
+    """Parameters of the places in the queue by servo: the newest message that was looked at, and the one deferred."""
     newest: dict[str, int] = {}
     deferred: dict[str, int | None] = {}
     for result in results:
@@ -189,10 +188,10 @@ def _places_in_queue(results: Sequence[WorkResult], now: float) -> list[dict[str
         if result.deferred is not None:
             deferred[result.servo] = result.deferred
     times = {"_later": now + BACKLOG_LATER_S, "_now": now}
-    return [
-        {"_servo": servo, "_newest": id_, "_deferred": deferred.get(servo), **times}
+    return {
+        servo: {"_servo": servo, "_newest": id_, "_deferred": deferred.get(servo), **times}
         for servo, id_ in sorted(newest.items())
-    ]
+    }
 
 
 def _oldest_time(queue: sa.ColumnElement[bool]) -> sa.ScalarSelect[Any]:
@@ -216,12 +215,3 @@ def _next_estimate() -> sa.ColumnElement[float]:
     """Place among the estimates: a servo keeps it until none of its windows is deferred any more."""
     since = sa.func.coalesce(twins.c.estimate_ready, sa.bindparam("_now", type_=sa.Double))
     return sa.case((_DEFERRED.is_(None), twins.c.estimate_ready), (_DEFERRED == 0, sa.null()), else_=since)
-
-
-# A separate statement after the serials were advanced: on PostgreSQL those rows are locked by then. Messages put before
-# that are seen here; a later put waits for the lock and marks the servo itself.
-_RESCHEDULE = (
-    sa.update(twins)
-    .where(twins.c.servo == sa.bindparam("_servo"))
-    .values(ready=_next_turn(), verification_ready=_oldest_time(VERIFICATIONS), estimate_ready=_next_estimate())
-)

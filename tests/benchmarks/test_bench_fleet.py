@@ -23,6 +23,7 @@ from benchmarks.fleet.processes import ProcessUsage, children, used
 from benchmarks.fleet.runs import FleetRun
 from benchmarks.fleet.setting import QUICK
 from benchmarks.fleet.stock import BOOT, COMMISSIONED, PERIOD, WindowSource, commissioned, readdressed
+from benchmarks.fleet.store import measure
 from benchmarks.fleet.tables import lines
 from benchmarks.fleet.watch import EDGES, TWIN, WORKERS, ResourceSample, ResourceWatch
 from servotwin.cli.app import app
@@ -329,3 +330,17 @@ def test_the_option_full_belongs_to_the_fleet_bench() -> None:
         shown = CliRunner().invoke(app, ["bench", *names, "--full"])
         assert shown.exit_code == 2
         assert "--full: only bench fleet or overload takes it" in shown.output
+
+
+def test_the_bench_of_a_store_counts_what_its_rounds_did(tmp_path: Path) -> None:
+    costs = []
+    for rounds in (3, 6):
+        store = open_store(f"sqlite:///{tmp_path}/{rounds}.db")
+        try:
+            costs.append(measure(store, 2, rounds))
+        finally:
+            store.close()
+    for what in ("write", "lease"):
+        few, many = (cost.statements[what] for cost in costs)
+        assert 0 < 2 * few == many
+        assert all(cost.seconds[what] > 0.0 for cost in costs)
