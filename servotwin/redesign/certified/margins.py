@@ -317,6 +317,6 @@ def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: AnyContro
 def with_margins(demands: Demands) -> Demands:
     """The part of the demands that the candidates depend on."""
     known = Demands()
-    names = ("Ms", "Ms_worst", "scales", "shapes", "learnt_shapes", "notch", "notch_shapes")
-    names += ("motor_shapes", "integral", "beyond")
+    shapes = ("shapes", "learnt_shapes", "notch_shapes", "motor_shapes")
+    names = ("Ms", "Ms_worst", "scales", "notch", "integral", "beyond", *shapes)
     return replace(known, **{name: getattr(demands, name) for name in names})
