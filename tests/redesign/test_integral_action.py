@@ -90,6 +90,8 @@ def test_a_motor_that_friction_holds_may_move_again_much_later() -> None:
     assert resting._long is not None
     assert hunting._long.settled < 1.0
     assert resting._long.settled == 1.0
+    # One that hunts on the first few is not simulated on the others.
+    assert (hunting._long.machines, resting._long.machines) == (12, 60)
     assert resting._long.duration == pytest.approx(20.0 * question().trial.duration)
     assert "stays at rest" in question().shortcoming(replace(resting.certificate(), long=hunting._long))
 

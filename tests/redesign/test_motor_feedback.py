@@ -65,6 +65,33 @@ def test_the_motors_error_has_no_zone_of_the_lost_motion_and_its_integral_acts_b
     assert integral_shares(on_motor("robot-joint"), Demands()) == (0.0, 0.1, 0.3, 1.0)
 
 
+def test_a_shorter_filter_is_tried_where_the_bounds_leave_less_than_half_of_the_own_gain() -> None:
+    """The derivative action of `robot-joint` lags at the resonance of its shaft, that of `gantry` does not."""
+    joint = on_motor("robot-joint")
+    known = Uncertainty(gap=(0.0, 0.1), step=(0.03, 0.15))
+    for axis, short in ((joint, True), (GANTRY, False)):
+        laws = [each.controller for each in candidates_of(axis, known, Demands(), disturbed=True, noisy=False)]
+        fastest = max(laws, key=lambda law: law.Kp)
+        assert (fastest.Tf < 0.5 * axis.pidf.Tf) == short
+    load = Axis.preset("robot-joint")
+    laws = [each.controller for each in candidates_of(load, known, Demands(), disturbed=True, noisy=False)]
+    assert min(law.Tf for law in laws) > 0.5 * load.pidf.Tf
+
+
+@pytest.mark.slow
+def test_a_robot_joint_that_reads_its_motor_has_a_setting_that_rests_on_fresh_machines() -> None:
+    joint = on_motor("robot-joint")
+    known = Uncertainty(gap=(0.4, 0.5), step=(0.03, 0.17))
+    demands = Demands(machines=60, settled=0.95, beyond=Beyond(machines=20))
+    found = certify(joint, known, demands)
+    assert isinstance(found, Certificate)
+    fresh = draw_independently(joint, known, 60, 987)
+    (setting,) = assess([found.setting], fresh, trial_for(joint, known, demands))
+    assert setting.settled.mean() >= 0.95
+    assert found.loop is not None
+    assert found.loop.Ms_worst <= demands.Ms_worst
+
+
 @pytest.mark.slow
 def test_a_setting_of_a_semi_closed_loop_is_verified_and_rests_on_machines_of_its_own() -> None:
     demands = Demands(machines=60, settled=0.95, beyond=Beyond(machines=20))

@@ -10,9 +10,10 @@ from itertools import islice
 import numpy as np
 import pytest
 
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import screening as module
-from servotwin.redesign.certified.assess import assess
+from servotwin.redesign.certified.assess import assess, steady_error
 from servotwin.redesign.certified.attempt import ROUNDED, Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.certify import _shortlist
@@ -130,6 +131,26 @@ def test_after_the_first_the_settings_that_settle_most_surely_are_verified() -> 
     assert tried(Screening(question), [*plain, *far], far) == [*plain[:3], *far[:3]]
 
 
+def test_a_refusal_names_the_largest_step_that_would_allow_what_friction_leaves() -> None:
+    """`gantry` in steps of up to 2.5 mm: friction of 1.56 N m holds 750 N m/m 2.08 mm off, less what is fed forward; a
+    tenth of the step may be left, and two counts."""
+    gantry, known = Axis.preset("gantry"), Uncertainty(gap=(0.0, 0.02), step=(1e-4, 2.5e-3))
+    question = Question(gantry, known, DEMANDS, trial_for(gantry, known, DEMANDS), noise=0.0)
+    law = gantry.pidf.replace(Kp=750.0, Kd=150.0, Ki=0.0)
+    left = 1.25 * gantry.own_friction / 750.0
+    assert steady_error(Design(law, 0.0), gantry, known) == pytest.approx(left)
+    fed = Design(law.replace(friction_feedforward=0.9), 0.0)
+    assert steady_error(fed, gantry, known) == pytest.approx(left - 0.9 / 750.0)
+    assert steady_error(Design(law.replace(Ki=50.0), 0.0), gantry, known) == 0.0
+    tried = Attempt(question, Design(law, 0.0)).certificate()
+    needed = (left - 2.0 * gantry.position_resolution) / DEMANDS.error
+    refused = f"may hold it {1e3 * left:.3g} mm off, which is allowed where the largest stated step is at least"
+    assert f"{refused} {1e3 * needed:.3g} mm, not 2.5 mm" in question.shortcoming(tried)
+    enough = replace(question, uncertainty=known.replace(step=(1e-4, 1.0001 * needed)))
+    assert not exceeds_error_limit(enough, Design(law, 0.0))
+    assert exceeds_error_limit(question, Design(law, 0.0))
+
+
 def test_what_friction_leaves_at_most_counts_and_not_where_a_few_machines_stop() -> None:
     """Friction of 40 mV holds a motor up to 29 um off under the servo's own Kp; 25 um are allowed."""
     friction = 0.04 * SERVO.k_T / SERVO.R
@@ -140,5 +161,7 @@ def test_what_friction_leaves_at_most_counts_and_not_where_a_few_machines_stop()
     assert exceeds_error_limit(question, calm)
     assert not exceeds_error_limit(question, lively)
     assert Screening(question).fails(calm)
+    # A tenth of the largest step of 2.5 mm is more than these 25 um already.
+    assert not question._larger_step(calm)
     integral = Design(SERVO.controller.replace(Ki=0.01 * SERVO.controller.Ki))
     assert not exceeds_error_limit(question, integral)

@@ -14,7 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.control.retuning import friction_feedforward, rest_gain
+from servotwin.control.retuning import friction_feedforward, integrates, rest_gain
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures
 from servotwin.hybrid.trajectory import ZenoError
@@ -23,6 +23,7 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.redesign.certified.machines import SimulatedMachines
 from servotwin.redesign.certified.trial import Trial
+from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
 from servotwin.simulation.ensemble import Cases, summarise_members
 from servotwin.simulation.sampled_ensemble import SampledCases, summarise_sampled
@@ -273,6 +274,17 @@ def arrival_error(setting: Design, model: Plant, input_bias: Array, friction: Ar
     held = model.command_of(friction) + abs(friction_feedforward(law))
     steady = (np.abs(input_bias + law.feedforward) + held) / rest_gain(law)
     return np.asarray(NEAR * step + steady + law.leave * setting.tolerance + COUNTS * model.position_resolution)
+
+
+def steady_error(setting: Design, model: Plant, known: Uncertainty) -> float:
+    """m, that input bias and friction may hold the loop off its reference; 0 with integral action."""
+    law = setting.controller
+    if integrates(law):
+        return 0.0
+    bias = max(abs(end + law.feedforward) for end in known.input_bias)
+    most = known.friction[1] + known.own_friction_of(model)[1]
+    held = max(0.0, float(model.command_of(most)) - abs(friction_feedforward(law)))
+    return (bias + held) / rest_gain(law)
 
 
 def _of(figures: Figures, setting: int) -> Figures:

@@ -69,6 +69,9 @@ class Demands:
     notch_shapes : tuple of (float, float)
         Shapes tried with a notch at the structure's first resonance, on a machine that was learnt; on any other one
         only where nothing else is within the bounds.
+    motor_shapes : tuple of (float, float)
+        Shapes tried where a filtered PID reads the motor and nothing with half of its gain is within the bounds: a
+        shorter filter leaves the derivative action its phase at the resonance of the shaft, which it then damps.
     integral : tuple of float
         Factors on Ki, tried where there is friction, or where the input bias is known to no better than `known`.
     known : float
@@ -158,6 +161,7 @@ class Demands:
     shapes: tuple[tuple[float, float], ...] = ((1.0, 1.0), (1.5, 0.85), (2.0, 0.7))
     learnt_shapes: tuple[tuple[float, float], ...] = ((1.2, 0.85), (1.5, 0.7))
     notch_shapes: tuple[tuple[float, float], ...] = ((1.0, 0.25), (1.0, 1.0))
+    motor_shapes: tuple[tuple[float, float], ...] = ((5.0, 0.1), (10.0, 0.1))
     integral: tuple[float, ...] = (0.0, 0.01, 0.02, 0.03)
     stops: tuple[tuple[float, float], ...] = ((0.02, 1.0), (0.05, 2.0), (0.1, 2.0))
     velocity: tuple[float, ...] = (0.3, 0.5)

@@ -173,6 +173,9 @@ def laws_within(
     laws += _scaled_laws(own, demands, demands.learnt_shapes, integral) if uncertainty.learnt is not None else []
     always = {scaled(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
     within = _lively(laws, passes, always)
+    if servo.at_motor and isinstance(own, Controller) and _all_slow(within, own):
+        laws += _scaled_laws(own, demands, demands.motor_shapes, integral)
+        within = _lively(laws, passes, always)
     if notched is not None and (uncertainty.learnt is not None or not within):
         with_it = _scaled_laws(notched, demands, demands.notch_shapes, integral)
         within += _lively(with_it, passes, set())
@@ -199,6 +202,11 @@ def _lively(
     fastest = next((law for law in sorted(laws, key=lambda law: -abs(strength(law))) if passes(law)), None)
     least = math.inf if fastest is None else _WORTH_TRYING * abs(strength(fastest))
     return [law for law in laws if (abs(strength(law)) >= least or law in always) and passes(law)]
+
+
+def _all_slow(laws: list[AnyController], own: AnyController) -> bool:
+    """True where none of the laws has at least half of the own gain."""
+    return all(abs(strength(law)) < _WORTH_TRYING * abs(strength(own)) for law in laws)
 
 
 def with_notch(servo: Plant) -> Controller | Cascade | None:
@@ -309,5 +317,6 @@ def margins_in_every_zone(servo: Plant, uncertainty: Uncertainty, law: AnyContro
 def with_margins(demands: Demands) -> Demands:
     """The part of the demands that the candidates depend on."""
     known = Demands()
-    names = ("Ms", "Ms_worst", "scales", "shapes", "learnt_shapes", "notch", "notch_shapes", "integral", "beyond")
+    shapes = ("shapes", "learnt_shapes", "notch_shapes", "motor_shapes")
+    names = ("Ms", "Ms_worst", "scales", "notch", "integral", "beyond", *shapes)
     return replace(known, **{name: getattr(demands, name) for name in names})

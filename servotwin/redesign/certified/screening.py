@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.control.controller import Controller
-from servotwin.control.retuning import friction_feedforward, integrates, rest_gain
-from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined
+from servotwin.control.retuning import friction_feedforward, integrates
+from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined, steady_error
 from servotwin.redesign.certified.attempt import ROUNDED, Question
 from servotwin.redesign.certified.machines import draw
 from servotwin.redesign.certified.margins import has_slow_integral
@@ -59,12 +59,8 @@ def exceeds_error_limit(question: Question, setting: Design) -> bool:
 
     The few machines that rank may stop nearer by chance.
     """
-    known, servo, law = question.uncertainty, question.servo, setting.controller
-    bias = max(abs(end + law.feedforward) for end in known.input_bias)
-    most = known.friction[1] + known.own_friction_of(servo)[1]
-    held = max(0.0, servo.command_of(most) - abs(friction_feedforward(law)))
-    left = (bias + held) / rest_gain(law)
-    return not integrates(law) and left > ROUNDED * question.largest_error(setting)
+    left = steady_error(setting, question.servo, question.uncertainty)
+    return left > ROUNDED * question.largest_error(setting)
 
 
 @dataclass(frozen=True, order=True)
