@@ -38,7 +38,7 @@ def test_a_number_of_intervals_is_an_integer_to_compiled_code() -> None:
     lifted = lifted_in([np.zeros(size) for size in lifted_counts(4, 2, 1)], 4, 2)
     low, high, slack, squares = -np.ones(2), np.ones(2), np.zeros(2), np.zeros(2)
     out = np.zeros(2 * (3 * FINE + 1 + 4))
-    found.append(clean_part(lifted, 0, 2, FINE, 8, low, high, slack, 0.0, squares, np.zeros(4), out))
+    found.append(clean_part(lifted, lifted.sizes, 0, 2, FINE, 8, low, high, slack, 0.0, squares, np.zeros(4), out))
     assert [(type(number), number) for number in found] == [(int, 8), (int, 8)]
 
 

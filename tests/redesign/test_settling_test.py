@@ -114,3 +114,10 @@ def test_the_second_sample_ends_as_soon_as_too_many_fail(monkeypatch: pytest.Mon
     found = attempt.decided()
     assert (found.members, attempt.verified()) == (32, None)
     assert found.settled_least == pytest.approx(beta.ppf(0.05, 28, 5))
+
+
+def test_where_no_machine_may_fail_there_is_no_second_sample(monkeypatch: pytest.MonkeyPatch) -> None:
+    attempt = tried(monkeypatch, [1])
+    strict = Attempt(replace(attempt.question, demands=replace(FEW, failures=0)), CALM)
+    assert strict.question.settling.whole == 16
+    assert (strict.decided().members, strict.verified()) == (16, None)

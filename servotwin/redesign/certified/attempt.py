@@ -69,7 +69,8 @@ class Question:
     @cached_property
     def settling(self) -> SettlingTest:
         """Test of the share that settles."""
-        return SettlingTest(self.demands.settled, self.demands.confidence, self.demands.machines)
+        demands = self.demands
+        return SettlingTest(demands.settled, demands.confidence, demands.machines, demands.failures)
 
     @cached_property
     def settling_beyond(self) -> SettlingTest:
@@ -193,7 +194,7 @@ class Attempt:
         for machines in hard:
             (few,) = assess([setting], machines, question.trial)
             missed += int(question.missed(setting, few).sum())
-            if missed > _MOST_HARD * count:
+            if missed > (_MOST_HARD * count if question.demands.failures else 0):
                 return True
         return self._ramp.settled < 1.0
 

@@ -91,6 +91,8 @@ class Demands:
         Plants that rank the candidates, and conditions of each.
     machines : int
         Machines of the first sample of a verification, drawn independently of one another and of those that rank.
+    failures : int
+        Machines that may fail in a larger sample, where so few of the first one do; 0: there is no larger sample.
     attempts : int
         Candidates that are verified before the search gives up, each on machines of its own; then as many of each
         kind that settles most surely.
@@ -171,6 +173,7 @@ class Demands:
     screened: int = 4
     conditions: int = 8
     machines: int = 300
+    failures: int = 3
     attempts: int = 6
     seed: int = 0
 

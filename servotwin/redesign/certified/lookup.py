@@ -217,7 +217,7 @@ def certify_cell(policy: CertifiedPolicy, grid: Grid, key: CellIndex) -> Certifi
     bias, limit = grid.biases[key.bias], policy.servo.controller.voltage_limit
     known = policy.uncertainty.replace(gap=cell_range(grid, policy.uncertainty.gap, key), input_bias=(-bias, bias))
     lower = policy.servo if limit is None else policy.servo.replace(voltage_limit=limit - policy.feedforward_limit)
-    noise, demands = grid.noises[key.noise], policy.demands_within_band()
+    noise, demands = grid.noises[key.noise], replace(policy.demands_within_band(), failures=0)
     found = certify(lower, known, demands, policy.simulations, 0.0, noise, policy.clock)
     if isinstance(found, Certificate) and found.saturated:
         found = certify(policy.servo, known, demands, policy.simulations, 0.0, noise, policy.clock)
@@ -233,7 +233,8 @@ def _with_feedforwards(
     policy: CertifiedPolicy, known: Uncertainty, found: Certificate, noise: float
 ) -> Certificate | NotVerified:
     """Certificate whose worst effort and settling are those with the largest feedforwards, too, limits included."""
-    (low, high), most, demands = known.input_bias, policy.feedforward_limit, policy.demands_within_band()
+    (low, high), most = known.input_bias, policy.feedforward_limit
+    demands = replace(policy.demands_within_band(), failures=0)
     worst = found
     for feedforward in (-most, most) if most else ():
         biased = known.replace(input_bias=(low - feedforward, high - feedforward))

@@ -13,8 +13,6 @@ from functools import cached_property
 
 from servotwin.errors import InvalidInput
 
-# Failures in both stages together that the second one accepts, beyond those that the first one does.
-_MORE = 3
 # Largest second sample, in first ones; halvings that tell a share to rounding.
 _LONGEST, _BISECTIONS = 5, 60
 
@@ -30,11 +28,14 @@ class SettlingTest:
         most 1 - confidence.
     first : int
         Machines of the first stage.
+    more : int
+        Failures that both stages together accept, beyond those that the first one does; 0: there is no second stage.
     """
 
     share: float
     confidence: float
     first: int
+    more: int = 3
 
     @cached_property
     def allowed_first(self) -> int:
@@ -49,9 +50,9 @@ class SettlingTest:
     @cached_property
     def whole(self) -> int:
         """Machines of both stages; those of the first where none is large enough."""
-        if self.allowed_first < 0:
+        if self.allowed_first < 0 or not self.more:
             return self.first
-        most, sizes = self.allowed_first + _MORE, range(self.first + 1, _LONGEST * self.first + 1)
+        most, sizes = self.allowed_first + self.more, range(self.first + 1, _LONGEST * self.first + 1)
         rare = 1.0 - self.confidence
         place = bisect_left(sizes, True, key=lambda machines: self._passing(self.share, most, machines) <= rare)
         return sizes[place] if place < len(sizes) else self.first
@@ -59,7 +60,7 @@ class SettlingTest:
     @property
     def allowed(self) -> int:
         """Failures with which the second stage passes, or the first where there is no second."""
-        return self.allowed_first + (_MORE if self.whole > self.first else 0)
+        return self.allowed_first + (self.more if self.whole > self.first else 0)
 
     def is_refused(self, failures: int) -> bool:
         """True where no further machines can make a setting pass."""
