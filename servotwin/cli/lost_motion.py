@@ -24,8 +24,6 @@ from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
 from servotwin.estimation.kinematic.travel import StatedTravel, in_stated_unit
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
-from servotwin.logs.formats import WRITTEN
-from servotwin.logs.log import read_columns
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
 from servotwin.plant.plants import Plant, resolve_plant
 
@@ -33,13 +31,6 @@ _Answer = tuple[RecordedLog, TransmissionGap]
 _DATED = 3e8  # s since 1970: smaller times are no dates
 _DAY = re.compile(r"\d{4}-\d\d-\d\d$")
 _PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
-
-
-def describes_its_machine(path: Path) -> bool:
-    """True for a log that holds its servo, as `servotwin simulate` writes it."""
-    if path.suffix.lower() not in WRITTEN:
-        return False
-    return isinstance(read_columns(path, ()).metadata.get("servo"), str)
 
 
 def show(

@@ -160,9 +160,9 @@ def identify(
 ) -> None:
     """Estimate the gap from recordings of two encoders, or with a model of the machine (--servo, or the log's own)."""
     from servotwin.cli.identify import IdentifyOptions, show
-    from servotwin.cli.lost_motion import describes_its_machine
     from servotwin.cli.lost_motion import show as show_lost_motion
     from servotwin.estimation.kinematic.travel import stated_travel
+    from servotwin.logs.log import describes_its_machine
     from servotwin.logs.recordings import RecordingColumns
 
     columns = RecordingColumns(motor, load, command, time, rate, motor_unit, load_unit)

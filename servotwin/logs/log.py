@@ -69,6 +69,13 @@ def read_log(path: Path) -> Log:
     return Log(whole, columns.metadata, names)
 
 
+def describes_its_machine(path: Path) -> bool:
+    """True for a log that holds its servo, as `servotwin simulate` writes it."""
+    if path.suffix.lower() not in WRITTEN:
+        return False
+    return isinstance(read_columns(path, ()).metadata.get("servo"), str)
+
+
 def read_columns(path: Path, requested: Requested) -> LogColumns:
     """Read columns by name, or those that are chosen among all names, from a log of any known format.
 

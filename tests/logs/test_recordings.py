@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from recordings import csv, recording, rows
 
-from servotwin.cli.lost_motion import describes_its_machine
 from servotwin.errors import InvalidInput
 from servotwin.estimation.kinematic.lost_motion import estimate_lost_motion
 from servotwin.logs import formats
 from servotwin.logs.cleaning import cleaned
 from servotwin.logs.columns import LogColumns, SignalTable, among
-from servotwin.logs.log import read_log, write_log
+from servotwin.logs.log import describes_its_machine, read_log, write_log
 from servotwin.logs.recordings import RecordingColumns, read_recording
 
 GAP, RATIO = 0.05, 0.1

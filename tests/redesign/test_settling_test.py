@@ -6,14 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import beta, binom
+from scipy.stats import beta, binom, binomtest
 
+from servotwin.errors import InvalidInput
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import attempt as module
 from servotwin.redesign.certified.assess import MachineMeasures
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.demands import Beyond, Demands
-from servotwin.redesign.certified.settling_test import SettlingTest
+from servotwin.redesign.certified.settling_test import SettlingTest, share_at_least
 from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
@@ -72,6 +73,22 @@ def test_other_results_have_the_bound_of_one_sample() -> None:
 def test_a_sample_that_is_too_small_for_any_pass_has_no_second_stage() -> None:
     test = SettlingTest(0.99, 0.95, 16)
     assert (test.allowed_first, test.whole, test.is_open(0), test.is_refused(1)) == (-1, 16, False, True)
+
+
+# --- bounds of a share
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (7, 10), (299, 300), (300, 300)])
+def test_the_share_is_at_least_the_bound_of_clopper_and_pearson(successes: int, trials: int) -> None:
+    exact = binomtest(successes, trials, alternative="greater").proportion_ci(0.95, "exact").low
+    assert share_at_least(successes, trials, 0.95) == pytest.approx(exact, abs=1e-12)
+
+
+def test_three_hundred_machines_without_a_failure_show_ninety_nine_percent() -> None:
+    assert share_at_least(300, 300, 0.95) == pytest.approx(0.05 ** (1.0 / 300.0))
+    assert share_at_least(299, 300, 0.95) < 0.99 < share_at_least(300, 300, 0.95)
+    with pytest.raises(InvalidInput, match="4 successes in 3 trials"):
+        share_at_least(4, 3, 0.95)
 
 
 # --- of a setting

@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from exploration import extent
-from scipy import stats
 
 from servotwin.commissioning.guarding import guarding
 from servotwin.control.retuning import law_for_margins
@@ -31,7 +30,6 @@ from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.machines import draw, draw_independently, extreme_plants
 from servotwin.redesign.certified.margins import loop_margins, widened
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.certified.settling_test import share_at_least
 from servotwin.redesign.certified.trial import Trial, trial_for
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors, Uncertainty
 from servotwin.redesign.design import Design
@@ -76,22 +74,6 @@ def test_equal_questions_are_answered_on_the_same_machines(known: Uncertainty, s
     found = Attempt(Question(SERVO, known, SMALL, trial, 0.0), setting)._members
     assert np.array_equal(found.gap, expected.gap)
     assert found.plants == expected.plants
-
-
-# --- bounds of a share
-
-
-@pytest.mark.parametrize(("successes", "trials"), [(0, 10), (7, 10), (299, 300), (300, 300)])
-def test_the_share_is_at_least_the_bound_of_clopper_and_pearson(successes: int, trials: int) -> None:
-    exact = stats.binomtest(successes, trials, alternative="greater").proportion_ci(0.95, "exact").low
-    assert share_at_least(successes, trials, 0.95) == pytest.approx(exact, abs=1e-12)
-
-
-def test_three_hundred_machines_without_a_failure_show_ninety_nine_percent() -> None:
-    assert share_at_least(300, 300, 0.95) == pytest.approx(0.05 ** (1.0 / 300.0))
-    assert share_at_least(299, 300, 0.95) < 0.99 < share_at_least(300, 300, 0.95)
-    with pytest.raises(InvalidInput, match="4 successes in 3 trials"):
-        share_at_least(4, 3, 0.95)
 
 
 # --- the loop that runs
