@@ -1,7 +1,7 @@
 """Gap of an axis from the motor's encoder and the command alone: the motor feels the load through the shaft.
 
 Motor and load are simulated together under the command, contacts included, and fitted to the motor's angle, with the
-numbers of both free within what is known of them. docs/estimator.md explains it.
+numbers of both free within what is known of them. docs/estimator-axes.md explains it.
 """
 
 from __future__ import annotations

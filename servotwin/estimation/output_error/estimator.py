@@ -1,7 +1,7 @@
 """Gap of an axis whose shaft is free in the gap, or of one mass behind a rigid screw, by an output-error fit.
 
 The load's motion under the measured motion of the motor is simulated exactly, contacts included, and fitted to the
-measured position with the axis's numbers free within what is known of them. docs/estimator.md explains it.
+measured position with the axis's numbers free within what is known of them. docs/estimator-axes.md explains it.
 """
 
 from __future__ import annotations

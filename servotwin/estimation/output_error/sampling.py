@@ -13,7 +13,8 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.plants import Plant
 
-# In a period of that swing: with fewer, random axes had accepted gaps outside of their intervals (docs/estimator.md).
+# In a period of that swing: with fewer, random axes had accepted gaps outside of their intervals
+# (docs/estimator-axes.md).
 _SAMPLES = 7.0
 
 
