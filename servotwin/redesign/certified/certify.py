@@ -179,13 +179,14 @@ def _plainer(question: Question, screening: Screening, found: Design) -> Certifi
 def _narrower(
     question: Question, screening: Screening, found: Certificate, hard: Sequence[SimulatedMachines]
 ) -> Certificate:
-    """The setting with a narrower zone that stops its integral, where that costs less and is verified too.
+    """The setting with a narrower zone that stops its slow integral, where that costs less and is verified too.
 
     The zones of the candidates are far apart, and most of the cost is the error that a zone leaves. Many narrower ones
     fail: such a one is given up at the first failure that the first sample does not allow, which takes little time.
     """
     setting, least = found.setting, COUNTS * question.servo.position_resolution
-    if not (setting.tolerance and setting.controller.integral_only and integrates(setting.controller)):
+    stops = setting.tolerance > 0.0 and setting.controller.integral_only and integrates(setting.controller)
+    if not (stops and has_slow_integral(question.servo)):
         return found
     strict = replace(question, demands=replace(question.demands, failures=0))
     for looked_at, share in enumerate(_NARROWER, 1):
