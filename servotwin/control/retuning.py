@@ -72,6 +72,8 @@ def scaled(own: AnyController, scale: float, shape: tuple[float, float], share: 
     if isinstance(own, Controller):
         if only_integrates(own):
             return own.replace(Ki=own.Ki * scale * share)
+        # Without derivative action nothing is filtered: laws that act alike are equal.
+        slower = slower if own.Kd else 1.0
         return own.replace(Kp=own.Kp * scale, Kd=own.Kd * scale * lead * slower, Tf=own.Tf * slower, Ki=own.Ki * share)
     if isinstance(own, LinearLaw):
         # A share counts over the own integral gain, which the gain scales too.

@@ -152,6 +152,17 @@ def test_the_constant_with_hindsight_is_among_the_candidates_of_a_known_plant() 
     assert {0.6, 1.0} <= found
 
 
+@pytest.mark.parametrize("name", ["micro-positioner", "telescope", "gantry"])
+def test_no_two_candidates_act_alike(name: str) -> None:
+    # Each would be verified on machines of its own: a setting that hardly fails would be drawn until one sample passes.
+    axis = Axis.preset(name)
+    found = candidates_of(axis, Uncertainty(gap=(0.0, 1.0), step=(1e-5, 1e-4)), Demands(), True, False)
+    acting = [
+        replace(each, controller=law if law.Kd else law.replace(Tf=1.0)) for each in found for law in [each.controller]
+    ]
+    assert len(set(acting)) == len(found)
+
+
 def test_learnt_factors_have_their_mean_and_covariance_and_narrow_the_set() -> None:
     covariance = ((4e-4, 1e-4), (1e-4, 9e-4))
     learnt = LearntFactors(("k", "c"), (0.02, -0.1), covariance)
