@@ -99,6 +99,8 @@ def lines_of(
     chosen = [trace for trace in traces if not changes or _matters(trace)]
     entries = [entry for trace in chosen for entry in _window(trace, units)]
     entries += [_event(event, units) for event in events]
+    if changes and not chosen:
+        yield f"  none of the newest {len(traces)} windows led to more than an estimate; --limit 1000 looks further"
     yield ""
     yield units.head
     boot = ""

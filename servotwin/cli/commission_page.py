@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,6 +19,17 @@ from servotwin.report.page import page
 from servotwin.report.panels import write_panels
 
 _POINTS = 4000  # of a curve
+
+
+class _Unit(NamedTuple):
+    """Unit of positions in a picture, and its number per m or rad."""
+
+    name: str
+    factor: float
+
+
+_POSITION = {False: _Unit("mm", 1e3), True: _Unit("deg", math.degrees(1.0))}  # by DriveRecording.rotary
+_ERROR = {False: _Unit("um", 1e6), True: _Unit("mdeg", 1e3 * math.degrees(1.0))}
 
 
 def write_page(path: Path, found: CommissionedAxis, headline: str) -> None:
@@ -35,13 +48,13 @@ def _shown(values: Array) -> Array:
 
 def _draw_position(axes: Axes, found: CommissionedAxis) -> None:
     recording, refined = found.logs[0].recording, found.drive.refinement
-    time = _shown(_times(recording))
-    axes.plot(time, _shown(recording.position), color=style.GREY, label="log")
+    time, unit = _shown(_times(recording)), _POSITION[recording.rotary]
+    axes.plot(time, unit.factor * _shown(recording.position), color=style.GREY, label="log")
     if refined is not None:
-        simulated = _shown(refined.simulated.position)
+        simulated = unit.factor * _shown(refined.simulated.position)
         axes.plot(time, simulated, color=style.BLUE, linestyle="--", label="simulated")
-    axes.legend()
-    axes.set(xlabel="Time (s)", ylabel=f"Position ({recording.unit})")
+    style.legend(axes)
+    axes.set(xlabel="Time (s)", ylabel=f"Position ({unit.name})")
 
 
 def _draw_force(axes: Axes, found: CommissionedAxis) -> None:
@@ -57,10 +70,11 @@ def _draw_force(axes: Axes, found: CommissionedAxis) -> None:
 
 def _draw_left(axes: Axes, found: CommissionedAxis) -> None:
     recording, refined = found.logs[0].recording, found.drive.refinement
+    unit = _ERROR[recording.rotary]
     if refined is not None:
-        left = recording.position - refined.simulated.position
+        left = unit.factor * (recording.position - refined.simulated.position)
         style.trace(axes, _times(recording), left, style.BLUE, linewidth=0.6)
-    axes.set(xlabel="Time (s)", ylabel=f"Position, log - simulated ({recording.unit})")
+    axes.set(xlabel="Time (s)", ylabel=f"Position, log less simulated ({unit.name})")
 
 
 def _filtered(found: CommissionedAxis, force: Array) -> Array:

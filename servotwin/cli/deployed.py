@@ -186,7 +186,9 @@ def audit(
     token: Annotated[Path | None, typer.Option(help="A file with an operator's token, for the service.")] = None,
     ca: Annotated[Path | None, typer.Option(help="Certificates with which the service's is checked.")] = None,
     limit: Annotated[int, typer.Option(min=1, max=1000, help="Largest number of windows.")] = 20,
-    changes: Annotated[bool, typer.Option("--changes", help="Only windows that led to more than an estimate.")] = False,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="Of these, only windows that led to more than an estimate.")
+    ] = False,
     json: Annotated[bool, typer.Option("--json", help="One JSON array of the windows instead of lines.")] = False,
     page: Annotated[
         Path | None, typer.Option(help="Write a report to mail instead: an HTML file with pictures inside.")

@@ -29,7 +29,7 @@ _Stillness = Annotated[
         show_default=False,
     ),
 ]
-_Servo = Annotated[str, typer.Argument(help="A preset's name or a servo's TOML.")]
+_Servo = Annotated[str, typer.Argument(help="A preset's name, or the TOML of a servo or an axis.")]
 
 
 def limit_cycle(
@@ -57,7 +57,7 @@ def limit_cycle(
 def tune(
     crossover: Annotated[float, typer.Argument(help="Gain crossover, rad/s.")],
     phase_margin_deg: Annotated[float, typer.Argument(help="Phase margin at the crossover, deg.")],
-    servo: Annotated[str, typer.Option(help="A preset's name or a servo's TOML.")] = "paper",
+    servo: Annotated[str, typer.Option(help="A preset's name, or the TOML of a servo or an axis.")] = "paper",
     kind: Annotated[str, typer.Option("--type", help="P, PI, PD, PDF, PID or PIDF.")] = "PIDF",
     ms_max: Annotated[float, typer.Option(help="Largest sensitivity peak that is accepted.")] = float("inf"),
     prefer: Annotated[

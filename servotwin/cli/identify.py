@@ -180,7 +180,8 @@ def _one(whole: Window, options: IdentifyOptions) -> Window:
     end = float(whole.start + whole.samples / whole.sample_rate)
     duration = end - start if options.duration is None else options.duration
     if not (math.isfinite(start) and math.isfinite(duration) and duration > 0.0):
-        shown = f"--start {start!r} s, --duration {duration!r} s"
+        given = {"--start": options.start, "--duration": options.duration}
+        shown = ", ".join(f"{name} {value!r} s" for name, value in given.items() if value is not None)
         raise InvalidInput(f"{whole.where}{shown}: the log goes from {whole.start:g} s to {end:g} s")
     return whole.slice(start, duration)
 

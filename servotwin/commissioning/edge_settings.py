@@ -214,7 +214,10 @@ class Commissioning:
         check_samples("window", self.recording.longest_window or self.window, rate)
         needed, why = self._shortest_window
         if self.window < needed * (1.0 - 1e-9):
-            raise InvalidInput(f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s")
+            raise InvalidInput(
+                f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s at "
+                f"{self.recording.sample_rate:g} Hz"
+            )
 
     def agent_settings(self, servo: str, boot: str) -> AgentSettings:
         """Make the settings of the agent of a servo (by name) for one boot.

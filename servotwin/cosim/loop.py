@@ -21,7 +21,7 @@ from servotwin.redesign.excitation import Decision
 from servotwin.redesign.policy import Redesign
 from servotwin.runtime.notebook import html_table
 from servotwin.simulation import Run
-from servotwin.simulation.views import arrow_table, pandas_table
+from servotwin.simulation.views import arrow_table, legend_above, pandas_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -198,8 +198,8 @@ class Loop:
         bars = np.maximum(np.stack([gaps - ends[:, 0], ends[:, 1] - gaps]), 0.0)
         axes = figure.axes[2]
         axes.errorbar([e.time for e in usable], gaps, bars, fmt=".", label="estimate, 95 %", linewidth=1.0)
-        axes.legend(loc="upper left", fontsize="small")
-        figure.axes[0].set_title(repr(self).partition(", <")[0].strip("<"))
+        legend_above(axes)
+        figure.suptitle(repr(self).partition(", <")[0].strip("<"))
         return figure
 
     def digest(self) -> str:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import itertools
+import math
 from array import array
 from typing import Any
 
 from servotwin.dashboard.window_view import whole_channel
 from servotwin.messages import WindowMessage
 
-REST, LIMIT_CYCLE, SWINGS_DOWN, NOT_SEEN = "rest", "limit cycle", "swings down", "not seen"
+REST, LIMIT_CYCLE, SWINGS_DOWN, NOT_SEEN, NOISE = "rest", "limit cycle", "swings down", "not seen", "noise"
 _STILL, _KEPT, _LEAST_TURNS, _LEAST_SAMPLES = 0.02, 0.7, 3, 8
 """Half the travel in the last quarter, over the step, that counts as rest; share of the swing of the quarter before
 that a limit cycle keeps at least; crossings of the mean without which nothing is told; samples of a quarter."""
+_NOISE = 4.0
+"""Standard deviations of the noise by which a swing goes beyond the mean on either side. White noise hardly does; a
+sine of more than 13 samples a period, whose steps from sample to sample count as noise here, always does."""
 
 
 def at_rest(message: WindowMessage) -> dict[str, Any]:
@@ -22,7 +26,7 @@ def at_rest(message: WindowMessage) -> dict[str, Any]:
     -------
     dict
         word; swing (m or rad, half the travel in the last quarter), frequency (Hz; None: no cycle is seen), seconds
-        (that were looked at).
+        (that were looked at). The word "noise": the noise of the samples may hide a cycle.
     """
     unknown = {"word": NOT_SEEN, "swing": None, "frequency": None, "seconds": 0.0}
     position, reference = (whole_channel(message, name) for name in ("position", "reference"))
@@ -39,9 +43,10 @@ def at_rest(message: WindowMessage) -> dict[str, Any]:
     before, last = _swing(position[-2 * quarter : -quarter]), _swing(position[-quarter:])
     if last <= _STILL * step:
         return {"word": REST, "swing": last, "frequency": None, "seconds": seconds}
-    crossings = _crossings(position[-2 * quarter :])
+    noise = _NOISE * _noise(position[-2 * quarter :])
+    crossings = _crossings(position[-2 * quarter :], noise)
     if crossings < _LEAST_TURNS:
-        return {**unknown, "swing": last, "seconds": seconds}
+        return {**unknown, "word": NOISE if noise > _STILL * step else NOT_SEEN, "swing": last, "seconds": seconds}
     word = LIMIT_CYCLE if last >= _KEPT * before else SWINGS_DOWN
     return {"word": word, "swing": last, "frequency": crossings * message.rate / (4.0 * quarter), "seconds": seconds}
 
@@ -50,8 +55,13 @@ def _swing(part: array[float]) -> float:
     return 0.5 * (max(part) - min(part))
 
 
-def _crossings(part: array[float]) -> int:
-    """Crossings of the mean."""
+def _noise(part: array[float]) -> float:
+    """Standard deviation of the noise, were it white and all that changes from sample to sample."""
+    return math.sqrt(sum((after - before) ** 2 for before, after in itertools.pairwise(part)) / (2.0 * len(part)))
+
+
+def _crossings(part: array[float], beyond: float) -> int:
+    """Crossings of the mean that go beyond it by so much on either side."""
     mean = sum(part) / len(part)
-    above = [value > mean for value in part]
-    return sum(one != other for one, other in itertools.pairwise(above))
+    sides = [value > mean for value in part if abs(value - mean) > beyond]
+    return sum(one != other for one, other in itertools.pairwise(sides))

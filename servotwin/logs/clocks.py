@@ -25,6 +25,7 @@ _SECONDS = {
 }
 _SHOWN = ("s", "ms", "us", "ns", "min", "h", "d")
 _SET_BACK = 100.0  # usual intervals: a smaller step back is disorder
+_OTHER_RATE = 0.02  # relative: more than a crystal's error, or a rate that is stated in round numbers
 _CONTINUES = 5.0  # usual intervals, within which a clock that was set back goes on
 
 
@@ -110,6 +111,8 @@ class LogClock:
         """
         before, self.samples = self.samples, self.samples + size
         if self._rate is not None:
+            if times is not None:
+                self._note_other_rate(times, self._rate)
             return np.arange(before, before + size) / self._rate
         if times is None:
             raise InvalidInput(
@@ -125,6 +128,14 @@ class LogClock:
             result = self._continued(times * _SECONDS.get(self._unit, 1.0))
         self._note_set_back(result, before)
         return result
+
+    def _note_other_rate(self, times: Array, rate: float) -> None:
+        """Note where the log's own times, of a stated unit, say another rate than the one that replaces them."""
+        steps = np.diff(times[np.isfinite(times)]) * _SECONDS.get(self._unit, 0.0)
+        usual = float(np.median(steps)) if steps.size else 0.0
+        if usual > 0.0 and abs(rate * usual - 1.0) > _OTHER_RATE:
+            name = f"samples timed by --rate {rate:g} Hz, though the log's own times say {1.0 / usual:.4g} Hz"
+            self.found[name] = self.found.get(name, 0) + times.size
 
     def _note_set_back(self, times: Array, before: int) -> None:
         known = np.flatnonzero(np.isfinite(times))

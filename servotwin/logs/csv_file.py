@@ -115,10 +115,20 @@ def _layout(path: Path) -> _Layout:
     longer = [cells[:size] for cells in above if len(cells) > size > 1][-1:]
     heads = [cells for cells in above if len(cells) == size] or longer or above[:1]
     names = heads[0] if heads else [f"col{i + 1}" for i in range(size)]
+    if separator == "," and first < len(rows) and 1 < len(names) < _filled(rows[first]):
+        raise InvalidInput(
+            f"log {path}: line {kept[first][0] + 1}: {_filled(rows[first])} values for {len(names)} names, all between "
+            "commas: if numbers have decimal commas, separate the columns by semicolons or tabs"
+        )
     if len(heads) > 1 and len(heads[1]) == len(names):
         names = [_with_unit(name, unit) for name, unit in zip(names, heads[1], strict=True)]
     last = kept[first][0] if first < len(kept) else len(lines)
     return _Layout(encoding, separator, comma, tuple(names), bool(heads), last, metadata)
+
+
+def _filled(cells: Sequence[str]) -> int:
+    """Cells up to the last that is not empty: rows may end with a separator."""
+    return max((place for place, cell in enumerate(cells, 1) if cell), default=0)
 
 
 def _decimal_comma(cell: str, separator: str | None) -> bool:

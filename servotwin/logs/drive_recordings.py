@@ -24,6 +24,7 @@ from servotwin.plant.signals import Array
 
 _LEAST = 500  # samples
 _SAME = math.log(1.2)  # of two ways
+_OTHER_UNIT = math.log(20.0)  # of two ways; a radian is 57.3 degrees
 _HELD = 2.5  # usual intervals: nothing is known of the motion within a longer one
 _POSITIONS = {**LENGTHS, **ANGLES}
 _TORQUES = ("n m", "nm", "n_m", "n·m")
@@ -129,7 +130,8 @@ def read_drive_log(path: Path, wanted: DriveColumns) -> DriveLog:
     found = {**clean.found, **clock.found, **({CUT: 1} if table.ends_within_line else {})}
     # Between samples that lie off the grid there are values finer than a count.
     counts = {part: resolution(np.unique(values)) for part, values in clean.channels.items()}
-    log = DriveLog(None, chosen, None, found)  # type: ignore[arg-type]
+    used = {part: name for part, name in chosen.items() if part != "time" or wanted.rate is None}
+    log = DriveLog(None, used, None, found)  # type: ignore[arg-type]
     return _in_si(path, channels, counts, units, (grid, usable, rate), wanted, log)
 
 
@@ -163,8 +165,8 @@ def _in_si(
     ratio = travel if turned and travel is not None else 1.0
     against = lost is not None and lost.ratio < 0.0
     motor = motor * (-ratio if against else ratio)
-    if "reference" in channels and ratio != 1.0:
-        _check_side(path, log.columns["reference"], channels["reference"], motor, ratio)
+    if "reference" in channels:
+        _check_reference(path, log.columns["reference"], channels["reference"], motor, ratio)
     scale = _force_scale(path, units["command"], rotary, travel if turned or not rotary else None, wanted)
     scale = -scale if scale is not None and against and wanted.force_per_command is None else scale
     recording = DriveRecording(
@@ -196,13 +198,21 @@ def _check_kinds(path: Path, units: Mapping[str, str], columns: Mapping[str, str
         )
 
 
-def _check_side(path: Path, column: str, reference: Array, position: Array, ratio: float) -> None:
-    """Refuse a reference that moves as the motor does, and not as the load (`position`)."""
-    moved = float(np.ptp(reference)) / max(float(np.ptp(position)), np.finfo(float).tiny)
-    if moved > 0.0 and abs(math.log(moved * ratio)) < _SAME and abs(math.log(moved)) > _SAME:
+def _check_reference(path: Path, column: str, reference: Array, position: Array, ratio: float) -> None:
+    """Refuse a reference that moves as the motor does, and not as the load (`position`), or in another unit."""
+    ways = float(np.ptp(reference)), float(np.ptp(position))
+    if min(ways) <= 0.0:
+        return
+    moved = ways[0] / ways[1]
+    if abs(math.log(moved * ratio)) < _SAME < abs(math.log(moved)):
         raise InvalidInput(
             f"log {path}: column {column!r} moves as far as the motor, {moved:.4g} times as far as the load: convert "
             "it to the load, or leave out --ratio and --lead-mm, and all parameters count at the motor"
+        )
+    if abs(math.log(moved)) > _OTHER_UNIT:
+        raise InvalidInput(
+            f"log {path}: column {column!r} moves {moved:.4g} times as far as the position: one of them has another "
+            "unit; give --reference-unit or --motor-unit"
         )
 
 

@@ -109,22 +109,24 @@ def _fill_notch(p: LawParameters, places: Places, demand: Array, m: Array) -> No
     demand[band] -= p.notch_gain
 
 
-@subroutine
-def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory: LiftedMemory) -> None:
-    """Fill the tick's map; the rows of the error and of the voltage demanded remain in `change` and `sizes`."""
-    p, n, m = loop.parameters, places.states, memory.tick_map
-    acting = active or p.acting_inside > 0.5
-    measured = places.counted if places.counted >= 0 else places.position
-    error, demand = memory.change, memory.sizes
+@inlined
+def _fill_error(p: LawParameters, places: Places, error: Array, m: Array) -> None:
+    """Fill the error's row, and the loop filter's part of the tick's map."""
+    n, measured = places.states, places.counted if places.counted >= 0 else places.position
     _clear(error)
-    _clear(demand)
-    _clear(m)
     error[places.reference] = 1.0
     error[measured] -= p.loop_step
     if places.filtered >= 0:
         error[places.filtered] -= 1.0 - p.loop_step
         m[places.filtered * n + measured] = p.loop_step
         m[places.filtered * n + places.filtered] = -p.loop_step
+
+
+@inlined
+def _fill_demand(p: LawParameters, places: Places, acting: bool, error: Array, demand: Array, m: Array) -> None:
+    """Fill the row of the voltage demanded, and the parts of the tick's map that belong to notch and feedforward."""
+    n = places.states
+    _clear(demand)
     if acting:
         for i in range(n):
             demand[i] = (p.Kp + p.derivative_gain) * error[i]
@@ -144,6 +146,17 @@ def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory
         m[ahead * n + ahead] -= p.velocity_step
         m[past * n + places.reference] += 1.0
         m[past * n + past] -= 1.0
+
+
+@subroutine
+def _fill_tick(loop: LiftedLoop, places: Places, active: bool, kind: int, memory: LiftedMemory) -> None:
+    """Fill the tick's map; the rows of the error and of the voltage demanded remain in `change` and `sizes`."""
+    p, n, m = loop.parameters, places.states, memory.tick_map
+    acting = active or p.acting_inside > 0.5
+    error, demand = memory.change, memory.sizes
+    _clear(m)
+    _fill_error(p, places, error, m)
+    _fill_demand(p, places, acting, error, demand, m)
     last = places.waiting + places.delay - 1 if places.delay > 0 else places.voltage
     # The law's own voltage, in place of the last one.
     for i in range(n):

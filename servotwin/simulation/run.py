@@ -175,7 +175,6 @@ class Run:
         drive = "voltage" if command_unit(self.servo) == "V" else "command"
         errors = {"error": factor * (self.reference - self.position)}
         if self.tolerance.any():
-            # matplotlib leaves labels that begin with an underscore out of the legend.
             errors |= {"dead zone": factor * self.tolerance, "_": -factor * self.tolerance}
         panels = (
             Panel(f"position, {name}", {"reference": factor * self.reference, "position": factor * self.position}),

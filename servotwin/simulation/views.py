@@ -10,11 +10,15 @@ import numpy as np
 from servotwin.runtime.extras import require
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
 class Panel(NamedTuple):
-    """One axes of a figure: its label with the unit, and the curves by name."""
+    """One axes of a figure: its label with the unit, and the curves by name.
+
+    A name that begins with an underscore continues the curve before: same colour, no entry in the legend.
+    """
 
     label: str
     curves: Mapping[str, Any]
@@ -34,15 +38,24 @@ def stacked_figure(title: str, time: Any, panels: Sequence[Panel]) -> Figure:
         len(panels), 1, sharex=True, squeeze=False, figsize=(8.0, height), layout="constrained"
     )
     for panel, ax in zip(panels, axes[:, 0], strict=True):
+        color = None
         for name, values in panel.curves.items():
-            ax.plot(time, values, label=name, linewidth=1.0)
+            (line,) = ax.plot(time, values, label=name, linewidth=1.0, color=color if name.startswith("_") else None)
+            color = line.get_color()
         ax.set_ylabel(panel.label)
         ax.grid(alpha=0.3)
         if len(panel.curves) > 1:
-            ax.legend(loc="upper right", fontsize="small")
-    axes[0, 0].set_title(title)
+            legend_above(ax)
+    figure.suptitle(title)
     axes[-1, 0].set_xlabel("time, s")
     return figure
+
+
+def legend_above(axes: Axes) -> None:
+    """Draw the legend above the axes, where it covers no data."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize="small", frameon=False, borderaxespad=0.2
+    )
 
 
 def pandas_table(columns: Mapping[str, Any]) -> Any:

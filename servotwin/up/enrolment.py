@@ -10,7 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from servotwin.commissioning.edge_settings import Commissioning, Recording
 from servotwin.config.table import did_you_mean, read_toml
@@ -25,9 +25,12 @@ from servotwin.plant.display_units import position_unit
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant
 from servotwin.runtime.files import make_directory, write_text
-from servotwin.twin_service.auth import PRIVATE, Verifiers, read_tokens, tokens_locked, write_private, write_tokens
+from servotwin.twin_service.auth import Verifiers, read_tokens, tokens_locked, write_private, write_tokens
 from servotwin.twin_service.config import ServiceConfig
 from servotwin.twin_service.twin_file import TwinFile, read_twin
+
+if TYPE_CHECKING:
+    from servotwin.twin.model_registry import ServoModel
 
 TOKEN, CONFIG, CERTIFICATE = "token", "edge.toml", "ca.crt"
 LONGEST_WINDOW_S, LONGEST_PRE_TRIGGER_S = 4.0, 0.3
@@ -147,7 +150,7 @@ def open_tokens(twin: TwinFile) -> Iterator[tuple[Path, Verifiers]]:
     """Hold the lock of a twin's file of tokens; yield its path and verifiers, for `write_tokens`."""
     tokens = _tokens_file(twin)
     with tokens_locked(tokens):
-        yield tokens, _read_or_create(tokens)
+        yield tokens, read_tokens(tokens) if tokens.exists() else Verifiers()
 
 
 def enroll_operator(
@@ -199,6 +202,14 @@ def drive_of(path: Path | None) -> Mapping[str, object]:
     return SIMULATED if path is None else dict(read_toml(path).table("drive", required=True).values)
 
 
+def _model_of(twin: TwinFile, servo: str) -> ServoModel:
+    fleet = twin.fleet
+    try:
+        return fleet.model_of(servo)
+    except InvalidInput as error:
+        raise InvalidInput(f"{twin.path}: {error}") from None
+
+
 def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
     """Make the configuration of a servo's edge, with the supervision that the twin's policy requires.
 
@@ -208,7 +219,7 @@ def _edge_config(twin: TwinFile, request: Enrolment) -> EdgeConfig:
         The servo has no model, its loop is unstable at the rate of the edge, or no setting is verified for its stated
         range.
     """
-    model = twin.fleet.model_of(request.servo)
+    model = _model_of(twin, request.servo)
     own = model.servo.controller
     rate = (own.sample_rate or _RATE) if request.sample_rate is None else request.sample_rate
     law = _running_law(own, request, rate)
@@ -295,12 +306,6 @@ def _tokens_file(twin: TwinFile) -> Path:
     if twin.service.tokens is None:
         raise InvalidInput(f'{twin.path}: [service] has no key tokens; add tokens = "tokens.toml"')
     return twin.service.tokens
-
-
-def _read_or_create(tokens: Path) -> Verifiers:
-    if not tokens.exists():
-        tokens.touch(PRIVATE)
-    return read_tokens(tokens)
 
 
 def _check(request: Enrolment, known: Verifiers) -> None:

@@ -188,6 +188,9 @@ def test_changes_leaves_out_what_led_to_nothing() -> None:
     requesting, sent = link(3, estimate(), found("request", "more")), link(4, estimate(), steps=[step()])
     lines = chain(quiet, failed, requesting, sent, changes=True)
     assert [line.split()[2] for line in lines if line.startswith("1970")] == ["2", "3", "4"]
+    none = "  none of the newest 1 windows led to more than an estimate; --limit 1000 looks further"
+    assert none in report_of(quiet, changes=True)
+    assert not any("--limit" in line for each in (True, False) for line in report_of(sent, changes=each))
 
 
 def test_an_invalid_body_does_not_fail_the_report() -> None:

@@ -109,7 +109,7 @@ def test_json_and_page_say_the_same(files):
         assert fit[name]["value"] == pytest.approx(true, rel=1e-3)
         assert fit[name]["half_width_95"] > fit[name]["std"] > 0.0
     page = files["page.html"].read_text(encoding="utf-8")
-    assert f"inertia {fit['inertia']['value']:.6g}" in page
+    assert f"Inertia {fit['inertia']['value']:.6g}" in page
     assert "Next experiment" in page
 
 
@@ -246,6 +246,17 @@ def test_a_reference_of_another_kind_or_side_is_told(tmp_path):
     assert "'reference [deg]' is an angle (deg) and 'motor [m]' is a length" in run(kinds).stderr
     side = written(tmp_path / "side.csv", header="t [s],motor [deg],torque [N m],reference [deg]")
     assert "moves as far as the motor" in run(side, "--ratio", 17).stderr
+    unit = written(tmp_path / "unit.csv", header="t [s],motor [m],force [N],reference [mm]")
+    assert (
+        "'reference [mm]' moves 0.001007 times as far as the position: one of them has another unit" in run(unit).stderr
+    )
+
+
+def test_a_rate_that_contradicts_the_times_of_the_log_is_told(log):
+    told = run(log, "--rate", 1000).output
+    assert "samples timed by --rate 1000 Hz, though the log's own times say 500 Hz: 3684" in told
+    assert "time:" not in told.splitlines()[0]
+    assert "--rate" not in run(log, "--rate", 500).output
 
 
 def test_counts_are_those_of_the_samples(tmp_path):

@@ -216,7 +216,7 @@ def test_a_bad_csv_is_one_sentence(folder, tmp_path, kind):
         (("FOLDER/run.npz", "--servo", "papre"), "papre"),
         (("FOLDER/run.npz", "--start", "-3"), "-3"),
         (("FOLDER/run.npz", "--start", "15.9", "--duration", "3"), "run.npz"),
-        (("FOLDER/run.npz", "--start", "99"), "run.npz"),
+        (("FOLDER/run.npz", "--start", "99"), "run.npz: --start 99.0 s: the log goes from 0 s to"),
         (("FOLDER/run.npz", "--duration", "0"), "the log goes from 0 s to"),
         (("FOLDER/run.npz", "--duration", "nan"), "the log goes from 0 s to"),
         (("FOLDER/run.npz", "--window", "0.01"), "needs at least 400"),

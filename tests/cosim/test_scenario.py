@@ -198,7 +198,7 @@ def test_steps_of_1_mm_are_a_replacement_away():
         (
             "[gap]",
             "[recording]\nwindow_s = 0.07\n[gap]",
-            "window = 0.07 s is too short for method 'whitened', which needs 400",
+            "which needs 400 samples: must be at least 0.08 s at 5000 Hz",
         ),
         ("[gap]", f"[recording]\nwindow_s = 0.25\n{PAPER}[gap]", "window = 0.25 s is too short for the observer"),
         ("[gap]", "[recording]\nwindow_s = 0.90001\n[gap]", "must be a whole number of samples"),

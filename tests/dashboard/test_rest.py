@@ -36,3 +36,14 @@ def test_a_machine_rests_swings_down_or_goes_on_swinging(motion, word):
     late = window_of(motion[20:], begun=0)  # it begins with the change
     assert at_rest(late)["word"] == word
     assert at_rest(window_of(motion, ((7.9, 1e-3),)))["word"] == "not seen"
+
+
+@pytest.mark.parametrize(("amplitude", "word"), [(0.0, "noise"), (0.4e-3, "limit cycle"), (1e-3, "limit cycle")])
+def test_noise_of_the_encoder_is_no_limit_cycle(amplitude, word):
+    random = np.random.default_rng(0)
+    motion = 1e-3 + amplitude * np.sin(2 * np.pi * 1.5 * SECONDS)
+    for _ in range(200):
+        found = at_rest(window_of(motion + 5e-5 * random.standard_normal(motion.size), begun=30))
+        assert found["word"] == word
+    if word == "limit cycle":
+        assert found["frequency"] == pytest.approx(1.5, rel=0.1)

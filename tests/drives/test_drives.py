@@ -260,11 +260,17 @@ from servotwin.drives.table import control_drive, supervised_drive
 from servotwin.drives.opcua.drive import OpcUaDrive
 from servotwin.config.table import Table
 from pathlib import Path
-control_drive(Table("t", {"kind": "simulated", "address": "unix:x"}), Path()).close()
-supervised_drive(Table("t", {"kind": "replay", "log": "x.csv"}), Path()).close()
-supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), Path()).close()
+drives = [
+    control_drive(Table("t", {"kind": "simulated", "address": "unix:x"}), Path()),
+    supervised_drive(Table("t", {"kind": "replay", "log": "x.csv"}), Path()),
+    supervised_drive(Table("t", {"kind": "opcua", "url": "opc.tcp://localhost:1"}), Path()),
+]
+for drive in drives:
+    drive.close()
+print(*(type(drive).__name__ for drive in drives))
 """
-    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert (ended.stdout, ended.stderr) == ("SimulatedControl Replay OpcUaDrive\n", "")
 
 
 @pytest.mark.parametrize(

@@ -68,6 +68,18 @@ def test_the_columns_of_a_log_are_chosen_while_it_is_read(suffix, tmp_path, made
     assert [sorted(each) for each in calls] == [["load_rad", "motor_rad", "time_s"]]
 
 
+def test_decimal_commas_between_commas_are_refused(tmp_path, made):
+    # Before: the digits behind a comma were read as the next column.
+    with pytest.raises(InvalidInput, match=r"line 3: 6 values for 3 names.*semicolons or tabs"):
+        read_recording(csv(tmp_path / "a.csv", rows(made)[1:], comma=True, comments=["# rig"]), RecordingColumns())
+
+
+def test_rows_may_end_with_a_comma(tmp_path, made):
+    path = csv(tmp_path / "a.csv", rows(made))
+    path.write_text("\n".join(line + "," * (number > 0) for number, line in enumerate(path.read_text().splitlines())))
+    seen(path, made)
+
+
 def test_structures_records_and_matrices(tmp_path, made):
     from scipy.io import savemat
 

@@ -87,6 +87,17 @@ def test_a_run_and_a_window_plot_themselves(run):
     pyplot.close("all")
 
 
+def test_both_edges_of_the_dead_zone_are_one_curve_of_the_legend(servo):
+    pyplot = pytest.importorskip("matplotlib.pyplot")
+    pyplot.switch_backend("agg")
+    axes = st.simulate(servo, 0.1, reference=1e-3, tolerance=1e-5, sample_rate=1000.0).plot().axes[1]
+    _, upper, lower = axes.lines
+    assert np.array_equal(upper.get_ydata(), -lower.get_ydata())
+    assert upper.get_color() == lower.get_color()
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["error", "dead zone"]
+    pyplot.close("all")
+
+
 def test_a_run_becomes_an_arrow_table(run):
     table = run.to_arrow()
     assert table.column_names[:3] == ["time_s", "position_m", "measured_position_m"]

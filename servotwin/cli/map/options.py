@@ -154,7 +154,9 @@ def _number(name: str, text: str, part: str) -> float:
 
 
 def _invalid_axis(name: str, text: str) -> InvalidInput:
-    return InvalidInput(f"{name} {text!r}: is no axis; give LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or VALUE,VALUE,...")
+    return InvalidInput(
+        f"{name} {text!r}: is no list of values; give LOW:HIGH:COUNT, LOW:HIGH:COUNT:log or VALUE,VALUE,..."
+    )
 
 
 def _check_drawable(shape: Sequence[int]) -> None:

@@ -345,6 +345,7 @@ export class MachinePage {
       rest: ["good", `No limit cycle: the load comes to rest ${over}, within ${size}.`],
       "limit cycle": ["bad", `Limit cycle: ${over} the load goes on swinging by ${size}${frequency === null ? "" : ` at ${brief(frequency)} Hz`}.`],
       "swings down": ["none", `The load still swings, but less and less: ${size} at the end, ${brief(frequency)} Hz.`],
+      noise: ["none", `The window does not tell whether there is a limit cycle: ${over} the load moves by ${size}, in which the noise of its samples may hide one.`],
       "not seen": ["none", "The window does not tell whether there is a limit cycle: the reference moves, or the time after its last step is too short."],
     }[word];
     this.rest.className = `mark ${mark}`;

@@ -6,29 +6,23 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import stdtrit
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NOTHING_KNOWN, GapStatus, Interval
-from servotwin.estimation.kinematic import bootstrap as draws
 from servotwin.estimation.kinematic.breaks import check_not_joined, check_one_machine
+from servotwin.estimation.kinematic.close_fit import fitted_closely, half_width
 from servotwin.estimation.kinematic.curves import FittedCurves, fitted_curves
 from servotwin.estimation.kinematic.local import LocalGap, drift_of, local_gaps
-from servotwin.estimation.kinematic.models import Model, ModelScore, chosen, undecided
+from servotwin.estimation.kinematic.models import ModelScore, chosen, undecided
 from servotwin.estimation.kinematic.pauses import behind_pauses
 from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.regression import (
     INERTIA,
     LAG,
     Regression,
-    columns,
-    least_gap,
-    products,
     regression,
-    solved,
 )
 from servotwin.estimation.kinematic.search import (
-    FINE,
     coarse_gap,
     compared_models,
     compared_with_fitted_lag,
@@ -36,25 +30,20 @@ from servotwin.estimation.kinematic.search import (
     lag_left,
     with_lag,
 )
-from servotwin.estimation.kinematic.sensitivity import sensitivity
-from servotwin.estimation.kinematic.strokes import counts_of, noise_of, play_and_side, strokes_of
-from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, structured, verdict
+from servotwin.estimation.kinematic.strokes import counts_of, noise_of, strokes_of
+from servotwin.estimation.kinematic.verdict import KinematicFit, simpler, verdict
 from servotwin.plant.signals import Array
 
-_ROUNDS = 8
-_END, _SAME = 0.9, 0.7  # of a grid's width: a minimum beyond lies outside; of the spread on a wider grid
 _COUNTS = 4.0  # a reversal is a motion of more than so many counts, and of more than the noise
 _LEAST_REVERSALS = 2
 _JUMPS, _NEAR_BY = 5.0, 0.01  # times the step to the next sample but one, and of the range: two motions by turns
 _PIECES = 10  # of a stroke on the average, in each of which noise and hunting average out
-_SHIFT = 0.5  # of what the model leaves, and of the difference of two weightings: standard deviation of the gap
 _SKEW = 2.0  # samples between two channels that are nothing unusual
 _ENDS = (0.002, 0.998)  # quantiles of the lead: single samples beyond are noise
 _EXCHANGED = (
     "the motor's column follows the load's through a gap, and not the load's the motor's: --motor and --load are "
     "exchanged, or the load overshoots at every reversal"
 )
-_CHANCE = 0.025  # on either side of a 95 % interval
 
 
 @dataclass(frozen=True)
@@ -259,44 +248,6 @@ def _first_moved(recording: EncoderRecording, gap: float) -> int | None:
     return None if place > motor.size // 2 else place
 
 
-def _fitted(prepared: Regression, model: Model, gap: float, width: float) -> tuple[float, float, draws.Spread]:
-    """Gap by time and by travel, and their bootstrap, on grids that are narrowed to the spread."""
-    places = model.places(prepared)
-    travel, least = _travel(prepared), 1e-3 * max(gap, width)
-    before = math.inf
-    for _ in range(_ROUNDS):
-        middle = gap
-        grid = np.linspace(max(middle - width, 0.0), middle + width, FINE)
-        by_time, by_travel = (
-            np.array(each) for each in zip(*(products(prepared, each, travel) for each in grid), strict=True)
-        )
-        spread = draws.bootstrap(grid, by_time, by_travel, places)
-        gap, other = (float(least_gap(grid, solved(each.sum(axis=1), places).squares)) for each in (by_time, by_travel))
-        wanted = max(5.0 * spread.std, 1.5 * abs(other - gap), least)
-        at_end = abs(gap - middle) > _END * width and gap > grid[0]
-        if not at_end and 0.4 * width <= wanted <= 1.5 * width and spread.std > _SAME * before:
-            break
-        # The parabola through three points of a wide grid is off by more than the draws spread, and so is theirs: the
-        # grid narrows by steps, and a spread counts where a finer grid has it too.
-        before = spread.std
-        width = 2.0 * width if at_end else wanted if wanted > width else max(min(wanted, 0.5 * width), 0.25 * width)
-    return gap, other, spread
-
-
-def _travel(prepared: Regression) -> Array:
-    """Way of the motor from one row to the next, its counts and noise left out, relative to the mean."""
-    motor = prepared.recording.motor
-    side = np.zeros(motor.size, dtype=np.int8)
-    smooth = play_and_side(motor, 2.0 * counts_of(prepared.recording)[0], side)[prepared.rows]
-    way = np.abs(np.diff(smooth, prepend=smooth[0]))
-    alone = prepared.recording.alone
-    if alone is not None:
-        # The first sample of a stretch is not the one that has moved by all that a thinned log leaves out.
-        behind = np.diff(np.cumsum(alone)[prepared.rows], prepend=0) > 0
-        way[behind] = np.roll(way, -1)[behind]
-    return way / max(float(way.mean()), np.finfo(float).tiny)
-
-
 def _answer(
     recording: EncoderRecording,
     prepared: Regression,
@@ -307,56 +258,44 @@ def _answer(
     """Fit the chosen model closely and judge it."""
     if LAG in best.model.used:
         prepared = with_lag(prepared, best)
-    gap, by_travel, spread = _fitted(prepared, best.model, best.gap, max(0.5 * best.gap, least))
-    values, side = columns(prepared, gap)
-    places = best.model.places(prepared)
-    fit = solved(values @ values.T, places)
-    residual, ratio = values[0] - fit.coefficients @ values[places], float(fit.coefficients[0])
-    motor_count, load_count = counts_of(recording)
-    quantisation = math.hypot(motor_count, load_count / abs(ratio)) / math.sqrt(12.0)
-    quantile = float(stdtrit(max(spread.units - 1, 1), 1.0 - _CHANCE))
-    left = structured(prepared, residual) / abs(ratio)
-    # Counts and what the model leaves are the same in every cycle: the bootstrap does not see that they shift the gap.
-    shift, of_model = _SHIFT * (by_travel - gap), sensitivity(values, places, side, gap)
-    half = quantile * math.hypot(spread.std, quantisation, of_model.motor * _SHIFT * left, shift)
-    at_load = math.hypot(
-        spread.std_at_load, *(abs(ratio) * each for each in (quantisation, of_model.load * _SHIFT * left, shift))
-    )
+    close = fitted_closely(prepared, best, least)
+    width = half_width(recording, prepared, close)
+    gap, ratio, residual, rows = close.gap, close.ratio, close.residual, prepared.rows
     judged = verdict(
         KinematicFit(
             gap=gap,
-            by_travel=by_travel,
+            by_travel=close.by_travel,
             simpler=simpler(best, comparisons),
-            spread=spread,
-            half=half,
-            quantisation=quantisation,
-            left=left,
+            spread=close.spread,
+            half=width.at_motor,
+            quantisation=width.quantisation,
+            left=width.left,
             rms=float(np.sqrt(np.mean(residual**2))) / abs(ratio),
             of_none=(best.rms / comparisons[-1].rms) ** 2 if comparisons[-1].rms else 1.0,
             accelerated=INERTIA in best.model.used,
             lead=_lead(prepared),
             richer=tuple(each.gap for each in undecided(best, comparisons[:-1])),
-            reach=float(np.ptp(np.quantile(recording.motor[prepared.rows] - values[0] / ratio, _ENDS))),
+            reach=float(np.ptp(np.quantile(recording.motor[rows] - close.values[0] / ratio, _ENDS))),
         ),
         recording.motor_unit,
     )
-    rows, known = prepared.rows, judged.interval != NOTHING_KNOWN
+    half, known = width.at_motor, judged.interval != NOTHING_KNOWN
     if judged.status is GapStatus.OK:
         half = max(half, 0.5 * (judged.interval[1] - judged.interval[0]))
     return LostMotion(
         at_motor=gap if known else math.nan,
-        std_motor=half / quantile if known else math.inf,
+        std_motor=half / width.quantile if known else math.inf,
         interval_motor=judged.interval,
         ratio=ratio,
-        load_spread=max(quantile * at_load / (half * abs(ratio)), 1.0) if half else 1.0,
-        lag=prepared.lag + lag_left(prepared, fit, places),
+        load_spread=max(width.at_load / (half * abs(ratio)), 1.0) if half else 1.0,
+        lag=prepared.lag + lag_left(prepared, close.fit, close.places),
         status=judged.status,
         reasons=judged.reasons,
         model=best.model.name,
         comparisons=comparisons,
         cycles=tuple(map(float, prepared.cycles)),
         rms=float(np.sqrt(np.mean(residual**2))),
-        local=local_gaps(recording.time[rows], recording.load[rows], side, residual, gap, ratio) if known else (),
+        local=local_gaps(recording.time[rows], recording.load[rows], close.side, residual, gap, ratio) if known else (),
     )
 
 

@@ -93,3 +93,7 @@ def test_a_log_of_one_machine_with_dropouts_is_not_joined(hunting):
     kept = ~((made.time > 5.0) & (made.time < 7.3)) & ~((made.time > 12.0) & (made.time < 12.4))
     load = made.load + hunting * np.sin(40.0 * made.time)
     check_not_joined(replace(made, time=made.time[kept], motor=made.motor[kept], load=load[kept]))
+    # The same dropouts are looked at: elsewhere behind one of them, the load is told.
+    load[made.time > 7.0] += 1.0
+    with pytest.raises(InvalidInput, match=r"from 7.3 s on the load is \+(1|0.9\d*|1.0\d*) rad off"):
+        check_not_joined(replace(made, time=made.time[kept], motor=made.motor[kept], load=load[kept]))
