@@ -11,7 +11,8 @@ import math
 
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.output_error.fit import Fit, FitProblem, Search, descend, noise_in, plain_cost
-from servotwin.estimation.output_error.search import distinct, starts
+from servotwin.estimation.output_error.models import HALF
+from servotwin.estimation.output_error.search import distinct, explains, rms, starts
 from servotwin.plant.signals import Array
 
 _FIRST, _KEPT = 4, 2  # minima that are followed in white noise, and in the window's own
@@ -19,6 +20,10 @@ _WHITE, _SLOWER, _SLOWEST = 10, 8, 10  # steps in white noise, and in the learnt
 _LOW = 0.3  # the white noise, of what the best start leaves
 _PASSES = 3
 _AGAIN = ((3, 3), (10, 2))  # steps in the noise that was learnt, from each start of the grid, and minima kept
+_BESIDE = (0.02, -0.02, 0.05, -0.05, 0.1, -0.1)  # of the gap: starts where the best minimum leaves much
+_BESIDE_STEPS, _SHARES = 15, (1.0, 0.5, 0.3, 0.15)  # from each, as the observer slows down
+_LEFT_COUNTS = 1.0  # what a good fit leaves
+_LESS = 0.5  # of what a minimum leaves: one beside it leaves less for certain
 
 
 def search(problem: FitProblem, gap: float) -> Search:
@@ -41,13 +46,45 @@ def search(problem: FitProblem, gap: float) -> Search:
         again = _followed(problem, _values(again), noise, _SLOWEST, slowest)
         fits = _followed(problem, [fit.values for fit in fits], noise, _SLOWEST, slowest)
     fits = distinct(_ranked([*fits, *again]))
+    beside = _beside(problem, fits[0])
+    if beside is not None:
+        found = [beside, *fits]
+        for _ in range(_PASSES):
+            noise = noise_in(problem, found[0])
+            found = _followed(problem, [fit.values for fit in found], noise, _SLOWEST, slowest)
+        fits = distinct(found)
     return Search(problem, noise, fits[0], tuple(fits[1:]), problem.free)
+
+
+def _beside(problem: FitProblem, best: Fit) -> Fit | None:
+    """The minimum beside the best one that leaves far less; None: there is none, or what that leaves is little.
+
+    A contact that comes earlier or later makes a minimum of its own, where the model's numbers go astray. Starts in
+    gaps beside it begin at the model's own numbers, in white noise, under an observer that slows down.
+    """
+    found = best
+    for share in _BESIDE:
+        if explains(problem, found, _LEFT_COUNTS):
+            break
+        *_, tried = problem.grid(float(best.values[HALF]) * (1.0 + share))
+        values = min(tried, key=lambda each: plain_cost(problem, each, problem.model.speed))
+        left = math.sqrt(plain_cost(problem, values, problem.model.speed) / problem.position.size)
+        for slower in _SHARES:
+            noise, rate = _low(problem, left), slower * problem.model.speed
+            fit = descend(problem, values, noise, problem.free, _BESIDE_STEPS, rate)
+            values, left = fit.values, rms(fit.raw)
+        found = min(found, fit, key=lambda each: rms(each.raw))
+    return found if rms(found.raw) < _LESS * rms(best.raw) else None
 
 
 def _white_noise(problem: FitProblem, start: Array) -> Autoregression:
     """White noise that is a share of what a start leaves."""
-    left = math.sqrt(plain_cost(problem, start, problem.model.speed) / problem.position.size)
-    return Autoregression.white(max(_LOW * left, 1e-9 * problem.range))
+    return _low(problem, math.sqrt(plain_cost(problem, start, problem.model.speed) / problem.position.size))
+
+
+def _low(problem: FitProblem, left: float) -> Autoregression:
+    """White noise that is a share of what is left (root mean square)."""
+    return Autoregression.white(max(_LOW * left, 1e-9 * problem.range) if math.isfinite(left) else problem.range)
 
 
 def _followed(problem: FitProblem, begun: list[Array], noise: Autoregression, steps: int, rate: float) -> list[Fit]:

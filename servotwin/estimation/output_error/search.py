@@ -137,7 +137,7 @@ def _beside(problem: SearchProblem, best: Fit) -> Fit:
     """
     random = np.random.default_rng(0)
     for _ in range(_NEIGHBOURS):
-        if _explains(problem, best):
+        if explains(problem, best):
             break
         far = math.exp(random.uniform(math.log(_NEAR[0]), math.log(_NEAR[1])))
         values, noise = best.values.copy(), _white(problem, _left(best))
@@ -151,13 +151,14 @@ def _beside(problem: SearchProblem, best: Fit) -> Fit:
     return best
 
 
-def _explains(problem: FitProblem, fit: Fit) -> bool:
-    """Tell whether a fit leaves next to nothing, or white noise."""
-    white = _WHITE * math.sqrt(0.5) * _rms(np.diff(fit.raw))
-    return _rms(fit.raw) <= max(_LEFT * float(fit.values[HALF]), _LEFT_COUNTS * problem.count, white)
+def explains(problem: FitProblem, fit: Fit, counts: float = _LEFT_COUNTS) -> bool:
+    """Tell whether a fit leaves next to nothing, so many counts of the sensor, or white noise."""
+    white = _WHITE * math.sqrt(0.5) * rms(np.diff(fit.raw))
+    return rms(fit.raw) <= max(_LEFT * float(fit.values[HALF]), counts * problem.count, white)
 
 
-def _rms(raw: Array) -> float:
+def rms(raw: Array) -> float:
+    """Root mean square of what a fit leaves (N,); inf where the load ran away."""
     with np.errstate(over="ignore"):
         return float(np.sqrt(np.mean(raw**2)))
 
