@@ -111,7 +111,7 @@ def motor_logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A joint off its model whose controller reads the motor: the motor's columns alone, and with an encoder behind."""
     folder = tmp_path_factory.mktemp("motor")
     machine = SEMI_CLOSED.scaled({"k": 1.03, "c": 0.85, "k_T": 1.05})
-    run = st.simulate(machine, 2.0, reference=st.SquareWave(0.05, 16.0), gap=JOINT_GAP, sample_rate=1000.0)
+    run = st.simulate(machine, 2.0, reference=st.SquareWave(0.05, 16.0), gap=JOINT_GAP, sample_rate=500.0)
     own = {name: run.columns[name] for name in ("time_s", "theta_m_rad", "command_n_m", "reference_rad")}
     for name, columns in {
         "motor": own,
@@ -131,8 +131,9 @@ def motor_logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("name", "method"), [("motor", "motor_side"), ("written", "motor_side"), ("load", "output_error")]
 )
 def test_a_log_of_a_controller_that_reads_the_motor_shows_the_gap(motor_logs: Path, name: str, method: str) -> None:
-    """With the load's own position both encoders tell it, and more closely."""
-    found = identify(IdentifyOptions(motor_logs / f"{name}.csv", str(motor_logs / "joint.toml")))
+    """With the load's own position both encoders tell it, and more closely. The wear is stated: one pass, not two."""
+    joint = str(motor_logs / "joint.toml")
+    found = identify(IdentifyOptions(motor_logs / f"{name}.csv", joint, wear_deg=0.1, wear_over_s=100.0))
     (estimate,) = found.estimates
     assert estimate.ok
     assert estimate.method == method
