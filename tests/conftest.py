@@ -36,8 +36,8 @@ settings.load_profile("suite")
 
 
 FIRST = (
-    "analysis/test_cycle.py",  # compiles the kernel: in a fresh clone half a minute
-    *("config/", "link/", "messages/", "runtime/", "store/"),  # compile nothing: for the other process, meanwhile
+    "simulation/test_sampled_ensemble.py",  # compiles what most others wait for: in a fresh clone most of a minute
+    *("config/", "link/", "messages/", "runtime/", "store/"),  # compile nothing: for the other processes, meanwhile
     *("analysis/", "control/", "cosim/", "estimation/", "hybrid/", "simulation/"),  # compile the rest
     *("up/", "edge_process/", "docs/test_operator_guide.py"),  # wait, and find all compiled: not at the end
 )

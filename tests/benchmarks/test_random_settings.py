@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
 from rich.console import Console
 
 from benchmarks.random_settings import BATCH
 
 
+@pytest.mark.slow
 def test_settings_are_judged_and_shown() -> None:
     (key, task), *_ = BATCH.units(("velocity",), 1, 78)
     numbers = BATCH.measure(task)

@@ -165,6 +165,7 @@ def test_an_axis_file_needs_a_controller(tmp_path):
     assert run(lone, "-o", tmp_path / "axis.toml", "--position-gain", 25, "--velocity-gain", 2400).exit_code == 0
 
 
+@pytest.mark.slow
 def test_two_encoders_give_the_shaft_and_the_gap(tmp_path):
     recording = elastic(gap=0.01)
     table = [

@@ -32,6 +32,7 @@ def send(twin, window):
     assert answer.status_code == 201
 
 
+@pytest.mark.slow
 def test_a_version_waits_is_approved_and_the_machine_is_rolled_back(open_page, twin, tmp_path):
     windows = [window for window in recorded_windows(tmp_path, SECONDS + 20.0) if window.start >= SECONDS - 1.0]
     page = open_page(login=ENGINEER)

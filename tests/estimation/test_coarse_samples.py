@@ -73,6 +73,7 @@ def _window(axis: Axis, rate: float, gap: float) -> Window:
     return Window.from_run(run, 5.5, 8.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate", [140.0, 200.0])
 def test_windows_with_few_samples_of_a_swing_have_the_gap_in_their_intervals(rate: float) -> None:
     """Straight lines between samples made one of these gaps wrong by 1.6 %, and the interval 1 % wide."""

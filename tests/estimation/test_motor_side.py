@@ -67,6 +67,7 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window:
     assert left(0.0) > 100.0 * left(1.0)
 
 
+@pytest.mark.slow
 def test_the_twin_of_an_axis_without_a_load_encoder_estimates_its_gap(window: Window) -> None:
     """The edge records the motor's angle as the position: the twin fits motor and load to it."""
     axis = SCREW.replace(sensors=dataclasses.replace(SCREW.sensors, feedback="motor"))
@@ -79,6 +80,7 @@ def test_the_twin_of_an_axis_without_a_load_encoder_estimates_its_gap(window: Wi
     assert estimate.interval[1] - estimate.interval[0] < 0.5 * GAP
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [1.0, 1.06])
 def test_a_quick_fit_beside_another_window_tells_whether_the_gap_moved(window: Window, moved: float) -> None:
     """In a twentieth of the time of an estimate, with the machine's numbers of the other window."""

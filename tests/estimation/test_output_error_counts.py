@@ -13,7 +13,8 @@ from scipy.signal import lfilter
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
-from servotwin.estimation.output_error.estimator import _problem, fit
+from servotwin.estimation.output_error.estimator import _problem
+from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.motor_angle import without_noise
 from servotwin.estimation.output_error.play_model import lagged
 from servotwin.estimation.output_error.possible import possible_half
@@ -56,6 +57,10 @@ def _moves(far: float, time: Array, random: np.random.Generator) -> Array:
     return np.concatenate([a + (b - a) * done**2 * (3.0 - 2.0 * done) for a, b in pairwise(ends)])
 
 
+_CREPT = (102, 107, 110, 113, 116, 121)
+"""Seeds of windows: least squares alone leaves the gap of a creeping motor wrong in one of them, unknown in four."""
+
+
 class _Counted(NamedTuple):
     window: Window
     gap: float
@@ -89,19 +94,23 @@ def _counted(
     return _Counted(Window(*seen, sample_rate=1000.0), gap)
 
 
-@pytest.mark.parametrize("motion", [_creep, _sine, _moves])
+@pytest.mark.slow
+@pytest.mark.parametrize(("motion", "seeds"), [(_creep, _CREPT), (_sine, _CREPT[:3]), (_moves, _CREPT[:3])])
 def test_errors_of_rounding_that_depend_on_each_other_are_no_reason_for_a_wrong_gap(
-    motion: Callable[..., Array],
+    motion: Callable[..., Array], seeds: tuple[int, ...]
 ) -> None:
-    """Least squares bends ratio and delay to fit them: 8 of 19 accepted windows that crept were false."""
+    """Least squares bends ratio and delay to fit them: 8 of 19 accepted windows that crept were false.
+
+    Those of the other motions were not; they must stay accepted.
+    """
     accepted = 0
-    for seed in (102, 107, 110, 113, 116, 121):
+    for seed in seeds:
         window, gap = _counted(motion, seed)
         estimate = estimate_gap(window, Axis.preset("stepper-stage"))
         accepted += estimate.ok
         assert not estimate.ok or estimate.interval[0] <= gap <= estimate.interval[1], seed
         assert not estimate.ok or abs(estimate.gap / gap - 1.0) < 0.02, seed
-    assert accepted >= 4
+    assert accepted >= len(seeds) * 2 / 3
 
 
 def test_a_lag_of_straight_lines_is_exact() -> None:
@@ -161,6 +170,7 @@ def _angle(window: Window) -> Array:
     return window.theta_m
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [286, 288, 293, 304])
 def test_a_motor_that_creeps_in_noise_tells_its_gap_no_better_than_ratio_and_delay_are_known(seed: int) -> None:
     """One rate of creeping makes the same motion with another gap, ratio and delay: three of these were 2 to 4 % off,
@@ -206,6 +216,7 @@ def test_samples_where_the_motor_s_speed_jumps_do_not_count() -> None:
     assert not _problem(window, _angle(window), axis, OutputErrorSettings()).unsure.any()
 
 
+@pytest.mark.slow
 def test_noise_of_the_motor_that_pushes_the_load_widens_the_interval() -> None:
     """Play follows the extremes of the motor's noise: a gap of 0.5 to 8 deg seems up to 9 % wider."""
     inside = []
@@ -217,6 +228,7 @@ def test_noise_of_the_motor_that_pushes_the_load_widens_the_interval() -> None:
     assert all(inside)
 
 
+@pytest.mark.slow
 def test_a_gap_that_jumps_within_a_window_of_large_moves_is_a_mismatch() -> None:
     """Its misfit was small beside the motion: 2.83 +- 0.24 deg for a gap of 4 deg that became 3 deg."""
     axis, random = Axis.preset("stepper-stage"), np.random.default_rng(7001)
@@ -230,9 +242,10 @@ def test_a_gap_that_jumps_within_a_window_of_large_moves_is_a_mismatch() -> None
     assert "of half the gap unexplained" in " ".join(estimate.reasons)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("stiffer", "fraction", "refused"), [(0.99, 1.0, False), (0.6, 0.001, True)])
 def test_a_shaft_that_looks_soft_within_few_counts_is_no_mismatch(
-    stiffer: float, fraction: float, refused: bool
+    monkeypatch: pytest.MonkeyPatch, stiffer: float, fraction: float, refused: bool
 ) -> None:
     """A gap of a few counts of the motor's encoder; the same machine is refused where fine counts show a soft shaft."""
     axis, gap = Axis.preset("two-mass-drive"), 0.0182
@@ -240,10 +253,13 @@ def test_a_shaft_that_looks_soft_within_few_counts_is_no_mismatch(
     axis = axis.replace(sensors=sensors)
     run = simulate(axis.scaled({"k": stiffer}), 15.0, reference=SquareWave(0.069, 20.0), gap=gap, sample_rate=2000.0)
     window = Window.from_run(run, 9.5, 5.0)
-    found = fit(window, axis, None, OutputErrorSettings())
+    searches = list[Search]()
+    kept = f"{_problem.__module__}.search"
+    monkeypatch.setattr(kept, lambda *given: searches.append(search(*given)) or searches[-1])
+    estimate = estimate_gap(window, axis)
+    found = searches[0]
     stiffness = next(place for place, each in enumerate(found.problem.model.unknowns) if each.name == "shaft stiffness")
     assert found.best.values[stiffness] < -0.2
-    estimate = estimate_gap(window, axis)
     if refused:
         assert estimate.status is GapStatus.MODEL_MISMATCH
         assert estimate.reasons == ("the shaft stiffness would be off by -27 %",)

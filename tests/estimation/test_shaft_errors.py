@@ -26,6 +26,7 @@ def screw(kind: str = "none", seed: int = 5) -> tuple[float, Window]:
     return gap, window
 
 
+@pytest.mark.slow
 def test_jitter_of_the_times_is_measured_and_widens_the_interval_or_is_refused() -> None:
     for kind, samples in (("position jitters by 0.1", 0.1), ("position jitters by 0.3", 0.3)):
         gap, window = screw(kind)
@@ -83,6 +84,7 @@ def erring(window: Window, gap: float, share: float) -> Window:
     return window.replace(position=window.position + wave)
 
 
+@pytest.mark.slow
 def test_a_sensor_that_errs_with_its_way_is_not_named_as_jitter() -> None:
     """Its quick errors grow with the speed too, but they last; a jitter of 3 us was named."""
     gap, window = screw(seed=6)
@@ -95,6 +97,7 @@ def test_a_sensor_that_errs_with_its_way_is_not_named_as_jitter() -> None:
     assert any("as where the times of the samples jitter by" in reason for reason in shaken.reasons), shaken.reasons
 
 
+@pytest.mark.slow
 def test_a_window_with_slow_motion_that_the_model_leaves_teaches_less_or_nothing() -> None:
     gap, window = screw()
     spreads = []

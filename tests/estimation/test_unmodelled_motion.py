@@ -30,6 +30,7 @@ def test_slow_errors_are_told_from_white_noise() -> None:
     assert slow(noise + 0.3 * np.sin(6.0 * time), 40) > 0.1
 
 
+@pytest.mark.slow
 def test_a_sensor_that_errs_with_its_way_widens_the_interval_and_nothing_else_does() -> None:
     axis = Axis.preset("ball-screw")
     gap = 2e-5 / axis.p
@@ -145,6 +146,7 @@ def test_friction_hides_in_the_gap_as_far_as_it_winds_up_the_shaft() -> None:
     assert model.hidden_friction(values) == pytest.approx((3.0 - 1.0) * wound / 2.0)
 
 
+@pytest.mark.slow
 def test_errors_of_floating_point_are_no_mismatch_and_errors_in_a_few_places_are_one() -> None:
     axis, time = Axis.preset("stepper-stage"), np.arange(4000) / 1000.0
     axis = axis.replace(sensors=replace(axis.sensors, encoder_resolution=0.0, position_resolution=0.0))
@@ -159,6 +161,7 @@ def test_errors_of_floating_point_are_no_mismatch_and_errors_in_a_few_places_are
     assert any("in a few places" in reason for reason in slipped.reasons), slipped.reasons
 
 
+@pytest.mark.slow
 def test_halves_that_differ_by_the_growth_that_is_told_are_no_mismatch() -> None:
     time = np.arange(4000) / 1000.0
     angle, gap = np.sin(6.0 * time), 0.05 * (1.0 + 0.02 * time)

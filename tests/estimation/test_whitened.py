@@ -173,6 +173,7 @@ def test_a_gap_taken_for_constant_that_grows_is_covered_or_refused():
     assert all(e.interval[0] < gap < e.interval[1] for e, gap in accepted)
 
 
+@pytest.mark.slow
 def test_growth_that_only_fractions_of_a_count_tell_counts_as_unknown():
     """Two pushes tell gap, offset and growth apart by nothing else; from such residuals a gap was 1.9 deg off."""
     axis, middle = Axis.preset("micro-positioner"), math.radians(40.5)

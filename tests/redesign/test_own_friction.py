@@ -68,6 +68,7 @@ def test_a_machine_has_arrived_where_its_own_friction_may_hold_it() -> None:
     assert near == pytest.approx(each)
 
 
+@pytest.mark.slow
 def test_the_least_friction_is_fed_forward_and_edges_take_it_where_no_bias_is_stated() -> None:
     own = POSITIONER.command_of(POSITIONER.own_friction)
     for width in (0.0, 0.25):

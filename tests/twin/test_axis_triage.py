@@ -66,6 +66,7 @@ def test_windows_that_say_nothing_new_get_a_glance() -> None:
         assert one.why == "nothing moved"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moved", [0.97, 1.03])
 def test_a_gap_that_moved_is_estimated_at_once(moved: float) -> None:
     twin = fed(new(), (*windows(GAP), *windows(moved * GAP, 6)))

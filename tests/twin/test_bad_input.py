@@ -94,6 +94,7 @@ def by_turns(factors):
     return Seen([window_message(number, 10.0 * number) for number in range(len(factors))], model)
 
 
+@pytest.mark.slow
 def test_two_machines_under_one_name_get_no_setting_until_three_windows_in_a_row_are_of_one():
     seen = by_turns([0.01, 0.2, 0.01, 0.2, 0.01, 0.01, 0.01, 0.01])
     assert "the machine is not the one that was learnt" in seen.alarms[1]

@@ -68,6 +68,7 @@ def test_models_carry_settings_controller_and_start():
     assert calm.first_setting == Setting(0.0, gains_of(calm.servo.controller))
 
 
+@pytest.mark.slow
 def test_without_a_start_it_is_the_verified_fallback_set_as_in_a_scenario():
     scenario = Scenario.preset("certified")
     model = ServoModel("axis", scenario.model, scenario.twin)

@@ -14,6 +14,7 @@ PATH = "/v1/servos/ax-1/what-if"
 ASKED = {"gap": 0.1, "k_dz": 1.0}
 
 
+@pytest.mark.slow
 def test_an_operator_s_token_simulates_in_a_process_of_its_own(tmp_path, monkeypatch):
     monkeypatch.setattr(what_if_process, "_ANSWER_S", 60.0)  # however busy the machine
 

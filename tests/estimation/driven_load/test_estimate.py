@@ -143,6 +143,7 @@ def drive_axis(friction=1.0, n=2):
     return Axis(TorqueDrive(1.0), Transmission(1.0, k, 5.0, in_gap="free"), load, Controller(0, 0, 0, 1.0))
 
 
+@pytest.mark.slow
 def test_a_chain_of_masses_is_tried_where_the_axis_has_one_and_one_mass_does_not_do():
     made = swinging(seconds=12.0, links=CHAIN, friction=0.2 * FRICTION)
     alone = with_dynamics(made, gap_within(UNKNOWN, None))
@@ -179,6 +180,7 @@ def test_a_stiff_load_whose_counts_a_swinging_one_would_smooth_is_not_said_to_sw
     assert found.status is GapStatus.LOST_MOTION
 
 
+@pytest.mark.slow
 def test_identify_tries_dynamics_by_itself_where_the_load_swings(tmp_path):
     made = swinging(seconds=12.0)
     rows = np.column_stack([made.time, made.motor, made.load])
