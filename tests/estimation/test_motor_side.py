@@ -12,8 +12,12 @@ from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.learning.trend import TrendSettings
 from servotwin.estimation.learning.wear import Expectation
+from servotwin.estimation.motor_side.estimator import problem_of
 from servotwin.estimation.motor_side.problem import MotorModel, MotorProblem
+from servotwin.estimation.motor_side.search import _beside, _white_noise
+from servotwin.estimation.output_error.fit import descend, plain_cost
 from servotwin.estimation.output_error.models import Priors, ShaftModel
+from servotwin.estimation.output_error.search import rms
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
@@ -65,6 +69,29 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window:
     assert left(1.0) < 1.0
     assert left(0.99) > 3.0 * left(1.0)
     assert left(0.0) > 100.0 * left(1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("start", "good"), [(0.85, False), (1.08, True)])
+def test_beside_a_minimum_that_leaves_more_than_counts_another_is_found(
+    window: Window, start: float, good: bool
+) -> None:
+    """Contacts that come a little earlier make a minimum of their own, in a gap that is 1 % off."""
+    problem, half = problem_of(window, SCREW, motor_side.MotorSideSettings()), 0.5 * SCREW.p * GAP
+    *_, tried = problem.grid(start * half)
+    values = min(tried, key=lambda each: plain_cost(problem, each, problem.model.speed))
+    slow = problem.model.slowing[1] * problem.model.speed
+    first = descend(problem, values, _white_noise(problem, values), problem.free, 10, slow)
+    found = _beside(problem, first)
+    if good:
+        assert rms(first.raw) < 0.5 * problem.count
+        assert found is None
+    else:
+        assert rms(first.raw) > 1.2 * problem.count
+        assert abs(first.values[0] / half - 1.0) > 0.01
+        assert found is not None
+        assert rms(found.raw) < 0.5 * problem.count
+        assert abs(found.values[0] / half - 1.0) < 0.002
 
 
 @pytest.mark.slow
