@@ -72,11 +72,11 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("start", "good"), [(0.85, False), (1.08, True)])
+@pytest.mark.parametrize(("start", "good"), [(1.5, False), (1.08, True)])
 def test_beside_a_minimum_that_leaves_more_than_counts_another_is_found(
     window: Window, start: float, good: bool
 ) -> None:
-    """Contacts that come a little earlier make a minimum of their own, in a gap that is 1 % off."""
+    """Contacts that come earlier or later make minima of their own, in gaps that are some per cent off."""
     problem, half = problem_of(window, SCREW, motor_side.MotorSideSettings()), 0.5 * SCREW.p * GAP
     *_, tried = problem.grid(start * half)
     values = min(tried, key=lambda each: plain_cost(problem, each, problem.model.speed))
@@ -87,8 +87,8 @@ def test_beside_a_minimum_that_leaves_more_than_counts_another_is_found(
         assert rms(first.raw) < 0.5 * problem.count
         assert found is None
     else:
-        assert rms(first.raw) > 1.2 * problem.count
-        assert abs(first.values[0] / half - 1.0) > 0.01
+        assert rms(first.raw) > 4.0 * problem.count
+        assert abs(first.values[0] / half - 1.0) > 0.05
         assert found is not None
         assert rms(found.raw) < 0.5 * problem.count
         assert abs(found.values[0] / half - 1.0) < 0.002

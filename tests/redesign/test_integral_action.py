@@ -13,12 +13,10 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
-from servotwin.redesign.certified import certify as certify_module
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of
-from servotwin.redesign.certified.certificate import Certificate
-from servotwin.redesign.certified.certify import certify, is_disturbed
+from servotwin.redesign.certified.certify import is_disturbed
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.margins import integral_shares, nominal_margins
@@ -122,25 +120,6 @@ def test_a_zone_lets_an_integral_work_against_friction_on_a_load_that_nothing_ho
     assert [each.settled.mean() > 0.95 for each in found] == [True, False, True]
     assert np.percentile(found[2].tail, 95.0) < 0.5 * np.percentile(found[0].tail, 95.0)
     assert np.percentile(found[2].cost, 95.0) < 0.7 * np.percentile(found[0].cost, 95.0)
-
-
-def test_a_verified_zone_is_narrowed_as_far_as_that_is_verified_and_costs_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    def found(*narrower: float, running: Design | None = None) -> Certificate:
-        monkeypatch.setattr(certify_module, "_NARROWER", narrower)
-        certificate = certify(SCREW, KNOWN, DEMANDS, running=running)
-        assert isinstance(certificate, Certificate)
-        return certificate
-
-    # A zone of hardly more than the sensor's counts does not keep the integral from hunting.
-    wide, narrow, refused = found(), found(0.06, 0.5), found(0.06)
-    assert wide.setting.controller.integral_only
-    assert narrow.setting == replace(wide.setting, tolerance=0.5 * wide.setting.tolerance)
-    assert narrow.cost < 0.9 * wide.cost
-    assert narrow.settled_least >= DEMANDS.settled
-    assert refused.setting == wide.setting
-    assert [each.looked_at - wide.looked_at for each in (narrow, refused)] == [2, 1]
-    # In force it stays, and is not narrowed at every update.
-    assert found(0.5, running=narrow.setting).setting == narrow.setting
 
 
 def test_where_a_candidate_failed_the_next_ones_are_tried_first() -> None:

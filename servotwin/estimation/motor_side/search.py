@@ -57,10 +57,11 @@ def search(problem: FitProblem, gap: float) -> Search:
 
 
 def _beside(problem: FitProblem, best: Fit) -> Fit | None:
-    """The minimum beside the best one that leaves far less; None: there is none, or what that leaves is little.
+    """The minimum in another gap beside the best one that leaves far less; None: there is none, or little is left.
 
-    A contact that comes earlier or later makes a minimum of its own, where the model's numbers go astray. Starts in
-    gaps beside it begin at the model's own numbers, in white noise, under an observer that slows down.
+    A contact that comes earlier or later makes a minimum of its own, where the model's numbers go astray. Starts beside
+    it begin at the model's own numbers, in white noise, under an observer that slows down. In such noise the numbers
+    bend to leave less in the same gap too, which says nothing.
     """
     found = best
     for share in _BESIDE:
@@ -74,7 +75,8 @@ def _beside(problem: FitProblem, best: Fit) -> Fit | None:
             fit = descend(problem, values, noise, problem.free, _BESIDE_STEPS, rate)
             values, left = fit.values, rms(fit.raw)
         found = min(found, fit, key=lambda each: rms(each.raw))
-    return found if rms(found.raw) < _LESS * rms(best.raw) else None
+    another = len(distinct([best, found])) > 1
+    return found if another and rms(found.raw) < _LESS * rms(best.raw) else None
 
 
 def _white_noise(problem: FitProblem, start: Array) -> Autoregression:

@@ -19,7 +19,6 @@ from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates
 from servotwin.plant.plants import Plant, check_gap_in_loop
-from servotwin.redesign.certified.assess import COUNTS
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of, last_resort
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
@@ -48,8 +47,6 @@ _WORTH = 1.03
 # Cost of a law without velocity feedforward over the same law with it, up to which the plain one is better: it
 # overshoots less and comes to rest sooner. In force it stays a little longer, so that the two do not take turns.
 _ALIKE, _ALIKE_IN_FORCE = 1.03, 1.045
-# Widths of a zone that stops the integral, over the one that is verified, in the order in which they are tried.
-_NARROWER = (0.5, 0.7)
 
 
 def certify(
@@ -104,7 +101,7 @@ def certify(
         looked_at += len(candidates)
         found = _first_verified(question, candidates, running, attempts)
         if found is not None:
-            return replace(found, looked_at=looked_at + found.looked_at, seconds=clock() - begin)
+            return replace(found, looked_at=looked_at, seconds=clock() - begin)
     # Only where all fail do the figures of one count: the rest of its machines are simulated now.
     furthest = max(attempts or [Attempt(question, with_feedforward(laws[0], feedforward))], key=Attempt.reached)
     best = replace(furthest.certificate(), looked_at=looked_at, seconds=clock() - begin)
@@ -126,7 +123,7 @@ def _first_verified(
             # Before the rest of the attempt's machines, which are needed only where this is none.
             verified = _plainer(question, screening, attempt.setting) or attempt.verified()
             if verified is not None:
-                return verified if verified.setting == running else _narrower(question, screening, verified, hard)
+                return verified
         hard += attempt.missed()
     return None
 
@@ -174,39 +171,6 @@ def _plainer(question: Question, screening: Screening, found: Design) -> Certifi
         return None
     attempt = Attempt(question, plain)
     return None if attempt.cannot_pass() else attempt.verified()
-
-
-def _narrower(
-    question: Question, screening: Screening, found: Certificate, hard: Sequence[SimulatedMachines]
-) -> Certificate:
-    """The setting with a narrower zone that stops its slow integral, where that costs less and is verified too.
-
-    The zones of the candidates are far apart, and most of the cost is the error that a zone leaves. Many narrower ones
-    fail: such a one is given up at the first failure that the first sample does not allow, which takes little time.
-    """
-    setting, least = found.setting, COUNTS * question.servo.position_resolution
-    stops = setting.tolerance > 0.0 and setting.controller.integral_only and integrates(setting.controller)
-    if not (stops and has_slow_integral(question.servo)):
-        return found
-    strict = replace(question, demands=replace(question.demands, failures=0))
-    for looked_at, share in enumerate(_NARROWER, 1):
-        narrower = replace(setting, tolerance=share * setting.tolerance)
-        if narrower.tolerance < least or screening.fails(narrower) or not _costs_less(screening, narrower, setting):
-            continue
-        attempt = Attempt(strict, narrower)
-        if attempt.fails_early(hard) or attempt.cannot_pass():
-            continue
-        verified = attempt.verified()
-        if verified is not None:
-            return replace(verified, looked_at=looked_at)
-    return replace(found, looked_at=len(_NARROWER))
-
-
-def _costs_less(screening: Screening, one: Design, other: Design) -> bool:
-    if screening.question.uncertainty.usual_step is None:
-        return screening.cost(one) < screening.cost(other)
-    costs = screening.expected_costs([one, other])
-    return costs[one] < costs[other]
 
 
 def _likely(question: Question, hard: list[SimulatedMachines], ranked: Iterator[Design]) -> Iterator[Attempt]:
