@@ -23,6 +23,7 @@ _AGAIN = ((3, 3), (10, 2))  # steps in the noise that was learnt, from each star
 _BESIDE = (0.02, -0.02, 0.05, -0.05, 0.1, -0.1)  # of the gap: starts where the best minimum leaves much
 _BESIDE_STEPS, _SHARES = 15, (1.0, 0.5, 0.3, 0.15)  # from each, as the observer slows down
 _LEFT_COUNTS = 1.0  # what a good fit leaves
+_BENT = 1.0  # how much less usual (squared standard deviations) its numbers may be
 _LESS = 0.5  # of what a minimum leaves: one beside it leaves less for certain
 
 
@@ -57,11 +58,11 @@ def search(problem: FitProblem, gap: float) -> Search:
 
 
 def _beside(problem: FitProblem, best: Fit) -> Fit | None:
-    """The minimum in another gap beside the best one that leaves far less; None: there is none, or little is left.
+    """The minimum beside the best one that leaves far less; None: there is none, or little is left.
 
     A contact that comes earlier or later makes a minimum of its own, where the model's numbers go astray. Starts beside
     it begin at the model's own numbers, in white noise, under an observer that slows down. In such noise the numbers
-    bend to leave less in the same gap too, which says nothing.
+    bend to leave less in any minimum: one whose numbers are less usual says nothing.
     """
     found = best
     for share in _BESIDE:
@@ -75,8 +76,14 @@ def _beside(problem: FitProblem, best: Fit) -> Fit | None:
             fit = descend(problem, values, noise, problem.free, _BESIDE_STEPS, rate)
             values, left = fit.values, rms(fit.raw)
         found = min(found, fit, key=lambda each: rms(each.raw))
-    another = len(distinct([best, found])) > 1
-    return found if another and rms(found.raw) < _LESS * rms(best.raw) else None
+    straight = _unusual(problem, found) <= _unusual(problem, best) + _BENT
+    return found if straight and rms(found.raw) < _LESS * rms(best.raw) else None
+
+
+def _unusual(problem: FitProblem, fit: Fit) -> float:
+    """Squared distance of a fit's numbers from those of the model, in their standard deviations."""
+    away = problem.model.root @ fit.values
+    return float(away @ away)
 
 
 def _white_noise(problem: FitProblem, start: Array) -> Autoregression:
