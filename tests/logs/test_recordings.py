@@ -69,7 +69,7 @@ def test_the_columns_of_a_log_are_chosen_while_it_is_read(suffix, tmp_path, made
 
 
 def test_decimal_commas_between_commas_are_refused(tmp_path, made):
-    # Before: the digits behind a comma were read as the next column.
+    # Otherwise the digits behind a comma are read as the next column.
     with pytest.raises(InvalidInput, match=r"line 3: 6 values for 3 names.*semicolons or tabs"):
         read_recording(csv(tmp_path / "a.csv", rows(made)[1:], comma=True, comments=["# rig"]), RecordingColumns())
 

@@ -23,8 +23,8 @@ _AGAIN = ((3, 3), (10, 2))  # steps in the noise that was learnt, from each star
 _BESIDE = (0.02, -0.02, 0.05, -0.05, 0.1, -0.1)  # of the gap: starts where the best minimum leaves much
 _BESIDE_STEPS, _SHARES = 15, (1.0, 0.5, 0.3, 0.15)  # from each, as the observer slows down
 _LEFT_COUNTS = 1.0  # what a good fit leaves
-_BENT = 1.0  # how much less usual (squared standard deviations) its numbers may be
-_LESS = 0.5  # of what a minimum leaves: one beside it leaves less for certain
+_LESS = 0.5  # of what the best minimum leaves: one beside it leaves less for certain
+_BENT = 1.0  # squared standard deviations: how much less usual the numbers of that one may be
 
 
 def search(problem: FitProblem, gap: float) -> Search:
