@@ -20,6 +20,7 @@ from servotwin.estimation.output_error.unexplained import slow, unexplained
 from servotwin.plant.signals import Array
 
 _BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
+_ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
 _RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
 _APART = 4.0  # standard deviations between the halves of a window
@@ -96,7 +97,8 @@ def judge(
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     single = one_flank(found)
     rise = (single.cost - best.cost) / best.variance()
-    if rise < _BELIEVED:
+    # The noise is learnt at the best fit, and speaks for it: what rounding may hide is no evidence of a second flank.
+    if rise < _BELIEVED or np.max(np.abs(single.raw - best.raw)) < _ALIKE * problem.count:
         bound = _BOUND * 2.0 * smallest_half(found, single) - problem.count
         enough = bound > _BOUND_COUNTS * problem.count
         words = "one flank explains the window nearly as well as two"
