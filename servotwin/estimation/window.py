@@ -21,6 +21,7 @@ MINIMUM_SAMPLES = 16
 CHANNELS = {"position": "m", "theta_m": "rad", "voltage": "V", "reference": "m"}
 _OTHERS = tuple(name for name in CHANNELS if name != "position")
 _ROUNDING = 1e-9  # of the motion
+_LARGEST = 1e100  # of a sample, in its unit: squares of larger ones overflow
 _JITTER = 0.05  # of a sample interval: largest deviation of (rounded) time stamps from a uniform grid
 
 
@@ -230,11 +231,12 @@ def _channel(where: str, name: str, values: ArrayLike) -> Array:
         raise InvalidInput(f"{where}{name} must be an array of numbers in {CHANNELS[name]}") from None
     if samples.ndim != 1 or samples.size < MINIMUM_SAMPLES:
         raise InvalidInput(f"{where}{name} has shape {samples.shape}: must be (n,) with n >= {MINIMUM_SAMPLES} samples")
-    finite = np.isfinite(samples)
-    if not finite.all():
-        index = int(np.argmin(finite))
+    usable = np.abs(samples) <= _LARGEST
+    if not usable.all():
+        index = int(np.argmin(usable))
         raise InvalidInput(
             f"{where}{name}[{index}] = {samples[index]} {CHANNELS[name]}: every sample must be a finite number"
+            f"{f' of at most {_LARGEST:g}' if np.isfinite(samples[index]) else ''}"
         )
     samples.flags.writeable = False
     return samples
@@ -289,6 +291,11 @@ def _uniform(where: str, size: int, time: ArrayLike, start: float) -> tuple[floa
     off_grid = ~(np.abs(times - (times[0] + interval * np.arange(size))) < _JITTER * interval)
     wrong = np.flatnonzero(off_grid if np.all(np.isfinite(times)) else ~np.isfinite(times))
     if wrong.size:
-        index = int(wrong[0])
-        raise InvalidInput(f"{where}time[{index}] = {times[index]} s: must be finite, increasing, uniformly spaced")
+        index, after, steps = int(wrong[0]), "", np.diff(times)
+        if np.all(np.isfinite(times)):
+            # Where samples are missing the whole grid is off: the step that is least like the others is the place.
+            index = int(np.argmax(np.abs(steps - np.median(steps)))) + 1
+            after = f", {steps[index - 1]:.6g} s after the sample before"
+        words = "must be finite, increasing, uniformly spaced"
+        raise InvalidInput(f"{where}time[{index}] = {times[index]} s{after}: {words}")
     return 1.0 / interval, float(times[0])

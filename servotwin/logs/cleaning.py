@@ -14,6 +14,7 @@ from servotwin.plant.signals import Array
 
 _Mask = np.ndarray[Any, np.dtype[np.bool_]]
 
+_LARGEST = 1e100  # squares of larger values overflow
 _STALE = 50.0  # times the usual interval: a first sample so far before the others is an old one
 _HELD_CHANGES, _HELD = 50, 0.9  # changes of a channel that is held, and share of them after equally many samples
 MEASURED = ("motor", "load")
@@ -83,7 +84,7 @@ def cleaned(time: Array, channels: Mapping[str, Array], turns: Mapping[str, floa
                 # Between two samples of the slower one an angle may make more than half a turn.
                 table[:, place], turned[name] = unwrapped(table[:, place], turns[name])
         keep(slowest, BETWEEN)
-    keep(np.isfinite(table.sum(axis=1)), "samples without a number in some column")
+    keep(np.all(np.abs(table) <= _LARGEST, axis=1), "samples without a number in some column")
     if first:
         keep(~_long_before(table[:, 0]), "stale samples, long before all others")
     keep(in_order(table[:, 0]), OUT_OF_ORDER)

@@ -86,6 +86,11 @@ def csv_blocks(path: Path, requested: Requested) -> Iterator[LogColumns]:
         if not wanted:
             yield LogColumns({}, layout.names, metadata)
             return
+        if doubled := [name for name in requested if layout.names.count(name) > 1]:
+            raise InvalidInput(
+                f"log {path}: {layout.names.count(doubled[0])} columns are named {doubled[0]!r}, as where two machines "
+                "are in one file: give each its own name"
+            )
         places = [layout.names.index(name) for name in wanted]
         for number, lines in _blocks(file, layout.first + 1):
             values, damaged = _values(lines, layout, places, number)

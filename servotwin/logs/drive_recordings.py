@@ -27,7 +27,7 @@ _SAME = math.log(1.2)  # of two ways
 _OTHER_UNIT = math.log(20.0)  # of two ways; a radian is 57.3 degrees
 _HELD = 2.5  # usual intervals: nothing is known of the motion within a longer one
 _POSITIONS = {**LENGTHS, **ANGLES}
-_TORQUES = ("n m", "nm", "n_m", "n·m")
+_COMMANDS = {"v": "V", "a": "A", "n": "N", **dict.fromkeys(("n m", "nm", "n_m", "n·m"), "N m")}
 _GUESSES = {
     "time": TIME_NAMES,
     "motor": ("motor", "theta_m", "motor_position", "motor_angle", "qm", "motor_pos", "position", "q"),
@@ -226,7 +226,7 @@ def _force_scale(path: Path, unit: str, rotary: bool, travel: float | None, want
         return given
     if unit == "N" and not rotary:
         return 1.0
-    if unit.lower() in _TORQUES:
+    if unit == "N m":
         # A torque of the motor, whose load travels by so much per radian.
         return 1.0 if travel is None and rotary else (None if travel is None else 1.0 / travel)
     return None
@@ -271,7 +271,9 @@ def _unit(path: Path, part: str, chosen: Mapping[str, str], wanted: DriveColumns
     """Unit of a column: as given, as the header says, or as that of the encoder that it refers to."""
     given: str | None = getattr(wanted, f"{part}_unit", None)
     unit = known_unit(given) if given else named_unit(chosen[part])
-    if part in ("time", "command"):
+    if part == "command":
+        return _COMMANDS.get(unit.lower(), unit)
+    if part == "time":
         return unit
     if not unit and part == "reference":
         return _unit(path, "load" if "load" in chosen else "motor", chosen, wanted)

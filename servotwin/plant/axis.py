@@ -386,13 +386,13 @@ class Axis:
         InvalidInput
             With the fastest growing pole.
         """
-        law = law_of(controller or self.controller)
-        if isinstance(law, LinearLaw):
-            self._law_loop(law).check(
-                described_law(controller or self.controller, self.actuator.unit, self.load.motion)
-            )
-            return
-        if self.rigid and self.at_motor:
-            check_damped(self.load, self.chain())
-        position = "m" if self.load.motion == LINEAR else "rad"
-        loop.check_stable(self.plant(), law, "axis", self.actuator.unit, position)
+        given = controller or self.controller
+        law, unit, motion = law_of(given), self.actuator.unit, self.load.motion
+        parts = Parts(self.actuator, self.transmission, self.load, given, self.sensors)
+        with loop.computable(lambda: values_of_parts(parts)):
+            if isinstance(law, LinearLaw):
+                self._law_loop(law).check(described_law(given, unit, motion))
+                return
+            if self.rigid and self.at_motor:
+                check_damped(self.load, self.chain())
+            loop.check_stable(self.plant(), law, "axis", unit, "m" if motion == LINEAR else "rad")

@@ -7,7 +7,9 @@ edge's own tick as the law.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -117,6 +119,31 @@ def axis_system(
 def gain_units(command: str, position: str) -> tuple[str, str, str, str]:
     """Units of Kp, Ki, Kd and Tf of a filtered PID, for those of its command and of the position."""
     return f"{command}/{position}", f"{command}/({position} s)", f"{command} s/{position}", "s"
+
+
+@contextmanager
+def computable(described: Callable[[], Mapping[str, Mapping[str, Any]]]) -> Iterator[None]:
+    """Refuse numbers of which no loop can be computed, as those of no machine: the message names the most extreme one.
+
+    Parameters
+    ----------
+    described : callable
+        The tables of the plant's file, with its controller's.
+    """
+    try:
+        with np.errstate(all="ignore"):
+            yield
+    except (np.linalg.LinAlgError, OverflowError):
+        sizes = {
+            f"{table}.{key} = {each!r}": abs(math.log10(abs(each)))
+            for table, values in described().items()
+            for key, value in values.items()
+            for each in (value if isinstance(value, list | tuple) else [value])
+            if isinstance(each, float) and math.isfinite(each) and each != 0.0
+        }
+        raise InvalidInput(
+            f"the loop cannot be computed; farthest from 1 is {max(sizes, key=sizes.__getitem__)}: check its unit"
+        ) from None
 
 
 def check_stable(plant: LinearSystem, law: Controller, described: str, command: str = "V", position: str = "m") -> None:

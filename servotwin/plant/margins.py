@@ -114,14 +114,13 @@ def margins_of_response(
         return np.asarray(value / (1.0 + value))
 
     rest = float(np.abs(closed(omega[:1]))[0]) if at_rest is None else at_rest
-    falls = crossings(lambda w: _log_modulus(closed(w)) - math.log(rest / math.sqrt(2.0)), omega)
     Ms_omega, Ms = _sensitivity_peak(loop, omega, at_infinity) if stable else (math.nan, math.inf)
     return Margins(
         gain_crossovers=_gain_crossovers(loop, omega),
         phase_crossovers=_phase_crossovers(loop, omega),
         Ms=Ms,
         Ms_omega=Ms_omega,
-        bandwidth=falls[0] if falls else math.inf,
+        bandwidth=_first_fall(closed, rest, omega),
         stable=stable,
     )
 
@@ -146,8 +145,16 @@ def gain_crossovers(loop: LinearSystem) -> tuple[GainCrossover, ...]:
 
 def bandwidth(closed_loop: LinearSystem) -> float:
     """rad/s at which abs(T) first falls 3 dB below abs(T(0)); inf where it never does."""
-    level = math.log(float(np.abs(closed_loop.response(0.0))) / math.sqrt(2.0))
-    falls = crossings(lambda w: _log_modulus(closed_loop.response(w)) - level, search_frequencies(closed_loop))
+    rest = float(np.abs(closed_loop.response(0.0)))
+    return _first_fall(closed_loop.response, rest, search_frequencies(closed_loop))
+
+
+def _first_fall(closed_loop: Callable[[Array], Complex], rest: float, omega: Array) -> float:
+    """rad/s at which a response first falls 3 dB below its gain at rest; inf where it never does, or has none."""
+    if rest == 0.0:
+        return math.inf
+    level = math.log(rest / math.sqrt(2.0))
+    falls = crossings(lambda w: _log_modulus(closed_loop(w)) - level, omega)
     return falls[0] if falls else math.inf
 
 
@@ -166,7 +173,7 @@ def search_frequencies(*systems: LinearSystem, also: Complex | None = None) -> A
     # A loop may cross over far beyond all its corners, where it is its asymptote.
     sizes = np.concatenate([np.abs(corners), *(system.asymptotic_crossovers() for system in systems)])
     low, high = (1e-2 * float(sizes.min()), 1e2 * float(sizes.max())) if sizes.size else (1e-2, 1e2)
-    grid = np.geomspace(low, high, int(_PER_DECADE * math.log10(high / low)) + 2)
+    grid = np.geomspace(low, high, int(_PER_DECADE * (math.log10(high) - math.log10(low))) + 2)
     width = np.maximum(np.abs(corners.real), _NARROWEST * np.abs(corners))
     about = (np.abs(corners.imag) + width * _ABOUT_RESONANCE[:, None]).ravel()
     omega = np.unique(np.concatenate([grid, sizes, about[(about > low) & (about < high)]]))
@@ -257,8 +264,10 @@ def _phase_crossovers(loop: Callable[[Array], Complex], omega: Array) -> tuple[P
 
 def direction(values: Complex) -> Complex:
     """Each value divided by its modulus."""
-    return np.asarray(values / np.abs(values))
+    with np.errstate(invalid="ignore", over="ignore"):  # 0 has none
+        return np.asarray(values / np.abs(values))
 
 
 def _log_modulus(values: Complex) -> Array:
-    return np.log(np.abs(values))
+    with np.errstate(divide="ignore"):  # a loop without gain has no crossing
+        return np.log(np.abs(values))

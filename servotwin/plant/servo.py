@@ -89,7 +89,9 @@ class Servo:
     controller: Annotated[
         Controller, key(help="The controller that runs when none is given; it also carries voltage and rate limits.")
     ]
-    n: Annotated[int, key("masses", table="structure", minimum=2, required=True, help="Number of masses.")] = 3
+    n: Annotated[
+        int, key("masses", table="structure", minimum=2, maximum=100, required=True, help="Number of masses.")
+    ] = 3
     k_d: Annotated[
         float,
         key(
@@ -121,7 +123,8 @@ class Servo:
             value = getattr(self, name)
             if isinstance(value, tuple) and len(value) != self.n:
                 count = f"has {len(value)} values for {self.n} masses; give one or {self.n}"
-                raise InvalidInput(f"servo {name} = {value!r}: {count}")
+                own = next(item.exact_name for item in items_of(type(self)) if item.name == name)
+                raise InvalidInput(f"servo {name} ({own}) = {value!r}: {count}")
             if name != "n":
                 object.__setattr__(self, name, tuple(map(float, value)) if isinstance(value, tuple) else float(value))
 
@@ -363,7 +366,9 @@ class Servo:
         InvalidInput
             With the fastest growing pole.
         """
-        loop.check_stable(self.plant(), filtered_pid(controller or self.controller), "servo")
+        law = filtered_pid(controller or self.controller)
+        with loop.computable(lambda: values_of(self, only=_PLANT) | {"controller": values_of(law)}):
+            loop.check_stable(self.plant(), law, "servo")
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""

@@ -183,6 +183,8 @@ class SCurve:
     def __post_init__(self) -> None:
         _finite("SCurve", begin_value=self.begin_value, end_value=self.end_value, begin=self.begin)
         _positive("SCurve", "s", duration=self.duration)
+        if not 1e-90 < self.duration < 1e90:  # its cube is a number
+            raise InvalidInput(f"SCurve: duration = {self.duration} s must lie between 1e-90 and 1e90 s")
 
     def pieces(self, _duration: float, /) -> PiecewiseCubic:
         """The ramp as one cubic between two constants."""

@@ -55,6 +55,16 @@ def test_of_a_voltage_it_is_said_that_resistance_and_torque_constant_are_not_tol
     assert "cannot be told apart" not in run(volts, "--inertia", 20).output
 
 
+def test_units_at_the_end_of_a_name_are_those_in_brackets(log, tmp_path):
+    ends = written(tmp_path / "ends.csv", header="time_s,motor_mm,force_n,reference_mm")
+    one, other = (json.loads(run(each, "--json").stdout)["inverse_dynamics"] for each in (log, ends))
+    assert one == other
+    volts = written(tmp_path / "volts.csv", header="time_s,motor_mm,voltage_v,reference_mm")
+    assert "cannot be told apart" in " ".join(run(volts).output.split())
+    torque = written(tmp_path / "torque.csv", header="time_s,motor_rad,torque_n_m,reference_rad")
+    assert "kg m^2" in run(torque).output
+
+
 def test_a_pid_is_stated_or_a_cascade(log):
     result = run(log, "--kp", 6e4, "--position-gain", 25)
     assert result.exit_code == 2

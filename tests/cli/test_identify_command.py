@@ -187,6 +187,7 @@ BAD = {
         lambda lines: [*lines[:5], lines[5].replace(",", ",nan,", 1), *lines[6:]],
         "every sample must be a finite",
     ),
+    "a name twice": (lambda lines: [lines[0].replace("reference_m", "theta_m_rad"), *lines[1:]], "2 columns are named"),
     "a hole": (lambda lines: lines[:50] + lines[90:], "uniformly spaced"),
     "backwards": (lambda lines: [lines[0], *lines[:0:-1]], "uniformly spaced"),
     "no steps": (lambda lines: [lines[0].replace("reference_m", "r"), *lines[1:]], "give --start and --duration"),

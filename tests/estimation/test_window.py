@@ -46,6 +46,11 @@ def test_names_the_sample_that_is_not_finite(name, bad):
         Window(**channels, sample_rate=100.0, source="log.csv")
 
 
+def test_names_the_sample_whose_square_is_no_number():
+    with pytest.raises(InvalidInput, match=r"position\[31\] = -1e\+200 m: every .* number of at most 1e\+100"):
+        Window(np.where(np.arange(50) == 31, -1e200, RAMP), sample_rate=100.0)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -60,9 +65,13 @@ def test_names_the_sample_that_is_not_finite(name, bad):
         ({"sample_rate": "fast"}, "sample_rate = 'fast' Hz: must be a finite number"),
         ({"start": math.inf}, "start = inf s: must be a finite number"),
         ({"sample_rate": None, "time": RAMP[::-1]}, "uniformly spaced"),
+        (
+            {"sample_rate": None, "time": np.delete(np.arange(53.0), [30, 31, 32])},
+            r"time\[30\] = 33.0 s, 4 s after the sample before: must be finite, increasing, uniformly spaced",
+        ),
         ({"sample_rate": None, "time": RAMP**2}, r"time\[1\] = .* uniformly spaced"),
         ({"sample_rate": None, "time": np.append(RAMP[:-1], np.nan)}, r"time\[49\] = nan s: must be finite"),
-        ({"sample_rate": None, "time": np.zeros(50)}, r"time\[.*\] = 0.0 s: must be .* increasing"),
+        ({"sample_rate": None, "time": np.zeros(50)}, r"time\[.*\] = 0.0 s, .*: must be .* increasing"),
         ({"sample_rate": None, "time": RAMP[:-1]}, r"time has shape \(49,\) and position \(50,\)"),
         ({"sample_rate": None, "time": RAMP, "start": 1.0}, "start = 1.0 s: must be left out"),
     ],

@@ -29,6 +29,15 @@ def test_one_time_stamp_far_ahead_costs_one_sample(tmp_path, place):
     assert sum(log.found.values()) == 1
 
 
+def test_a_value_whose_square_is_no_number_is_left_out(tmp_path):
+    load = MADE.load.copy()
+    load[700:703] = 1e200
+    log = log_of(tmp_path, load=load)
+    assert log.found == {"samples without a number in some column": 3}
+    with pytest.raises(InvalidInput, match=r"0 of \d+ samples can be used"):
+        log_of(tmp_path, load=1e200 * np.sign(MADE.load - 1e-9))
+
+
 def test_a_clock_that_is_set_back_keeps_most_of_the_log():
     time = np.concatenate([np.arange(0.0, 10.0, 0.1), np.arange(7.0, 20.0, 0.1)])
     kept = in_order(time)

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from servotwin.plant import linear
 from servotwin.plant import loop as loops
+from servotwin.plant.axis import Axis
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, bandwidth, gain_crossovers, margins, peak, sensitivity_peak
 from servotwin.plant.servo import Servo
@@ -198,6 +199,16 @@ def test_a_loop_below_one_has_no_crossover() -> None:
     assert gain_crossovers(low) == ()
     assert margins(low, linear.feedback(low, linear.gain(1.0))).Ms == pytest.approx(1.0, rel=1e-6)
     assert bandwidth(linear.gain(1.0)) == math.inf
+
+
+def test_a_loop_without_gain_has_margins_without_a_word() -> None:
+    """A stepper whose controller has no gain; and with one that is as good as none."""
+    stepper = Axis.preset("stepper-stage")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = stepper.replace(Ki=0.0).margins()
+        assert stepper.replace(Kp=1e-300).margins().Ms == pytest.approx(stepper.margins().Ms)
+    assert (found.Ms, found.bandwidth, found.gain_crossovers, found.phase_crossovers) == (1.0, math.inf, (), ())
 
 
 def test_pidf_with_terms_left_out() -> None:

@@ -154,6 +154,8 @@ def test_signals_are_values() -> None:
         (lambda: PiecewiseCubic([-math.inf], [[0.0, 0.0, 0.0, 0.0]]), "times of a piecewise cubic must be finite"),
         (lambda: SCurve(0.0, math.inf, 1.0), "end_value = inf must be finite"),
         (lambda: SCurve(0.0, 1.0, 0.0), "duration = 0.0 s must be positive"),
+        (lambda: SCurve(0.0, 1.0, 1e-300), "duration = 1e-300 s must lie between"),
+        (lambda: SCurve(0.0, 1.0, 1e300), r"duration = 1e\+300 s must lie between"),
         (lambda: Step(math.nan), "size = nan"),
         (lambda: SquareWave(1.0, -2.0), "period = -2.0 s must be positive"),
         (lambda: Samples([0.0, 0.0], [1.0, 2.0]), "must increase"),

@@ -173,14 +173,21 @@ class Problem:
             size = max(_FEWEST, size // 2)
 
     def on_one_flank(self, values: Array) -> list[list[Array]]:
-        """Unknowns (u,) of a gap whose other flank is out of reach, a list for each flank, the lower one first."""
+        """Unknowns (u,) of a gap whose other flank is out of reach, lists for each flank, the lower one first.
+
+        One list has the numbers of `values` and one the model's own: a fit with two flanks may have bent its numbers
+        and its first state until they explain the window. In both the flank is also where `values` have it.
+        """
         wide, middle = _WIDE * self.range, -0.5 * float(self.lead.max() + self.lead.min())
-        tables = []
+        first, tables = self._first_of_few(), []
         for side in (-1.0, 1.0):
-            tried = [values.copy() for _ in _PLACES]
-            for each, place in zip(tried, _PLACES, strict=True):
-                each[HALF], each[OFFSET] = wide, middle + place * self.range + side * wide
-            tables.append(tried)
+            flanks = [middle + place * self.range for place in _PLACES]
+            flanks.append(float(values[OFFSET] - side * values[HALF]))
+            own = [self.model.start(wide, flank + side * wide, first) for flank in flanks]
+            tried = [values.copy() for _ in flanks]
+            for each, start in zip(tried, own, strict=True):
+                each[[HALF, OFFSET]] = start[[HALF, OFFSET]]
+            tables += [tried, own]
         return tables
 
 

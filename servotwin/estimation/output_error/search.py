@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from collections.abc import Iterator
+from typing import Protocol, cast
 
 import numpy as np
 
@@ -81,6 +82,22 @@ def _left(fit: Fit) -> float:
     with np.errstate(over="ignore"):
         left = float(fit.raw @ fit.raw)
     return left if math.isfinite(left) else math.inf
+
+
+def one_flank_without_a_gap(found: Search) -> Iterator[Fit]:
+    """Fits with one flank, in the found noise, of a window whose best fit has hardly a gap.
+
+    The noise of the best fit hides them (`search`): they are followed in white noise, as that fit was.
+    """
+    problem, free = cast(SearchProblem, found.problem), found.free.copy()
+    free[HALF] = False
+    noise = _white(problem, _left(found.best))
+    for tried in problem.on_one_flank(found.best.values):
+        values = min(tried, key=lambda each: plain_cost(problem, each, problem.model.speed))
+        for rate in _rates(problem):
+            values = descend(problem, _nearest(problem, values, rate), noise, free, _STEPS, rate, _ROUGH).values
+        for steps in (0, _STEPS):
+            yield descend(problem, values, found.noise, free, steps, _last_rate(problem))
 
 
 def distinct(fits: list[Fit]) -> list[Fit]:

@@ -9,17 +9,19 @@ import numpy as np
 
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
-from servotwin.estimation.output_error.fit import Search, one_flank
+from servotwin.estimation.output_error.fit import Fit, Search, one_flank
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
 from servotwin.estimation.output_error.rounding import influence, rounded
+from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
 from servotwin.estimation.output_error.unexplained import slow, unexplained
 from servotwin.plant.signals import Array
 
 _BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
+_ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
 _RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
 _APART = 4.0  # standard deviations between the halves of a window
@@ -94,9 +96,11 @@ def judge(
     mismatches = _mismatches(found, likely, settings.gap_rate / unit, settings.model_share * half)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
-    single = one_flank(found)
-    rise = (single.cost - best.cost) / best.variance()
-    if rise < _BELIEVED:
+    singles = [one_flank(found)]
+    if half <= NORMAL_95 * total:
+        singles += one_flank_without_a_gap(found)
+    single = min(singles, key=lambda fit: fit.cost)
+    if (single.cost - best.cost) / best.variance() < _BELIEVED or any(_alike(found, fit) for fit in singles):
         bound = _BOUND * 2.0 * smallest_half(found, single) - problem.count
         enough = bound > _BOUND_COUNTS * problem.count
         words = "one flank explains the window nearly as well as two"
@@ -122,6 +126,14 @@ def judge(
     ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
     reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
     return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
+
+
+def _alike(found: Search, single: Fit) -> bool:
+    """True where rounding may hide the difference between the best fit and one with a single flank.
+
+    The noise is learnt at the best fit, and speaks for it: what rounding hides is no evidence of a second flank.
+    """
+    return float(np.max(np.abs(single.raw - found.best.raw))) < _ALIKE * found.problem.count
 
 
 def _allowed(found: Search, half: float, settings: OutputErrorSettings) -> float:

@@ -58,7 +58,7 @@ def refused(blank: GapEstimate, sentences: tuple[str, ...]) -> GapEstimate:
 def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
     steps = np.abs(np.diff(samples))
     span = float(np.ptp(samples))
-    if span == 0.0:
+    if span * span == 0.0:  # also of a motion whose square underflows
         return f"{name} is constant at {factor * samples[0]:.6g} {unit}: nothing moved, or the sensor is dead"
     index = int(np.argmax(steps))
     if steps[index] > 0.2 * span and steps[index] > _JUMP * max(_usual(steps), 1e-9 * span):
