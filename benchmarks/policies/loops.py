@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -13,20 +14,20 @@ from rich.table import Table
 
 from benchmarks import report
 from benchmarks.batch import Batch
+from benchmarks.policies.contenders import candidates, without_bounds
 from benchmarks.policies.worn import BLOCKS, HALF_PERIOD, RATE, STEPS, WornMachine, worn_machines
 from servotwin.analysis.maps.pool import shared, workplace
-from servotwin.control.laws import filtered_pid
-from servotwin.control.retuning import scaled
 from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.messages.updates import Update
+from servotwin.redesign.design import Design
 from servotwin.redesign.registry import certified_policy
 from servotwin.simulation import Run
 
 SCHEMA, NAME = "servotwin-bench-loops/1", "loops"
 MACHINES, QUICK, SEED = 40, 1, 2027
-TWIN, OWN, SLOWER, FALLBACK = "twin", "own PD", "0.6 x PD", "fallback set, held"
-# Constants: factors on the servo's Kp and Kd, and on its Ki.
-_SCALES, _INTEGRAL = (0.6, 0.7, 0.85, 1.0), (0.0, 0.01, 0.03)
+TWIN, OWN, FALLBACK = "twin", "own PD", "fallback set, held"
+_WITHIN, _FED = "within the bounds: ", ", velocity x "
+"""Parts of the names of constants: one that the policy's bounds on Ms allow, one with velocity feedforward."""
 _GAP_OFF = math.radians(0.05)
 # Steps of which most are made with little knowledge.
 _FIRST = 4
@@ -131,32 +132,52 @@ def loops(
 
 
 def _block(block: str, count: int, seed: int) -> list[LoopRow]:
-    """Rows of the twin, of the constant that is verified, of two others, and of the best constant with hindsight."""
+    """Rows of the twin, the constant that is verified, the own gains, and, with hindsight, the best constants."""
     tasks = [_Task(place, machine) for place, machine in enumerate(worn_machines(block, count, seed))]
     found = dict(sorted((task.place, scores) for task, scores in shared(_compared, tasks)))
-    return _rows(block, list(found.values()))
+    return best_rows(block, list(found.values()))
 
 
-def _rows(block: str, found: Sequence[Mapping[str, LoopScores]]) -> list[LoopRow]:
+def best_rows(block: str, found: Sequence[Mapping[str, LoopScores]]) -> list[LoopRow]:
+    """Rows of a block from the scores of all contenders on each machine."""
     rows = {name: LoopRow(block, name, tuple(scores[name] for scores in found)) for name in found[0]}
     constants = [row for row in rows.values() if row.name not in (TWIN, FALLBACK)]
+    within = [row for row in constants if row.name.startswith(_WITHIN)]
+    return [
+        *(rows[name] for name in (TWIN, FALLBACK, OWN)),
+        _best("without velocity feedforward", [row for row in constants if _FED not in row.name]),
+        _best("of all", [*constants, rows[FALLBACK]]),
+        _best("within the bounds", [*within, rows[FALLBACK]]),
+    ]
+
+
+def _best(which: str, constants: Sequence[LoopRow]) -> LoopRow:
+    """The constant with the lowest cost p95."""
     best = min(constants, key=lambda row: row.at("cost", 95.0))
-    best = best._replace(name=f"best constant: {best.name}")
-    return [rows[TWIN], rows[FALLBACK], rows[OWN], rows[SLOWER], best]
+    return best._replace(name=f"best constant {which}: {best.name.removeprefix(_WITHIN)}")
 
 
 def _compared(task: _Task) -> dict[str, LoopScores]:
-    machine, own = task.machine, task.machine.model.controller
-    fallback = certified_policy(machine.model, machine.scenario.twin).fallback().setting
-    scores = {
-        TWIN: with_twin(machine),
-        FALLBACK: scored(machine, machine.under(fallback.pid, fallback.tolerance)),
-    }
-    for scale in _SCALES:
-        for share in _INTEGRAL:
-            name = {(1.0, 0.0): OWN, (0.6, 0.0): SLOWER}.get((scale, share), f"Kp, Kd x {scale:g}, Ki x {share:g}")
-            scores[name] = scored(machine, machine.under(filtered_pid(scaled(own, scale, (1.0, 1.0), share))))
+    machine = task.machine
+    scores = {TWIN: with_twin(machine)}
+    for name, setting in constants_of(machine).items():
+        scores[name] = scored(machine, machine.under(setting.pid, setting.tolerance))
     return scores
+
+
+def constants_of(machine: WornMachine) -> dict[str, Design]:
+    """Constant settings by name: the fallback set, the candidates of the policy, and those beyond its bounds on Ms.
+
+    The zones that stop the integral are left out, but for that of the fallback set.
+    """
+    policy = certified_policy(machine.model, machine.scenario.twin)
+    demands = replace(policy.demands, stops=())
+    within = candidates(machine.model, policy.uncertainty, demands)
+    beyond = candidates(machine.model, policy.uncertainty, without_bounds(demands))
+    own = Design(machine.model.controller.replace(Ki=0.0))
+    others = {name: each for name, each in beyond.items() if each != own and each not in within.values()}
+    result = {FALLBACK: policy.fallback().setting, OWN: own}
+    return result | {f"{_WITHIN}{name}": each for name, each in within.items()} | others
 
 
 def with_twin(machine: WornMachine) -> LoopScores:
@@ -221,7 +242,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
         those = [numbers for key, numbers in sorted(found.items()) if key.split("/")[1] == block]
         if those:
             scores = [{name: LoopScores(**each) for name, each in numbers.items()} for numbers in those]
-            console.print(shown(_rows(block, scores)))
+            console.print(shown(best_rows(block, scores)))
 
 
 BATCH = Batch(_units, _numbers, _show, BLOCKS)

@@ -17,7 +17,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
-from servotwin.control.retuning import friction_feedforward
+from servotwin.control.retuning import friction_feedforward, strength
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
@@ -30,7 +30,7 @@ from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
-from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors
+from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors, Uncertainty
 from servotwin.redesign.dead_zones import HysteresisPolicy
 from servotwin.redesign.registry import certified_policy, policy_of
 from servotwin.twin.settings import TwinSettings
@@ -162,13 +162,23 @@ def _centre_of(own: AnyGains, middle: dict[str, float], leave: float) -> AnyGain
 
 
 def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[AnyController]:
-    """Candidates for the stated ranges, and those for a plant that the twin has learnt exactly."""
+    """Candidates for the stated ranges, those for a plant that the twin has learnt exactly, and those in between.
+
+    What is left open of a learnt plant may rule its fastest laws out: then slower ones with a notch are candidates.
+    """
     exact = policy.uncertainty.replace(
         **dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors(("k",), (0.0,), ((0.0,),))
     )
+    stated = _laws(policy, policy.uncertainty, demands)
     known = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
-    pairs = ((policy.uncertainty, demands), (exact, known))
-    return [each.controller for pair in pairs for each in candidates_of(policy.servo, *pair, True, False)]
+    fastest = max(abs(strength(law)) for law in stated) / abs(strength(policy.servo.controller))
+    slower = tuple(scale for scale in demands.scales if scale <= fastest * _ROUNDING)
+    between = dataclasses.replace(known, scales=slower)
+    return [*stated, *_laws(policy, exact, known), *_laws(policy, exact, between)]
+
+
+def _laws(policy: CertifiedPolicy, known: Uncertainty, demands: Demands) -> list[AnyController]:
+    return [each.controller for each in candidates_of(policy.servo, known, demands, True, False)]
 
 
 def _range(values: list[float]) -> tuple[float, float]:

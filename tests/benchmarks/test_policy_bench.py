@@ -15,7 +15,7 @@ from rich.console import Console
 
 from benchmarks.policies.command import chosen, dumps, policies, shown
 from benchmarks.policies.contenders import constants, contender
-from benchmarks.policies.loops import scored
+from benchmarks.policies.loops import FALLBACK, OWN, TWIN, LoopScores, best_rows, constants_of, scored
 from benchmarks.policies.machines import BIAS, BLOCKS, machines
 from benchmarks.policies.table import PolicyScores, compare
 from benchmarks.policies.trial import REST, Contender, run_machine, scores
@@ -157,3 +157,38 @@ def test_the_cost_of_a_loop_is_the_error_s_integral_per_step() -> None:
     found = scored(machine, run)
     assert found.cost == pytest.approx(0.05 * HALF_PERIOD)
     assert (found.settled, found.tail) == (1.0, 0.0)
+
+
+@pytest.mark.slow
+def test_constants_of_a_loop_come_with_and_without_velocity_feedforward_and_bounds() -> None:
+    (machine,) = worn_machines("model error", 1, 5)
+    found, model = constants_of(machine), machine.model
+    assert len({each.controller for each in found.values()}) == len(found) > 100
+    assert found[OWN].controller == model.controller.replace(Ki=0.0)
+    for name, setting in found.items():
+        law = setting.pid
+        assert name == FALLBACK or name.endswith(f"velocity x {law.velocity_feedforward * model.p / model.k_B:g}") == (
+            law.velocity_feedforward > 0.0
+        )
+        # Away from the bounds, so that the other plants of the ranges do not matter.
+        peak = model.margins(law.replace(velocity_feedforward=0.0)).Ms
+        assert peak <= 2.0 or not (name == FALLBACK or name.startswith("within the bounds"))
+    lively = found["Kp, Kd x 0.85, Ki x 0, velocity x 0.5"].pid
+    assert (lively.Kp, lively.Ki) == (pytest.approx(0.85 * model.controller.Kp), 0.0)
+
+
+def test_the_best_constants_are_those_with_the_lowest_cost_p95() -> None:
+    def costs(*values: float) -> list[LoopScores]:
+        return [LoopScores(value, value, 1.0, 0.0) for value in values]
+
+    names = [TWIN, FALLBACK, OWN, "within the bounds: slow", "lively", "lively, velocity x 0.5"]
+    values = [costs(0.1, 0.1), costs(3.0, 3.0), costs(4.0, 4.0), costs(2.0, 2.0), costs(1.0, 9.0), costs(1.0, 1.5)]
+    found = [dict(zip(names, machine, strict=True)) for machine in zip(*values, strict=True)]
+    assert [(row.name, row.at("cost", 100.0)) for row in best_rows("bias", found)] == [
+        (TWIN, 0.1),
+        (FALLBACK, 3.0),
+        (OWN, 4.0),
+        ("best constant without velocity feedforward: slow", 2.0),
+        ("best constant of all: lively, velocity x 0.5", 1.5),
+        ("best constant within the bounds: slow", 2.0),
+    ]

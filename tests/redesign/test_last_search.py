@@ -11,9 +11,10 @@ import pytest
 
 from servotwin.control.gains import gains_of
 from servotwin.estimation.disturbance import Disturbance
-from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus
+from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.whitened.free_model import FactorPrior
-from servotwin.messages import Setting
+from servotwin.messages import Gains, Setting
 from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as policies
@@ -23,10 +24,11 @@ from servotwin.redesign.certified.last_search import LastSearch, ranges_of
 from servotwin.redesign.certified.policy import CertifiedPolicy, alike
 from servotwin.redesign.certified.uncertainty import Region, Uncertainty
 from servotwin.redesign.design import Design, decoded_part
-from servotwin.redesign.policy import Evidence, Redesign
+from servotwin.redesign.policy import NOT_OBSERVED, Evidence, Redesign
 
 DEG = math.pi / 180.0
 SMALL = Demands(machines=16, conditions=4, screened=2, settled=0.8, integral=(0.0,), beyond=Beyond(machines=4))
+OWN = Servo.preset("paper").controller
 POLICY = CertifiedPolicy(Servo.preset("paper"), Uncertainty(input_bias=(-0.1, 0.1)), SMALL)
 
 
@@ -135,6 +137,44 @@ def test_the_chosen_setting_is_verified_alone_while_the_question_is_nearly_the_s
     other = Setting(0.0, gains_of(POLICY.servo.controller))
     for asked in (seen(5.0, 10.1, setting=made.setting), seen(9.8, 10.3, setting=other)):
         assert POLICY.redesign(replace(asked, search=made.search)).search is not None
+    assert searches.count == 2
+
+
+def test_the_chosen_setting_follows_the_friction_as_it_becomes_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    def evidence(friction: float, **more: object) -> Evidence:
+        std = 1.5e-3
+        motor = LearntMotor((0.0, 0.0, friction, -0.02), (*[0.0] * 10, std**2, *[0.0] * 4, std**2), 0.0)
+        return seen(9.9, 10.1, motor=motor, **more)
+
+    def fed(made: Redesign) -> float:
+        assert made.setting is not None
+        assert isinstance(made.setting.gains, Gains)
+        return made.setting.gains.friction_feedforward
+
+    made = POLICY.redesign(evidence(0.06))
+    assert fed(made) == pytest.approx(0.06 - NORMAL_95 * 1.5e-3)
+    searches = Searches()
+    monkeypatch.setattr(policies, "certify", searches)
+    again = POLICY.redesign(evidence(0.062, setting=made.setting, search=made.search))
+    assert fed(again) == pytest.approx(0.062 - NORMAL_95 * 1.5e-3)
+    assert again.certificate is not None
+    assert again.certificate.friction == pytest.approx(np.array(POLICY.ranges.friction(evidence(0.062))))
+    assert searches.count == 0
+
+
+def test_a_machine_whose_gap_no_window_shows_is_asked_about_again_once_more_is_known(searches: Searches) -> None:
+    hidden = replace(seen(0.0, 60.0).estimate, status=GapStatus.LOWER_BOUND)
+    made = POLICY.redesign(replace(seen(0.0, 60.0), estimate=hidden, setting=Setting(0.0, gains_of(OWN))))
+    assert searches.count == 1
+    calm = Setting(0.0, gains_of(OWN.replace(Ki=0.0, feedforward=-0.02)))
+    then = replace(seen(0.0, 60.0), estimate=hidden, setting=calm, search=made.search)
+    assert POLICY.redesign(then).reason == "the estimate is lower bound"
+    assert POLICY.redesign(replace(then, steps=(1e-3,), disturbance=NOT_OBSERVED)).search is None
+    assert searches.count == 1
+    again = POLICY.redesign(replace(then, steps=(1e-3,)))
+    assert again.search is not None
+    assert searches.count == 2
+    assert POLICY.redesign(replace(then, steps=(1.01e-3,), search=again.search)).search is None
     assert searches.count == 2
 
 

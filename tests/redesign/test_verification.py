@@ -11,6 +11,7 @@ import pytest
 from exploration import extent
 
 from servotwin.commissioning.guarding import guarding
+from servotwin.control.gains import gains_of
 from servotwin.control.retuning import law_for_margins
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
@@ -216,6 +217,20 @@ def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     assert box is not None
     assert after.setting.gains is not None
     assert box.limits.allows_gains(after.setting.gains, box.middle)
+
+
+@pytest.mark.slow
+def test_the_box_of_the_edge_admits_the_candidates_of_a_machine_learnt_more_or_less_well() -> None:
+    """A motor's gain of which nothing is learnt rules the fastest laws out; slower ones with a notch come in."""
+    servo, ranges = SERVO.replace(sample_rate=1000.0), Uncertainty(input_bias=(-0.1, 0.1))
+    box = guarding(servo, TwinSettings(uncertainty=ranges))
+    assert box is not None
+    for width in (0.01, 0.04):
+        covariance = np.diag(np.square([width, 3.0 * width, 0.1 * width])).tolist()
+        learnt = LearntFactors(("k", "c", "p"), (0.0,) * 3, tuple(map(tuple, covariance)))
+        laws = [each.controller for each in candidates_of(servo, ranges.replace(learnt=learnt), Demands(), True, False)]
+        assert any(law.notch_hz and law.Kp < servo.controller.Kp for law in laws)
+        assert all(box.limits.allows_gains(gains_of(law), box.middle) for law in laws)
 
 
 def motor(back_emf: float, friction: float, bias: float, std: float) -> LearntMotor:

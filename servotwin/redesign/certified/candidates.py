@@ -53,8 +53,7 @@ def candidates_of(
     within = laws_within(servo, widened(uncertainty, demands), with_margins(demands), integral)
     plain = list(_without_zone(servo, within, demands, uncertainty.step[0]))
     fed = [each.controller for each in plain if not each.tolerance]
-    friction = uncertainty.friction[0] + uncertainty.own_friction_of(servo)[0]
-    plain += [Design(law) for law in _with_friction(servo, fed, friction, demands)]
+    plain += [Design(law) for law in _with_friction(servo, fed, uncertainty, demands)]
     # The lost motion is no part of an error of the motor.
     zone = 0.0 if servo.at_motor else servo.tolerance_for(uncertainty.gap[1])
     plain += _zones_in_gap(servo, within, zone, demands)
@@ -105,14 +104,22 @@ def _with_velocity(servo: Plant, law: AnyController, demands: Demands) -> list[A
     return [law, *(law.replace(velocity_feedforward=share * needed, velocity_time=time) for share in shares)]
 
 
-def _with_friction(servo: Plant, laws: list[AnyController], friction: float, demands: Demands) -> list[AnyController]:
-    """The laws without integral action, with the feedforward of a friction (N m): an integral would have to give up at
-    every reversal what it holds against it."""
+def friction_push(servo: Plant, uncertainty: Uncertainty, demands: Demands) -> float:
+    """Feedforward of the friction that acts on every machine; 0: none is allowed."""
+    friction = uncertainty.friction[0] + uncertainty.own_friction_of(servo)[0]
     fed = min(float(servo.command_of(friction)), demands.friction_limit)
     if not demands.friction_feedforward or not fed:
-        return []
-    fed = math.copysign(fed, static_gain(servo.controller))
-    pids = [law for law in laws if isinstance(law, Controller) and not law.Ki]
+        return 0.0
+    return math.copysign(fed, static_gain(servo.controller))
+
+
+def _with_friction(
+    servo: Plant, laws: list[AnyController], uncertainty: Uncertainty, demands: Demands
+) -> list[AnyController]:
+    """The laws without integral action, with the feedforward of friction: an integral would have to give up at every
+    reversal what it holds against it."""
+    fed = friction_push(servo, uncertainty, demands)
+    pids = [law for law in laws if isinstance(law, Controller) and not law.Ki] if fed else []
     return [law.replace(friction_feedforward=fed) for law in pids]
 
 

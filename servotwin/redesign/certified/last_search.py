@@ -53,6 +53,10 @@ class Asked(Struct, frozen=True):
             and all(_contains(mine, other.ranges[name]) for name, mine in self.ranges.items())
         )
 
+    def alike(self, other: Asked) -> bool:
+        """True where another question is nearly the same."""
+        return self.contains(other) and other.contains(self)
+
 
 class LastSearch(Struct, frozen=True):
     """Question of the last search, the setting that it found, and the reason where it found none."""
@@ -67,7 +71,7 @@ class LastSearch(Struct, frozen=True):
 
     def finds(self, asked: Asked) -> Design | None:
         """The setting that it found, where this question is nearly the same."""
-        return self.found if asked.contains(self.asked) and self.asked.contains(asked) else None
+        return self.found if asked.alike(self.asked) else None
 
 
 def digest_of(servo: Plant, uncertainty: Uncertainty, demands: Demands, trial: Trial) -> str:

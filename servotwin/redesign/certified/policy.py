@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import ClassVar, Protocol
 
+from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.control.retuning import static_gain
 from servotwin.estimation.learning.motor import LearntMotor
@@ -15,6 +16,7 @@ from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Band, Setting
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.assess import NEAR
+from servotwin.redesign.certified.candidates import friction_push
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
 from servotwin.redesign.certified.certify import certify, confirm
 from servotwin.redesign.certified.demands import Demands
@@ -119,13 +121,14 @@ class CertifiedPolicy:
 
     def decide(self, evidence: Evidence, verifier: Verifier) -> Redesign:
         """Choose as `redesign` does, with the certificates of `verifier`."""
-        estimate = self.ranges.estimate(evidence)
-        if estimate is None and not self.ranges.shows_more(evidence):
+        region, past = self.ranges.region(evidence), evidence.search
+        asked = verifier.asked(region)
+        if self.ranges.estimate(evidence) is None and not (
+            self.ranges.shows_more(evidence) or self._changed(evidence, asked)
+        ):
             return Redesign(None, math.nan, evidence.unusable)
-        region = self.ranges.region(evidence)
         if too_wide := self._too_wide(region):
             return self._for_growth(evidence, verifier.fallback(), region) or Redesign(None, math.nan, too_wide)
-        asked, past = verifier.asked(region), evidence.search
         if asked is not None and past is not None and past.fails(asked):
             reason = f"{past.reason}; the ranges have not become noticeably narrower since that search"
             return self._without(evidence, region, verifier.fallback(), reason)
@@ -140,6 +143,13 @@ class CertifiedPolicy:
         made = self._answer(evidence, region, result, verifier)
         return made if asked is None or kept is not None else replace(made, search=LastSearch(asked, result.setting))
 
+    def _changed(self, evidence: Evidence, asked: Asked | None) -> bool:
+        """True where a rest, of a machine whose gap no window has shown, changes the question of the last search: the
+        size of the steps or the machine's numbers may have become known since."""
+        if asked is None or evidence.search is None or evidence.gains is None:
+            return False
+        return math.isfinite(evidence.disturbance.bias_std) and not evidence.search.asked.alike(asked)
+
     def _without(self, evidence: Evidence, region: Region, fallback: Certificate, reason: str) -> Redesign:
         """The fallback set, where a search found nothing and it is not in force yet."""
         fed = with_feedforward(fallback.setting, region.feedforward)
@@ -152,8 +162,25 @@ class CertifiedPolicy:
         found = None if evidence.search is None else evidence.search.finds(asked)
         if found is None or not alike(found, evidence.setting):
             return None
-        result = self.confirm(region, with_feedforward(found, region.feedforward), evidence.machine, evidence.motor)
+        fed = self._with_push(with_feedforward(found, region.feedforward), region, evidence)
+        result = self.confirm(region, fed, evidence.machine, evidence.motor)
         return result if isinstance(result, Certificate) else None
+
+    def _with_push(self, found: Design, region: Region, evidence: Evidence) -> Design:
+        """The setting with the feedforward of the friction that is known now, where it has one."""
+        law = found.controller
+        if not isinstance(law, Controller) or not law.friction_feedforward:
+            return found
+        servo, known = self._learnt(region, evidence.machine, evidence.motor)
+        push = friction_push(servo, known, self._limited_demands)
+        return Design(law.replace(friction_feedforward=push), found.tolerance)
+
+    def _learnt(
+        self, region: Region, machine: FactorPrior | None, motor: LearntMotor | None
+    ) -> tuple[Plant, Uncertainty]:
+        """Model and ranges of a region, as learnt where they were."""
+        known, learnt = region.within(self.uncertainty), learnt_servo(self.servo, self.uncertainty, machine, motor)
+        return (self.servo, known) if learnt is None else (learnt[0], narrowed(known, learnt[1]))
 
     def _answer(self, evidence: Evidence, region: Region, found: Certificate, verifier: Verifier) -> Redesign:
         """Redesign that follows from a certificate."""
@@ -230,10 +257,7 @@ class CertifiedPolicy:
         motor: LearntMotor | None = None,
     ) -> Certificate | NotVerified:
         """Verify one setting for a region, by simulation, on machine and motor as learnt where they were."""
-        servo, known = self.servo, region.within(self.uncertainty)
-        learnt = learnt_servo(servo, self.uncertainty, machine, motor)
-        if learnt is not None:
-            servo, known = learnt[0], narrowed(known, learnt[1])
+        servo, known = self._learnt(region, machine, motor)
         demands = self.demands_within_band()
         return confirm(servo, known, setting, demands, self.simulations, region.noise, self.clock)
 
