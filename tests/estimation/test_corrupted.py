@@ -110,6 +110,20 @@ def test_a_spike_is_told_from_noise_and_counts():
     assert "in sample 2300 alone" in sentence
 
 
+@pytest.mark.parametrize("count", [0.0, 1e-6])
+def test_a_position_that_slips_is_told_from_one_that_follows_a_motor_in_one_sample(count):
+    """The slip is a hundredth of the motion, and far beyond what the motion does in a sample."""
+    angle = moving_angle()
+    position = 1e-3 * np.concatenate([np.zeros(20), angle[:-20]])
+    rounded = position if count == 0.0 else count * np.round(position / count)
+    assert faults(Window(rounded, angle, sample_rate=5000.0)) == ()
+    slip = np.where(np.arange(5000) > 2300, 0.01 * np.ptp(position), 0.0)
+    (sentence,) = faults(Window(rounded + slip, angle, sample_rate=5000.0))
+    assert sentence.startswith("position slips by ")
+    assert "between samples 2300 and 2301, and the motor does not" in sentence
+    assert faults(Window(rounded + slip, angle + 1e3 * slip, sample_rate=5000.0)) == ()
+
+
 def test_a_ramp_of_the_gap_is_refused_or_lies_within_the_interval():
     for case in corrupted_windows("ramp of 2 deg/s", 6, 11):
         estimate = estimate_gap(case.window, case.servo)

@@ -182,8 +182,11 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     agent, policy = scenario.agent_settings(), certified_policy(scenario.model, scenario.twin)
     limits, own = agent.limits, agent.own
     exact = policy.uncertainty.replace(k=0.0, c=0.0, k_B=0.0, m=0.0, learnt=LearntFactors(("k",), (0.0,), ((0.0,),)))
-    sets = ((policy.uncertainty, Demands()), (exact, Demands(beyond=Beyond(k_T=0.0))))
-    laws = [s.controller for pair in sets for s in candidates_of(policy.servo, *pair, True, True)]
+    stated = [s.controller for s in candidates_of(policy.servo, policy.uncertainty, Demands(), True, True)]
+    fastest = max(law.Kp for law in stated) / policy.servo.controller.Kp
+    slower = tuple(scale for scale in Demands().scales if scale <= fastest)
+    sets = (Demands(beyond=Beyond(k_T=0.0)), Demands(beyond=Beyond(k_T=0.0), scales=slower))
+    laws = stated + [s.controller for each in sets for s in candidates_of(policy.servo, exact, each, True, True)]
     for law in laws:
         for fed in (-0.1, 0.1):
             assert limits.allows_gains(gains_of(law.replace(feedforward=fed)), own)
@@ -191,8 +194,8 @@ def test_the_limits_admit_every_candidate_and_little_else(tmp_path):
     for change in (
         {"Kd": 1.01 * min(law.Kd for law in laws)},
         {"Kd": 0.99 * max(law.Kd for law in laws)},
-        {"Kp": 1.5 * max(law.Kp for law in laws)},
-        {"Kp": 0.6 * min(law.Kp for law in laws)},
+        {"Kp": 2.0 * max(law.Kp for law in laws)},
+        {"Kp": 0.5 * min(law.Kp for law in laws)},
         {"Ki": 1.01 * max(law.Ki for law in laws)},
         {"Ki": -1.0},
         {"feedforward": 0.101},

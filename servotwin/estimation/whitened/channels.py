@@ -31,6 +31,7 @@ from servotwin.plant.signals import Array
 _FLAT, _CREST, _RUN, _STEEP = 20, 10, 6, 0.05
 _JUMP = 50.0  # times the usual fastest motion
 _SPIKE, _SHOWN, _SPIKE_COUNTS = 8.0, 0.01, 2.0  # of the median step, of the motion's range; counts
+_SLIP_SHOWN, _SLIP_COUNTS = 0.001, 5.0  # of the motion's range; counts, of which noise and rounding make three
 # Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
 _REPEATED, _ABRUPT, _LEAP = 4, 4.0, 2.0
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
@@ -45,7 +46,8 @@ def faults(window: Window, motion: str = LINEAR) -> tuple[str, ...]:
     units = {"theta_m": degrees, "position": (1e3, "mm") if motion == LINEAR else degrees}
     channels = {name: (window.channels[name], *unit) for name, unit in units.items()}
     sentences = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
-    return tuple(sentence for sentence in sentences if sentence)
+    found = tuple(sentence for sentence in sentences if sentence)
+    return found or _slip(window.theta_m, window.position, *units["position"])
 
 
 def refused(blank: GapEstimate, sentences: tuple[str, ...]) -> GapEstimate:
@@ -74,22 +76,48 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
 
 
 def _spike(name: str, samples: Array, factor: float, unit: str) -> str:
-    """Describe a sample that leaves its neighbours and comes back at once; empty without one.
+    """Describe a sample that leaves its neighbours and comes back at once; empty without one."""
+    index, size = _loner(samples)
+    if size <= _SHOWN * float(np.ptp(samples)) or size <= _SPIKE_COUNTS * counted(samples):
+        return ""
+    return f"{name} leaves its neighbours by {factor * size:.6g} {unit} in sample {index} alone: a fault of the sensor"
+
+
+def _slip(theta_m: Array, position: Array, factor: float, unit: str) -> tuple[str, ...]:
+    """Describe a position that moves on in one step alone and stays there, at most one sentence.
+
+    No load does, which has a speed before and after. Where the motor does, as one that is told to step, the load may
+    follow, or the samples of both are missing.
+    """
+    if _slipped(theta_m)[1] > 0.0:
+        return ()
+    index, size = _slipped(position)
+    if size == 0.0:
+        return ()
+    words = "the motor does not: the load or its scale slipped, or samples are missing"
+    return (f"position slips by {factor * size:.6g} {unit} between samples {index} and {index + 1}, and {words}",)
+
+
+def _slipped(samples: Array) -> tuple[int, float]:
+    """Sample before the step that leaves its neighbours, and by how much; 0 without one."""
+    index, size = _loner(np.diff(samples))
+    shown = size > _SLIP_SHOWN * float(np.ptp(samples)) and size > _SLIP_COUNTS * counted(samples)
+    return index, size if shown else 0.0
+
+
+def _loner(values: Array) -> tuple[int, float]:
+    """Index of the value that leaves both of its neighbours farthest, and by how much; 0 where no value clearly does.
 
     No motion does: at its crests both steps are smaller than those beside them. Noise does by a few of its standard
     deviations, which the median step is, and a counter by one count.
     """
-    steps, span = np.diff(samples), float(np.ptp(samples))
+    steps = np.diff(values)
     sizes = np.pad(np.abs(steps), 1)
     back, beside = np.minimum(sizes[2:-1], sizes[1:-2]), np.maximum(sizes[3:], sizes[:-3])
     back[(steps[1:] * steps[:-1] >= 0.0) | (back <= beside)] = 0.0
     index = int(np.argmax(back))
-    size, least = float(back[index]), max(_SPIKE * float(np.median(np.abs(steps))), _SHOWN * span)
-    if size <= least or size <= _SPIKE_COUNTS * counted(samples):
-        return ""
-    return (
-        f"{name} leaves its neighbours by {factor * size:.6g} {unit} in sample {index + 1} alone: a fault of the sensor"
-    )
+    size = float(back[index])
+    return index + 1, size if size > _SPIKE * float(np.median(np.abs(steps))) else 0.0
 
 
 def _usual(steps: Array) -> float:
