@@ -48,6 +48,7 @@ UNUSABLE = "none"
 """Method of the estimate of an unusable window; a probing move would not improve it."""
 
 _TAIL = 10  # the last one of so many parts of a window
+_LATE, _FARTHEST, _NEAR = 4, 0.8, 0.1  # the same of what comes last; of the largest way, at first; of that, at last
 
 
 def stated_machine(settings: TwinSettings) -> FactorPrior:
@@ -280,6 +281,16 @@ class DecodedWindow(NamedTuple):
             return 0.0
         size = float(np.ptp(self.window.reference))
         return size if math.isfinite(size) else 0.0
+
+    @property
+    def way_to_rest(self) -> float:
+        """Way from the first sample to where the position comes to rest, m, as after a step; 0 where it does not."""
+        if self.window is None:
+            return 0.0
+        left = np.abs(self.window.position - self.window.position[-1])
+        way, late = float(left[0]), left[-(left.size // _LATE) :]
+        arrived = way >= _FARTHEST * float(left.max()) and float(late.max()) <= _NEAR * way
+        return way if arrived else 0.0
 
 
 def decode_window(message: messages.WindowMessage) -> Window:

@@ -218,8 +218,7 @@ def _work_on(
     if not learnt.stale:
         state, taught = _teach(model, state, decoded, arrived, None if learnt.rejection else learnt.estimate)
         others, records = [*taught], [*records, *taught]
-        if decoded.step > 0.0:
-            state = replace(state, steps=(*state.steps, decoded.step)[-_STEPS:])
+        state = _with_step(state, decoded)
     evidence = _evidence(model, state, learnt, arrived)
     if why_none := _OVERTAKEN if event.overtaken else event.too_late:
         redesign = Redesign(None, math.nan, why_none)
@@ -256,6 +255,12 @@ def _send_redesign(
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     sent = _send(state, versions.pending, now, ())
     return sent if unverified is None else sent._replace(evidence=(*sent.evidence, unverified))
+
+
+def _with_step(state: TwinState, decoded: DecodedWindow) -> TwinState:
+    """The state with the step that a window shows; the first may have been made when the window began, as at a start."""
+    size = decoded.step or (0.0 if state.steps else decoded.way_to_rest)
+    return replace(state, steps=(*state.steps, size)[-_STEPS:]) if size > 0.0 else state
 
 
 def _learn(

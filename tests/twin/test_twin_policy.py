@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import msgspec
 import pytest
-from twin_messages import PITCH, Rule, eq_21, known_gap, make, receipt, twin_of, window_message
+from twin_messages import PITCH, Rule, eq_21, known_gap, make, message_of, receipt, twin_of, window_message
 
 from servotwin import messages
 from servotwin.control.gains import gains_of
@@ -17,6 +17,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import Disturbance
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.learning.wear import TrendState
+from servotwin.estimation.window import Window
 from servotwin.messages import (
     Band,
     Cause,
@@ -72,6 +73,25 @@ def test_a_policy_sees_the_evidence():
     evidence = rule.consulted[1]
     assert (evidence.setting.tolerance, evidence.tuned_for) == (PITCH * 0.1, 0.1)
     assert evidence.gains == gains_of(OWN)
+
+
+def test_a_policy_sees_the_steps_of_the_reference_and_the_one_of_the_start():
+    """A step at the first sample leaves a reference at rest; only what the position does then shows its size."""
+    servo = Servo.preset("paper")
+    calm, worn = (
+        simulate(servo, 4.0, reference=SquareWave(1e-3, 4.0), controller=servo.controller.replace(Ki=Ki), gap=gap)
+        for Ki, gap in ((0.0, 0.1), (servo.controller.Ki, 0.5))
+    )
+    for run, start, steps in (
+        (calm, 0.0, (1e-3, 2e-3)),
+        (calm, 1.7, (2e-3, 2e-3)),  # a step within the window
+        (worn, 0.5, (2e-3,)),  # a limit cycle
+    ):
+        rule = eq_21()
+        twin, _ = with_policy(rule)
+        for sequence, begin in enumerate((start, 1.8), start=1):
+            twin.receive(message_of(Window.from_run(run, begin, 1.5), sequence, boot="boot-1"), 10.0 * sequence)
+        assert rule.consulted[-1].steps == pytest.approx(steps, rel=0.05)
 
 
 def test_a_whole_controller_is_sent_and_known_to_be_in_force_once_it_is():
