@@ -258,7 +258,7 @@ def _send_redesign(
 
 
 def _with_step(state: TwinState, decoded: DecodedWindow) -> TwinState:
-    """The state with the step that a window shows; the first may have been made when the window began, as at a start."""
+    """The state with the step that a window shows; the first one may have been made when the window began."""
     size = decoded.step or (0.0 if state.steps else decoded.way_to_rest)
     return replace(state, steps=(*state.steps, size)[-_STEPS:]) if size > 0.0 else state
 
