@@ -80,7 +80,8 @@ class Controller:
         key(
             "tracking_time_s",
             above=0.0,
-            help="Time constant of the integral's back-calculation; sqrt(abs(Kd / Ki)) where absent.",
+            help="Time constant of the integral's back-calculation; the larger of sqrt(abs(Kd / Ki)) and abs(Kp / Ki) "
+            "where absent.",
         ),
     ] = None
     feedforward: Annotated[
@@ -171,14 +172,15 @@ class Controller:
     def tracking(self) -> float:
         """Time constant of the back-calculation, s; inf: the integral is never corrected.
 
-        As given, otherwise sqrt(Td Ti) = sqrt(abs(Kd / Ki)); without derivative action Ti = abs(Kp / Ki).
-        Zero means at once (pure integral action), infinite that there is no integral to correct.
+        As given, otherwise the usual sqrt(Td Ti) = sqrt(abs(Kd / Ki)), but at least the reset time Ti = abs(Kp / Ki):
+        where the proportional part saturates, a slow integral that is corrected faster runs down. Zero means at once
+        (pure integral action), infinite that there is no integral to correct.
         """
         if self.Ki == 0.0:
             return inf
         if self.tracking_time is not None:
             return self.tracking_time
-        return sqrt(abs(self.Kd / self.Ki)) if self.Kd != 0.0 else abs(self.Kp / self.Ki)
+        return max(sqrt(abs(self.Kd / self.Ki)), abs(self.Kp / self.Ki))
 
     @property
     def notch_gain(self) -> float:

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 
 from servotwin.control import Controller
+from servotwin.control.law import start, tick
 from servotwin.errors import InvalidInput
 
 PAPER = Controller(Kp=1377.7, Ki=18907.6, Kd=-135.1, Tf=0.1, sample_rate=5000.0)
@@ -28,6 +29,20 @@ def test_everything_optional_is_off_by_default() -> None:
     assert (law.voltage_limit, law.rate_step, law.loop_step) == (math.inf, math.inf, 1.0)
 
 
+@pytest.mark.parametrize("share", [0.01, 0.03, 0.1])
+def test_a_slow_integral_does_not_run_down_while_the_proportional_part_saturates(share: float) -> None:
+    """It grows by the limit's share of the error, as if only that had been asked for."""
+    slow = PAPER.replace(Ki=share * PAPER.Ki, voltage_limit=1.0)
+    law, state = slow.law(), start(0.0)
+    for _ in range(5000):  # 1 s under an error that asks for three times the limit
+        before, state = state.integral, tick(law, state, 3.0 / slow.Kp, 0.0)
+        assert state.integral >= before
+    assert state.voltage == 1.0
+    reset = slow.Kp / slow.Ki
+    grown = 1.0 - math.exp(-1.0 / reset)  # V, towards the limit; faster until that is reached
+    assert grown < state.integral < grown + 0.3 / reset
+
+
 def test_thresholds_are_multiples_of_the_tolerance() -> None:
     controller = PAPER.replace(enter=0.5, leave=1.5)
     assert controller.thresholds(2e-4) == (1e-4, 1.5 * 2e-4)
@@ -37,6 +52,7 @@ def test_thresholds_are_multiples_of_the_tolerance() -> None:
 def test_tracking_time_has_a_default_for_every_structure() -> None:
     assert Controller(2.0, 8.0, 0.0, 0.1).tracking == 0.25
     assert Controller(2.0, 8.0, -0.5, 0.1).tracking == 0.25
+    assert Controller(2.0, 8.0, -2.0, 0.1).tracking == 0.5
     assert Controller(2.0, 0.0, 0.5, 0.1, sample_rate=10.0).law().tracking_step == 0.0
     assert Controller(0.0, 8.0, 0.0, 0.1, sample_rate=10.0).law().tracking_step == 1.0
     assert Controller(2.0, 8.0, 1.0, 0.1, sample_rate=10.0, tracking_time=0.5).law().tracking_step == 0.2
