@@ -13,6 +13,7 @@ from servotwin.runtime.notebook import html_table
 # Angle per tick above which a notch has settled within the tick to all digits, unless it is very narrow.
 _BEYOND_RATE = 1e6
 _GAINS = ("Kp", "Ki", "Kd", "Tf")
+_SLOW = 0.25  # of the reset time: below, the usual tracking time is too short
 
 
 class ControllerChanges(TypedDict, total=False):
@@ -80,8 +81,8 @@ class Controller:
         key(
             "tracking_time_s",
             above=0.0,
-            help="Time constant of the integral's back-calculation; the larger of sqrt(abs(Kd / Ki)) and abs(Kp / Ki) "
-            "where absent.",
+            help="Time constant of the integral's back-calculation; where absent sqrt(abs(Kd / Ki)), and abs(Kp / Ki) "
+            "where that is more than four times as long.",
         ),
     ] = None
     feedforward: Annotated[
@@ -172,15 +173,17 @@ class Controller:
     def tracking(self) -> float:
         """Time constant of the back-calculation, s; inf: the integral is never corrected.
 
-        As given, otherwise the usual sqrt(Td Ti) = sqrt(abs(Kd / Ki)), but at least the reset time Ti = abs(Kp / Ki):
-        where the proportional part saturates, a slow integral that is corrected faster runs down. Zero means at once
-        (pure integral action), infinite that there is no integral to correct.
+        As given, otherwise the usual sqrt(Td Ti) = sqrt(abs(Kd / Ki)); where that is below a quarter of the reset time
+        Ti = abs(Kp / Ki), and without derivative action, Ti: a slow integral that is corrected faster runs down while
+        the proportional part saturates. Zero means at once (pure integral action), infinite that there is no integral
+        to correct.
         """
         if self.Ki == 0.0:
             return inf
         if self.tracking_time is not None:
             return self.tracking_time
-        return max(sqrt(abs(self.Kd / self.Ki)), abs(self.Kp / self.Ki))
+        usual, reset = sqrt(abs(self.Kd / self.Ki)), abs(self.Kp / self.Ki)
+        return usual if usual >= _SLOW * reset else reset
 
     @property
     def notch_gain(self) -> float:

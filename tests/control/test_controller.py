@@ -29,7 +29,7 @@ def test_everything_optional_is_off_by_default() -> None:
     assert (law.voltage_limit, law.rate_step, law.loop_step) == (math.inf, math.inf, 1.0)
 
 
-@pytest.mark.parametrize("share", [0.01, 0.03, 0.1])
+@pytest.mark.parametrize("share", [0.01, 0.02, 0.03])
 def test_a_slow_integral_does_not_run_down_while_the_proportional_part_saturates(share: float) -> None:
     """It grows by the limit's share of the error, as if only that had been asked for."""
     slow = PAPER.replace(Ki=share * PAPER.Ki, voltage_limit=1.0)
@@ -51,8 +51,9 @@ def test_thresholds_are_multiples_of_the_tolerance() -> None:
 
 def test_tracking_time_has_a_default_for_every_structure() -> None:
     assert Controller(2.0, 8.0, 0.0, 0.1).tracking == 0.25
-    assert Controller(2.0, 8.0, -0.5, 0.1).tracking == 0.25
     assert Controller(2.0, 8.0, -2.0, 0.1).tracking == 0.5
+    assert Controller(2.0, 8.0, 0.04, 0.1).tracking == math.sqrt(0.005)
+    assert Controller(2.0, 8.0, 0.03, 0.1).tracking == 0.25
     assert Controller(2.0, 0.0, 0.5, 0.1, sample_rate=10.0).law().tracking_step == 0.0
     assert Controller(0.0, 8.0, 0.0, 0.1, sample_rate=10.0).law().tracking_step == 1.0
     assert Controller(2.0, 8.0, 1.0, 0.1, sample_rate=10.0, tracking_time=0.5).law().tracking_step == 0.2

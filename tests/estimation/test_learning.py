@@ -132,18 +132,20 @@ def test_derivatives_are_those_of_the_residual():
     assert residual.size > rows.shape[0]
 
 
-def test_a_short_step_to_the_minimum_needs_no_further_evaluation():
+def test_a_descent_ends_where_a_step_that_promises_little_leads_up(monkeypatch):
     problem, points = problem_of(machine_window(factors=np.zeros(4)), noise=1e-6)
-    fit = problem.descend(np.array([*points[0], 0.0, 0.0, 0.0, 0.0]), (True, True), short=1e-9)
-    spread = np.sqrt(fit.covariance.diagonal() * fit.cost / fit.rows.shape[1])
+    fit = problem.descend(np.array([*points[0], 0.0, 0.0, 0.0, 0.0]), (True, True))
+    evaluated, smooth = [], FreeProblem.rows
+
+    def ever_higher(self, q, keep=False):
+        residual, rows = smooth(self, q, keep)
+        evaluated.append(q)
+        return residual * (1.0 + 1e-3 * len(evaluated)), rows
+
+    monkeypatch.setattr(FreeProblem, "rows", ever_higher)
     near = np.array([*fit.point, *fit.factors])
-    near[0] += 0.05 * np.sqrt(fit.cost / fit.rows.shape[1]) / np.linalg.norm(fit.rows[0])
-    again = problem.descend(near, (True, True))
-    assert again.evaluations == 1
-    moved = np.array([*again.point, *again.factors]) - np.array([*fit.point, *fit.factors])
-    shown = np.isfinite(spread)  # a screw that begins in contact does not show its place
-    assert np.all(np.abs(moved[shown]) < 0.005 * spread[shown])
-    assert again.cost == pytest.approx(fit.cost, rel=1e-6)
+    near[0] += 0.01 * np.sqrt(fit.covariance[0, 0] * fit.cost / fit.rows.shape[1])
+    assert problem.descend(near, (True, True)).evaluations == 2
 
 
 def test_without_noise_the_factors_come_out_exactly():

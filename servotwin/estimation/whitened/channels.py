@@ -32,6 +32,7 @@ _FLAT, _CREST, _RUN, _STEEP = 20, 10, 6, 0.05
 _JUMP = 50.0  # times the usual fastest motion
 _SPIKE, _SHOWN, _SPIKE_COUNTS = 8.0, 0.01, 2.0  # of the median step, of the motion's range; counts
 _SLIP_SHOWN, _SLIP_COUNTS = 0.001, 5.0  # of the motion's range; counts, of which noise and rounding make three
+_SLIP_BESIDE, _BESIDE = 3.0, 10  # of the changes of the steps beside it; so many on each side
 # Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
 _REPEATED, _ABRUPT, _LEAP = 4, 4.0, 2.0
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
@@ -101,8 +102,11 @@ def _slip(theta_m: Array, position: Array, factor: float, unit: str) -> tuple[st
 def _slipped(samples: Array) -> tuple[int, float]:
     """Sample before the step that leaves its neighbours, and by how much; 0 without one."""
     index, size = _loner(np.diff(samples))
+    changes = np.abs(np.diff(samples, 2))
+    # Where the times of the samples jitter, steps change the more the faster the motion is.
+    beside = np.concatenate([changes[max(0, index - _BESIDE) : index - 1], changes[index + 1 : index + _BESIDE]])
     shown = size > _SLIP_SHOWN * float(np.ptp(samples)) and size > _SLIP_COUNTS * counted(samples)
-    return index, size if shown else 0.0
+    return index, size if shown and size > _SLIP_BESIDE * float(beside.max(initial=0.0)) else 0.0
 
 
 def _loner(values: Array) -> tuple[int, float]:

@@ -37,7 +37,8 @@ CYCLIC = 2e-3 * math.pi  # rad, usual size of an error once per turn: a thousand
 _WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: within these, the motion is linear in them
 _FIRST_DAMPING, _FIRST_LINEAR, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-6, 1e8, 1e-9
 _EVALUATIONS = 12  # of a fit
-_SHORT = 1e-2  # of the residual's variance, promised by a step: a tenth of one standard deviation of anything
+_GAIN = 1e-6  # of the residual's variance, promised by a step: a thousandth of one standard deviation of anything
+_VAIN = 1e-3  # the same, of a step that led up: what is left then is rounding, and edges of single samples
 _SINGULAR = 1e-10  # of a column's length
 _ANY = (0.0, math.inf, math.inf)
 
@@ -239,14 +240,14 @@ class FreeProblem:
         free: tuple[bool, bool],
         within: tuple[float, float, float] = _ANY,
         evaluations: int = _EVALUATIONS,
-        short: float = _SHORT,
+        gain: float = _GAIN,
     ) -> FreeFit:
         """Descend from a start (6,) with at most so many evaluations; of gap and place only what is `free` moves.
 
-        It ends with a step that promises no more than the part `short` of the residual's variance, over which the
-        residual is taken as linear. It ends early once the cost is below the first number of `within`, once the
-        linearised problem stays above the second by more than it is below the cost, or once it stays above the third:
-        its value is then not that of the minimum, but on the same side of these.
+        It ends where a step promises less than the part `gain` of the residual's variance, or little and leads up.
+        It ends early once the cost is below the first number of `within`, once the linearised problem stays above the
+        second by more than it is below the cost, or once it stays above the third: its value is then not that of the
+        minimum, but on the same side of these.
         """
         lowest, highest = self.prior.limits()
         low, high = np.concatenate([[0.0, -1.0], lowest]), np.concatenate([[self.largest, 1.0], highest])
@@ -260,15 +261,15 @@ class FreeProblem:
                 if floor > hopeless or floor - most > cost - floor:
                     break
             step = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high) - q
-            promised = _promised(step, residual, rows)
-            if promised <= short * cost / residual.size:
-                if promised > 0.0:
-                    q, cost = q + step, cost - promised
+            variance, promised = cost / residual.size, _promised(step, residual, rows)
+            if promised <= gain * variance:
                 break
             ahead, slopes = self.rows(q + step)
             after, count = float(ahead @ ahead), count + 1
             if after < cost:
                 q, residual, rows, cost, damping = q + step, ahead, slopes, after, max(0.1 * damping, _LEAST_DAMPING)
+            elif promised <= _VAIN * variance:
+                break
             else:
                 damping *= 10.0
         return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, rows, movable, count, floor)

@@ -21,7 +21,7 @@ from servotwin.estimation.whitened.nearby import PITCH
 # Structure's stiffness over the screw's, beyond that of the model. Below the first the lead moves by little, and a
 # screw softer than the last is no drive.
 _SOFTER = (0.0, 0.02, 0.05, 0.1, 0.2)
-_SHORT = 0.1  # of the variance: a third of one standard deviation
+_GAIN = 0.1  # of the variance: a third of one standard deviation
 
 
 class Lead(NamedTuple):
@@ -65,7 +65,7 @@ def _softer(problem: FreeProblem, single: FreeFit, allowed: float) -> Iterator[F
         softened = replace(problem, servo=servo.replace(k_d=screw), compliance=0.0)
         start = here + (more - before) * moved
         within = (0.0, least + allowed, least + HOPELESS * allowed)
-        fit = softened.descend(start, (False, True), within, short=_SHORT)
+        fit = softened.descend(start, (False, True), within, gain=_GAIN)
         yield fit
         least = min(least, fit.cost)
         if fit.cost > least + allowed:
