@@ -106,7 +106,8 @@ def _read_item(table: Table, item: Item, folder: Path, base: object, values: Val
         values[item.name] = None
         return
     for name in table.names(item.names):
-        if name in table.values and table.values[name] != []:
+        # A law without states has matrices without numbers.
+        if name in table.values and not (item.form is Form.NUMBERS and table.values[name] == []):
             values[item.name] = _value(table, item, name, folder, base)
 
 

@@ -94,6 +94,8 @@ def test_the_exact_key_overrides_the_other() -> None:
         ("share_percent = 100", "m.toml: share_percent = 100 is not allowed; give a number, at least 0, below 100"),
         ("mode = 'fst'", "one of fast, slow (did you mean 'fast'?)"),
         ("range_deg = [1]", "m.toml: range_deg = [1] is not allowed; give two numbers"),
+        ("range_deg = []", "m.toml: range_deg = [] is not allowed; give "),
+        ("size_mm = []", "m.toml: size_mm = [] is not allowed; give a number, at least 0, inf allowed"),
         ("[motor]\npoles = 4", "m.toml: key 'motor.speed_deg_per_s' is missing"),
         ("[motor]\nspeed_deg = 4", "key 'motor.speed_deg_per_s' is missing (found 'motor.speed_deg' instead)"),
         ("[motor]\nspeed_deg_per_s = 1\npoles = 9", "motor.poles = 9 is not allowed; give an integer, at least 2"),
