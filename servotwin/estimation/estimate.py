@@ -70,6 +70,36 @@ class MachineReading:
 
 
 @dataclass(frozen=True)
+class LastContact:
+    """Last contact of a window in which the motor pushed the screw one way only.
+
+    Attributes
+    ----------
+    side : float
+        1: the motor pushed the screw forwards; -1: backwards.
+    motor : float
+        rad, the motor's furthest angle: where it touches the screw.
+    position : float
+        m, of the last mass at rest with the screw there.
+    std : float
+        rad, of both together.
+    time : float
+        s, the window's middle.
+    gap, gap_std : float
+        rad, the gap between the contact before, on the other side, and this one, and its standard deviation; NaN and
+        inf where there was none.
+    """
+
+    side: float
+    motor: float
+    position: float
+    std: float
+    time: float
+    gap: float = math.nan
+    gap_std: float = math.inf
+
+
+@dataclass(frozen=True)
 class UnknownRatio:
     """The transmission's ratio, where a window does not tell the gap from it and would show the gap with it.
 
@@ -123,6 +153,8 @@ class GapEstimate:
         The machine's own numbers; None: the model was taken as it is.
     ratio : UnknownRatio, optional
         None: the window tells the gap from the ratio, or would not show the gap with a known ratio either.
+    contact : LastContact, optional
+        The window's last contact; None: it has contacts on both sides, or none for certain.
     """
 
     gap: float
@@ -140,6 +172,7 @@ class GapEstimate:
     offset: OffsetReading | CarriedOffset | None = None
     machine: MachineReading | None = None
     ratio: UnknownRatio | None = None
+    contact: LastContact | None = None
 
     def __post_init__(self) -> None:
         # Estimates go into messages and logs, which take plain floats only, not numpy scalars.

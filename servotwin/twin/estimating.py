@@ -147,8 +147,8 @@ def _fits_of_servo(model: Servo, options: object, settings: TwinSettings) -> _Fi
     ) -> GapEstimate:
         assert isinstance(options, whitened.WhitenedSettings)
         growing = replace(options, gap_rate=options.gap_rate or expected.gap_rate(settings.trend))
-        prior, offset = (None, None) if afresh else (expected.prior, expected.offset)
-        return whitened.estimate_carrying(window, model, prior, growing, offset, machine)
+        prior, offset, contact = (None, None, None) if afresh else (expected.prior, expected.offset, expected.contact)
+        return whitened.estimate_carrying(window, model, prior, growing, offset, machine, contact)
 
     return fitted
 

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from servotwin.estimation.estimate import MachineReading
+from servotwin.estimation.estimate import LastContact, MachineReading
 from servotwin.estimation.learning.trend import TrendSettings
 from servotwin.estimation.learning.wear import Expectation, TrendState
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -62,19 +62,20 @@ class StoredExpectation(Struct, frozen=True):
     previous: float
     trend: TrendState | None
     machine: MachineReading | None = None
+    contact: LastContact | None = None
 
     @classmethod
     def of(cls, expected: Expectation) -> StoredExpectation:
         """The numbers of an expectation."""
         trend = None if expected.trend is None else TrendState.of(expected.trend)
         machine = None if expected.machine is None else expected.machine.reading
-        return cls(float(expected.previous), trend, machine)
+        return cls(float(expected.previous), trend, machine, expected.contact)
 
     def expectation(self, settings: TrendSettings) -> Expectation:
         """Make the expectation again, bit for bit."""
         trend = None if self.trend is None else self.trend.trend(settings)
         machine = None if self.machine is None else FactorPrior.of_reading(self.machine)
-        return Expectation(self.previous, trend, machine)
+        return Expectation(self.previous, trend, machine, self.contact)
 
 
 class StoredEstimate(Struct, frozen=True):

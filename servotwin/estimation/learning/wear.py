@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 from msgspec.structs import replace
 
-from servotwin.estimation.estimate import GapEstimate, GapStatus
+from servotwin.estimation.estimate import GapEstimate, GapStatus, LastContact
 from servotwin.estimation.learning.machine import LearningSettings, LearntMachine, updated
 from servotwin.estimation.learning.motor import LearntMotor, MotorLearning
 from servotwin.estimation.learning.trend import Trend, TrendSettings
@@ -37,11 +37,14 @@ class Expectation:
         The wear as predicted for the middle of the window; None before the first accepted estimate.
     machine : FactorPrior or None
         What earlier windows told of the machine's numbers; None: nothing.
+    contact : LastContact or None
+        Last contact of the last window of this boot that showed one only; None: there was none.
     """
 
     previous: float
     trend: Trend | None = None
     machine: FactorPrior | None = None
+    contact: LastContact | None = None
 
     @property
     def prior(self) -> float | GapEstimate:
@@ -136,6 +139,8 @@ class Wear(Struct, frozen=True):
     at_limit, limited : int, float
         Windows in a row that tell nothing of the motor because its commands were at the drive's limit, and the share of
         the last one's commands that were.
+    contact, contact_boot : LastContact or None, str
+        Last contact of the last window that showed one only, and its boot.
     """
 
     previous: float
@@ -147,6 +152,8 @@ class Wear(Struct, frozen=True):
     mismatches: int = 0
     at_limit: int = 0
     limited: float = 0.0
+    contact: LastContact | None = None
+    contact_boot: str = ""
 
     def trend(self, settings: TrendSettings) -> Trend | None:
         """The trend as the last estimate left it."""
@@ -161,7 +168,8 @@ class Wear(Struct, frozen=True):
         """
         trend = self._on_clock(settings, boot, time, now)
         known = self.known_machine(learning, now)
-        return Expectation(self.previous, trend and trend.predict(max(time, trend.time)), known)
+        contact = self.contact if boot == self.contact_boot else None
+        return Expectation(self.previous, trend and trend.predict(max(time, trend.time)), known, contact)
 
     def known_machine(self, learning: LearningSettings, now: float) -> FactorPrior | None:
         """The machine's numbers as learnt, at a time (s, on the twin's clock); None: nothing, or learning is off."""
@@ -204,12 +212,18 @@ class Wear(Struct, frozen=True):
         wear, rejection = self._update_trend(settings, boot, estimate, now)
         if wear.mismatches != (mismatches := self._mismatches(estimate)):
             wear = replace(wear, mismatches=mismatches)
+        if (contact := estimate.contact) is not None and self._is_newer(contact, boot):
+            wear = replace(wear, contact=contact, contact_boot=boot)
         if motor is not None and window is not None:
             wear = self._with_motor(wear, motor, window, now)
         if not learning.learn:
             return wear, rejection
         machine = updated(self.machine, learning, estimate, counts=not rejection, now=now, stated=stated)
         return replace(wear, machine=machine), rejection
+
+    def _is_newer(self, contact: LastContact, boot: str) -> bool:
+        """True for a contact later than the last one, or of another boot."""
+        return self.contact is None or boot != self.contact_boot or contact.time > self.contact.time
 
     def _with_motor(self, wear: Wear, motor: MotorLearning, window: Window, now: float) -> Wear:
         """`wear` with what the window tells of the motor, or that it was at its drive's limit."""
@@ -271,7 +285,8 @@ class Wear(Struct, frozen=True):
         counts = after.refused == 0
         previous = float(estimate.gap) if counts else self.previous
         rejection = "" if counts else "; ".join(after.reasons) or "the window is older than the trend"
-        return Wear(previous, boot, now, TrendState.of(after), self.machine, self.motor), rejection
+        after_state = TrendState.of(after)
+        return replace(self, previous=previous, boot=boot, arrived=now, state=after_state), rejection
 
     def _on_clock(self, settings: TrendSettings, boot: str, time: float, now: float) -> Trend | None:
         """The trend on the clock of `boot`."""

@@ -19,6 +19,7 @@ from servotwin.plant.signals import Array
 
 _ODDS = math.exp(2.0)  # of each explanation beforehand: real machines and sensors err in some way
 _LEAST = 1e-12  # of a column's square
+_PLACE = 1  # row of the derivative by the place
 
 
 def gap_doubt(problem: FreeProblem, at: Array, variance: float, delay: float, ramp: float, learnt: bool) -> float:
@@ -38,19 +39,37 @@ def gap_doubt(problem: FreeProblem, at: Array, variance: float, delay: float, ra
     learnt : bool
         True: the factors are free in any case; otherwise each is an explanation of its own.
     """
-    wide = replace(problem, compliance=COMPLIANCE, delay=delay, cyclic=CYCLIC, ramp=ramp)
-    residual, rows = wide.rows(at, keep=True)
+    residual, rows = _explained(problem, delay, ramp).rows(at, keep=True)
     first = 2 + len(FREEDOM)
     if learnt:
         known, factors = first, []
     else:
         known, factors = 2, [[index] for index in range(2, first)]
         rows[2:first] *= np.array(FREEDOM)[:, None]
-    singles = [1] if delay == 0.0 else [1, 1]
-    sizes = [*singles, 2, 2, *([1] if ramp > 0.0 else [])]
+    return spread_over(residual, rows, known, [*factors, *_groups(first, delay, ramp)], variance)
+
+
+def way_doubt(problem: FreeProblem, at: Array, variance: float, delay: float, ramp: float) -> float:
+    """The same of the motor's way to the only contact of a window, in a gap so wide that it has no other.
+
+    Gap and place act alike there, through this way.
+    """
+    residual, rows = _explained(problem, delay, ramp).rows(at, keep=True)
+    rows[_PLACE] /= 0.5 * at[0]
+    known = 1 + len(FREEDOM)
+    return spread_over(residual, rows[_PLACE:], known, _groups(known, delay, ramp), variance)
+
+
+def _explained(problem: FreeProblem, delay: float, ramp: float) -> FreeProblem:
+    """The problem with all other explanations."""
+    return replace(problem, compliance=COMPLIANCE, delay=delay, cyclic=CYCLIC, ramp=ramp)
+
+
+def _groups(first: int, delay: float, ramp: float) -> list[list[int]]:
+    """Rows of the explanations, which begin at row `first`."""
+    sizes = [*([1] if delay == 0.0 else [1, 1]), 2, 2, *([1] if ramp > 0.0 else [])]
     ends = first + np.cumsum(sizes)
-    groups = [*factors, *(list(range(end - size, end)) for end, size in zip(ends.tolist(), sizes, strict=True))]
-    return spread_over(residual, rows, known, groups, variance)
+    return [list(range(end - size, end)) for end, size in zip(ends.tolist(), sizes, strict=True)]
 
 
 def spread_over(residual: Array, rows: Array, known: int, groups: Sequence[Sequence[int]], variance: float) -> float:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -127,11 +128,7 @@ class WindowFit:
         """Judge the fit and make the estimate."""
         if self.aligned is None:
             return self.blank
-        evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
-        if self.learnt is not None:
-            evidence = _with_free_model(evidence, self.learnt, self.settings)
-        if self.settings.gap_rate > 0.0 and max(evidence.scale, self.servo.position_resolution) > 0.0:
-            evidence = _spread_to(evidence, math.hypot(evidence.std, self._moved_by_growth()))
+        evidence = self.evidence
         status, reasons = judge(evidence, self.settings)
         usable = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
         if self.learnt is not None and self.learnt.beyond and usable:
@@ -158,6 +155,17 @@ class WindowFit:
         if self.learnt is None or not teaches:
             return stated
         return replace(stated, machine=self.learnt.reading(self.settings.calibration))
+
+    @cached_property
+    def evidence(self) -> FitEvidence:
+        """Evidence for and against the fit; there must be one."""
+        assert self.aligned is not None
+        evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
+        if self.learnt is not None:
+            evidence = _with_free_model(evidence, self.learnt, self.settings)
+        if self.settings.gap_rate > 0.0 and max(evidence.scale, self.servo.position_resolution) > 0.0:
+            evidence = _spread_to(evidence, math.hypot(evidence.std, self._moved_by_growth()))
+        return evidence
 
     def _moved_by_growth(self) -> float:
         """Distance (rad) of the gap from that of the same window taken for constant.

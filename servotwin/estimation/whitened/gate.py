@@ -177,6 +177,11 @@ class FitEvidence:
         """Angle (rad) that a single contact may seem wider by, because both channels come in counts."""
         return self.count + self.scale
 
+    @property
+    def caution(self) -> float:
+        """Factor on standard deviations for noise whose spectrum the window itself must show."""
+        return 1.0 + _COLOURED * self.colour
+
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
     """Decide status and reasons.
@@ -226,7 +231,7 @@ def least_lead(evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, s
     """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error."""
     problem = with_free_model(evidence.aligned, servo)
     leads = possible_leads(problem, contacts.single, contacts.variance)
-    sigmas = NORMAL_95 * (1.0 + _COLOURED * evidence.colour)
+    sigmas = NORMAL_95 * evidence.caution
     return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.counts
 
 
@@ -264,7 +269,7 @@ def _spread(evidence: FitEvidence, settings: WhitenedSettings) -> str:
         return "the window contradicts no large gap"
     gap = evidence.aligned.whitened.point.gap
     widest = max(evidence.std, (evidence.interval[1] - gap) / NORMAL_95, (gap - evidence.interval[0]) / NORMAL_95)
-    widest *= 1.0 + _COLOURED * evidence.colour
+    widest *= evidence.caution
     if widest > settings.largest_std:
         return f"the gap is known to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     rounded = math.hypot(widest, _ROUNDED * evidence.count)

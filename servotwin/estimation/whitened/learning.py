@@ -115,7 +115,7 @@ class LearntFit:
 
     def gap_std(self, calibration: float) -> float:
         """Standard deviation of the gap with the factors free, rad."""
-        return math.sqrt(self._scale(calibration) * self.free.covariance[0, 0])
+        return math.sqrt(self.scale(calibration) * self.free.covariance[0, 0])
 
     def doubt(self, ramp: float, calibration: float) -> float:
         """Root mean square (rad) of what machines and sensors that are not as assumed can do to the gap.
@@ -124,12 +124,12 @@ class LearntFit:
         """
         variance = max(1.0, self.aligned.whitened.variance)
         at = np.array([*self.free.point, *self.free.factors])
-        moved = self._softness.moved(self.problem.prior.softness, self._scale(calibration))
+        moved = self._softness.moved(self.problem.prior.softness, self.scale(calibration))
         return math.hypot(gap_doubt(self.problem, at, variance, self.aligned.delay, ramp, learnt=True), moved)
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""
-        scale = self._scale(calibration)
+        scale = self.scale(calibration)
         softness = self._softness.joined(self.problem.prior.softness, scale)
         return _reading(self.free.factors, self.free.learnt(self.problem.prior, scale), softness)
 
@@ -163,15 +163,20 @@ class LearntFit:
         """
         if not self.problem.prior.wide or self.beyond:
             return None
-        one = self.problem.descend(np.array([self.problem.largest, single.place, *self.free.factors]), (False, True))
-        if one.cost > self.free.cost + BELIEVED * max(1.0, self.aligned.whitened.variance):
+        one = self.one_contact(single.place)
+        if one is None:
             return None
         away = one.factors - self.free.factors
-        prior, scale = self.problem.prior, self._scale(calibration)
+        prior, scale = self.problem.prior, self.scale(calibration)
         spread = 0.5 * (self.free.learnt(prior, scale) + one.learnt(prior, scale))
         return _reading(self.free.factors + 0.5 * away, spread + 0.25 * np.outer(away, away), prior.softness)
 
-    def _scale(self, calibration: float) -> float:
+    def one_contact(self, place: float) -> FreeFit | None:
+        """Fit of one contact, from a place in the widest gap on; None where two are believed."""
+        one = self.problem.descend(np.array([self.problem.largest, place, *self.free.factors]), (False, True))
+        return one if one.cost <= self.free.cost + BELIEVED * max(1.0, self.aligned.whitened.variance) else None
+
+    def scale(self, calibration: float) -> float:
         """Factor on covariances for a residual of variance 1."""
         return calibration**2 * max(1.0, self.aligned.whitened.variance)
 

@@ -17,8 +17,9 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import BY_GAP, BY_START, SCREW, Gap, polygon
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
-from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, OffsetReading
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, LastContact, OffsetReading
 from servotwin.estimation.whitened.channels import motor_angle
+from servotwin.estimation.whitened.contact_pair import OneContact, pair
 from servotwin.estimation.whitened.estimator import WhitenedSettings, fit, fit_gap_only
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
@@ -39,8 +40,11 @@ def estimate_carrying(
     settings: WhitenedSettings,
     carried: tuple[float, float] | None,
     machine: FactorPrior | None = None,
+    before: LastContact | None = None,
 ) -> GapEstimate:
-    """Estimate the gap from the window alone, or, where that shows too little, with the offset from earlier windows.
+    """Estimate the gap from the window alone, or, where that shows too little, with what earlier windows showed.
+
+    That is the encoder's offset, or, until it is known, the last contact on the other side.
 
     The estimate holds the offset for the trend. The carried offset is not used where the window shows both sides of the
     gap, so that an encoder that has slipped cannot spoil the estimate.
@@ -57,6 +61,8 @@ def estimate_carrying(
         Mean and standard deviation of the offset, rad.
     machine : FactorPrior, optional
         What is known of the machine's numbers; None: the model is exact.
+    before : LastContact, optional
+        Of the last window that showed one contact.
     """
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
     # Where the machine is known well, a fit of the gap alone tells whether contact suffices.
@@ -64,6 +70,9 @@ def estimate_carrying(
     fitted = (fit_gap_only if gap_only else fit)(window, servo, prior, settings, machine)
     if gap_only and not fitted.one_sided():
         fitted, gap_only = fit(window, servo, prior, settings, machine, fitted), False
+    if settings.offset is None and not known and (single := OneContact.of(fitted)) is not None:
+        made = pair(single, before, prior)
+        return made.estimate or made.added_to(fitted.concluded())
     # A window of one contact cannot show the gap alone, and judging it takes longer than everything else here.
     alone = None if known and fitted.one_sided() else fitted.concluded()
     if alone is not None:
@@ -79,7 +88,11 @@ def estimate_carrying(
         return replace(helped, offset=CarriedOffset(*carried, slope))
     if gap_only:
         fitted = fit(window, servo, prior, settings, machine, fitted)
-    return _refused(alone or fitted.concluded(), helped)
+    paired = None if (single := OneContact.of(fitted)) is None else pair(single, before, prior)
+    if paired is not None and paired.estimate is not None:
+        return paired.estimate
+    refused = _refused(alone or fitted.concluded(), helped)
+    return refused if paired is None else paired.added_to(refused)
 
 
 def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:

@@ -1,0 +1,159 @@
+"""The gap of a loop that never overshoots: two windows of one contact each, on opposite sides."""
+
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from servotwin.estimation import whitened
+from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, LastContact, OffsetReading
+from servotwin.estimation.learning.trend import Trend, TrendSettings
+from servotwin.estimation.learning.wear import Wear
+from servotwin.estimation.whitened import estimate_carrying
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.estimation.window import Window
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SCurve, SquareWave
+from servotwin.simulation import Run, simulate
+
+DEG = math.radians(1.0)
+GAP = 28.0 * DEG
+MODEL = Servo.preset("paper")
+# Half the gain and no integral action: every step ends without overshoot, and pushes the screw one way only.
+OWN = MODEL.controller
+CALM = MODEL.replace(Kp=0.4 * OWN.Kp, Kd=0.4 * OWN.Kd, Ki=0.0)
+KNOWN = FactorPrior.of_spreads(0.001, 0.01, 0.0005, 0.001)
+SETTINGS = whitened.WhitenedSettings()
+STARTS = (9.7, 19.7, 29.7, 39.7)
+"""Of windows about steps back, forth, back and forth, s."""
+REFUSED = {GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND}
+
+
+@cache
+def run(worn: float = 0.0) -> Run:
+    """Steps of 0.5 mm to and fro; `worn`: growth of the gap in 50 s, rad."""
+    gap = SCurve(GAP, GAP + worn, 50.0)
+    return simulate(CALM, 50.0, reference=SquareWave(2.5e-4, 20.0), gap=gap, theta_d0=0.2 * GAP, sample_rate=1e3)
+
+
+def windows(noise: float = 0.0, seed: int = 0, worn: float = 0.0) -> list[Window]:
+    rng = np.random.default_rng(seed)
+    made = [Window.from_run(run(worn), start, 2.0) for start in STARTS]
+    return [each.replace(position=each.position + noise * rng.standard_normal(each.position.size)) for each in made]
+
+
+def estimates(made: list[Window], gap_rate: float = 0.0) -> list[GapEstimate]:
+    """Estimates one after the other, each with the contact of the one before; `gap_rate`: assumed growth, rad/s."""
+    results: list[GapEstimate] = []
+    for window in made:
+        before = results[-1].contact if results else None
+        settings = replace(SETTINGS, gap_rate=gap_rate)
+        results.append(estimate_carrying(window, CALM, None, settings, None, KNOWN, before))
+    return results
+
+
+def holds(estimate: GapEstimate, gap: float) -> bool:
+    return estimate.interval[0] <= gap <= estimate.interval[1]
+
+
+def test_two_windows_show_the_gap_and_a_third_confirms_it():
+    """Without noise and growth, to a hundredth of a degree."""
+    first, second, *later = estimates(windows())
+    for alone in (first, second):
+        assert alone.status in REFUSED
+        assert alone.contact is not None
+    assert math.isnan(first.contact.gap)
+    assert second.contact.gap == pytest.approx(GAP, abs=0.01 * DEG)
+    assert "another window must confirm it" in second.reasons[-1]
+    for made, start in zip(later, STARTS[1:], strict=False):
+        assert made.ok
+        assert made.gap == pytest.approx(GAP, abs=0.01 * DEG)
+        assert made.time == pytest.approx(start + 6.0, abs=1e-3)
+        assert made.offset.offset == pytest.approx(0.0, abs=0.01 * DEG)
+        assert holds(made, GAP)
+    assert [e.contact.side for e in (first, second, *later)] == [-1.0, 1.0, -1.0, 1.0]
+
+
+@pytest.mark.parametrize("noise", [1e-7, 4e-7])
+def test_intervals_hold_in_noise(noise):
+    """Errors of up to 2.5 standard deviations; the offset, the middle of both contacts, is told as well as the gap."""
+    made = [each for seed in range(4) for each in estimates(windows(noise, seed))[2:]]
+    accepted = [each for each in made if each.ok]
+    assert len(accepted) >= 6
+    assert all(holds(each, GAP) for each in accepted)
+    assert max(abs(each.gap - GAP) / each.std for each in accepted) <= 2.5
+    assert max(abs(each.offset.offset) / each.offset.std for each in accepted) <= 2.5
+
+
+def test_the_gap_of_a_worn_screw_is_that_of_the_middle_between_both_windows():
+    worn = 2.0 * DEG
+    for each in estimates(windows(worn=worn), gap_rate=0.2 * DEG)[2:]:
+        true = float(run(worn).gap[round(1e3 * each.time)])
+        assert each.ok
+        assert each.gap == pytest.approx(true, abs=0.05 * DEG)
+        assert holds(each, true)
+        assert abs(each.offset.offset) <= 2.0 * each.offset.std
+
+
+def test_moves_that_no_window_shows_change_nothing():
+    """Two more steps between the windows of a pair: the last mass is back where it was, and so is the screw."""
+    made = estimates([windows()[0], windows()[3]])
+    assert made[-1].contact.gap == pytest.approx(GAP, abs=0.01 * DEG)
+
+
+def test_two_pushes_the_same_way_show_no_gap():
+    first, second, third, _ = windows()
+    made = estimates([first, third, second])
+    assert not any(each.ok for each in made)
+    assert math.isnan(made[1].contact.gap)
+    assert made[2].contact is not None
+
+
+@pytest.mark.parametrize("slip", [-1.0, 1.0])
+def test_an_encoder_that_slips_between_two_windows_confirms_nothing(slip):
+    """The pair that straddles the slip is off by it; neither it nor the next pair, which it contradicts, counts."""
+    first, *later = windows()
+    slipped = [each.replace(theta_m=each.theta_m + slip * DEG) for each in later]
+    made = estimates([first, *slipped])
+    assert made[1].contact.gap == pytest.approx(GAP + slip * DEG, abs=0.01 * DEG)
+    assert not made[2].ok
+    assert "the two before" in made[2].reasons[-1]
+    assert made[3].ok
+    assert holds(made[3], GAP)
+
+
+def test_an_offset_from_earlier_windows_comes_first():
+    """A window of one contact is estimated with the offset where that does, and with the last contact where not."""
+    second, third = windows(1e-7)[1:3]
+    before = estimates(windows(1e-7)[:2])[-1].contact
+    prior = Trend.start(0.0, TrendSettings()).as_estimate()
+    sure, unsure = (
+        estimate_carrying(third, CALM, prior, SETTINGS, (0.0, std * DEG), KNOWN, before) for std in (0.001, 0.045)
+    )
+    assert sure.ok
+    assert isinstance(sure.offset, CarriedOffset)
+    assert unsure.ok
+    assert isinstance(unsure.offset, OffsetReading)
+    assert holds(unsure, GAP)
+    assert second.mid_time < unsure.time < third.mid_time
+
+
+def test_wear_keeps_the_newest_contact_of_a_boot():
+    wear, settings = Wear(0.0), TrendSettings()
+    first, second, *_ = estimates(windows())
+    after, _ = wear.update(settings, "a", second, 0.0)
+    assert after.expect(settings, "a", 30.0, 0.0).contact == second.contact
+    assert after.expect(settings, "b", 30.0, 0.0).contact is None
+    assert after.update(settings, "a", first, 0.0)[0].contact == second.contact
+    assert after.update(settings, "b", first, 0.0)[0].contact == first.contact
+
+
+def test_a_later_contact_is_not_used():
+    first, second, *_ = windows()
+    later = LastContact(1.0, 1.0, 1e-3, 1e-6, 60.0, GAP, 1e-3)
+    alone = estimate_carrying(second, CALM, None, SETTINGS, None, KNOWN, later)
+    assert not alone.ok
+    assert replace(alone.contact, time=0.0) == replace(estimates([second])[0].contact, time=0.0)
+    assert estimates([first])[0].contact.side == -1.0
