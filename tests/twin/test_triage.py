@@ -327,8 +327,8 @@ def test_a_servo_on_which_glances_mislead_gets_none() -> None:
 
 @pytest.mark.slow
 def test_estimates_in_vain_become_rare_until_something_changes() -> None:
-    """A loop that shows one contact only, and was never seen to show both: no offset, no gap."""
-    blind = [one for one in calm_windows() if one.sequence >= 3]
+    """A loop that shows one contact only, always on the same side: no offset, no gap."""
+    blind = [one for one in calm_windows() if one.sequence in (3, 5)]
     many = [
         msgspec.structs.replace(blind[k % len(blind)], sequence=100 + k, start=20.0 * k, parameter_version=1)
         for k in range(24)
@@ -341,6 +341,19 @@ def test_estimates_in_vain_become_rare_until_something_changes() -> None:
     restarted = msgspec.structs.replace(many[-1], sequence=200, start=600.0, parameter_version=2, servo="servo")
     twin.receive(restarted, 600.0)
     assert ("servo", "boot-1", 200) in store.estimates
+
+
+def test_contacts_on_both_sides_by_turns_show_the_gap_and_later_windows_need_a_glance_only() -> None:
+    blind = [one for one in calm_windows() if one.sequence >= 3]
+    many = [
+        msgspec.structs.replace(blind[k % 2], sequence=100 + k, start=20.0 * k, parameter_version=1) for k in range(8)
+    ]
+    _, store = triaged(many)
+    made = list(store.estimates.values())
+    assert [each.ok for each in made[:3]] == [False, False, True]
+    assert made[2].gap == pytest.approx(25.0 * DEG, abs=0.02 * DEG)
+    assert len(made) == 3
+    assert [glance.why for glance in list(store.glances.values())[3:]] == 5 * ["nothing moved"]
 
 
 # --- settings
