@@ -70,6 +70,26 @@ class MachineReading:
 
 
 @dataclass(frozen=True)
+class GapBetween:
+    """The gap as the contacts of two windows show it, one on each side.
+
+    Attributes
+    ----------
+    gap, std : float
+        rad.
+    time : float
+        s, the middle between both contacts.
+    rate : float
+        rad/s, growth since the two contacts before; NaN where there were none.
+    """
+
+    gap: float
+    std: float
+    time: float
+    rate: float = math.nan
+
+
+@dataclass(frozen=True)
 class LastContact:
     """Last contact of a window in which the motor pushed the screw one way only.
 
@@ -84,10 +104,9 @@ class LastContact:
     std : float
         rad, of both together.
     time : float
-        s, the window's middle.
-    gap, gap_std : float
-        rad, the gap between the contact before, on the other side, and this one, and its standard deviation; NaN and
-        inf where there was none.
+        s, when the motor was there.
+    between : GapBetween, optional
+        The gap between the contact before, on the other side, and this one; None: there was none.
     """
 
     side: float
@@ -95,8 +114,7 @@ class LastContact:
     position: float
     std: float
     time: float
-    gap: float = math.nan
-    gap_std: float = math.inf
+    between: GapBetween | None = None
 
 
 @dataclass(frozen=True)

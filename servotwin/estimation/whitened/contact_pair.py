@@ -15,25 +15,38 @@ import numpy as np
 
 from servotwin.estimation.core.contacts import BY_RATE, BY_START, SCREW
 from servotwin.estimation.core.least_squares import least_squares
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, OffsetReading, interval_95
+from servotwin.estimation.estimate import (
+    NORMAL_95,
+    GapBetween,
+    GapEstimate,
+    GapStatus,
+    LastContact,
+    OffsetReading,
+    interval_95,
+)
 from servotwin.estimation.whitened.doubt import way_doubt
 from servotwin.estimation.whitened.estimator import WindowFit
 from servotwin.estimation.whitened.fit import WhitenedFit
-from servotwin.estimation.whitened.free_model import PITCH, FreeFit
+from servotwin.estimation.whitened.free_model import PITCH, FactorPrior, FreeFit
 from servotwin.estimation.whitened.gate import misfits, sure_of_contact, with_free_model
+from servotwin.estimation.whitened.learning import LearntFit, as_known
 from servotwin.estimation.whitened.reduction import CONSTANT, PLACE, RESIDUAL, Point
 from servotwin.estimation.whitened.shift import fastest
+from servotwin.plant.servo import Servo
 
 _AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
+_SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
+_WITHIN = 0.25  # standard deviations per growth within a window, which its one contact hardly tells from the way to it
 _ROUNDED = math.sqrt(1.0 / 12.0)  # of a count, at each contact
 
 
 @dataclass(frozen=True)
 class _Touch:
-    """The motor's angle at which it touches the screw (rad), the last mass at rest then (m), and the latter's standard
-    deviation (m)."""
+    """The motor's angle at which it touches the screw (rad), when it is there (s), the last mass at rest with the screw
+    there (m), and the latter's standard deviation (m)."""
 
     motor: float
+    time: float
     position: float
     std: float
 
@@ -45,6 +58,8 @@ class OneContact:
     Attributes
     ----------
     fitted : WindowFit
+    learnt : LearntFit
+        The same with the machine's numbers free.
     side : float
         As of `LastContact`.
     single : FreeFit
@@ -54,49 +69,53 @@ class OneContact:
     """
 
     fitted: WindowFit
+    learnt: LearntFit
     side: float
     single: FreeFit
     begin: _Touch
     end: _Touch
 
     @classmethod
-    def of(cls, fitted: WindowFit) -> OneContact | None:
-        """Read the contact from a fit; None where the window has none for certain, or two, or the model is exact."""
-        aligned, learnt = fitted.aligned, fitted.learnt
-        if aligned is None or learnt is None or learnt.beyond or not fitted.one_sided():
+    def of(cls, fitted: WindowFit, servo: Servo, machine: FactorPrior | None) -> OneContact | None:
+        """Read the contact from a fit to a servo; None where the window has none for certain, or two.
+
+        None too where the model is taken as exact: without `machine`.
+        """
+        aligned, settings = fitted.aligned, fitted.settings
+        if machine is None or aligned is None or not fitted.one_sided():
             return None
-        motion, evidence, settings = fitted.evidence.travel, fitted.evidence, fitted.settings
-        if max(motion.forwards, motion.backwards) < evidence.needed:
+        motion, facts = fitted.facts.travel, fitted.facts
+        if max(motion.forwards, motion.backwards) < facts.needed:
             return None
-        if misfits(evidence, settings) or not sure_of_contact(evidence, settings):
+        if misfits(facts, settings) or not sure_of_contact(facts, settings):
             return None
+        learnt = fitted.learnt or as_known(aligned, servo, machine)
         side = 1.0 if motion.forwards > motion.backwards else -1.0
         single = learnt.one_contact(_same_way(aligned.whitened.point, aligned.largest, side))
-        return None if single is None else cls(fitted, side, single, *_touches(fitted, single.point, side))
+        if single is None or learnt.beyond:
+            return None
+        return cls(fitted, learnt, side, single, *_touches(fitted, single.point, side))
 
     @property
     def way(self) -> float:
         """Motor's way to the contact, rad."""
-        assert self.fitted.aligned is not None
-        return self.side * (self.begin.motor - self.fitted.aligned.first)
+        return self.side * (self.begin.motor - self.learnt.aligned.first)
 
     @cached_property
     def _beside(self) -> FreeFit:
         """The fit, or, where it begins so close to the contact that free motions hide it, the point a little off."""
-        learnt, settings = self.fitted.learnt, self.fitted.settings
-        assert learnt is not None
+        settings = self.fitted.settings
         if math.isfinite(self.single.covariance[1, 1]) and abs(self.single.point.place) < 1.0:
             return self.single
         gap, place = self.single.point
         place += self.side * 2.0 * settings.largest_std / gap
         start = np.array([gap, place, *self.single.factors])
-        return learnt.problem.descend(start, (False, True), evaluations=1)
+        return self.learnt.problem.descend(start, (False, True), evaluations=1)
 
     @property
     def way_std(self) -> float:
         """Standard deviation of the motor's way to the contact, rad."""
-        assert self.fitted.learnt is not None
-        scale = self.fitted.learnt.scale(self.fitted.settings.calibration)
+        scale = self.learnt.scale(self.fitted.settings.calibration)
         return 0.5 * self.single.point.gap * math.sqrt(scale * self._beside.covariance[1, 1])
 
     @property
@@ -107,33 +126,30 @@ class OneContact:
     @property
     def rounded(self) -> float:
         """Standard deviation (rad) of one contact by the counts of both channels."""
-        evidence, stated = self.fitted.evidence, self.fitted.servo.position_resolution
-        return _ROUNDED * math.hypot(evidence.count, max(evidence.scale, stated / abs(self.gain)))
+        facts, stated = self.fitted.facts, self.fitted.servo.position_resolution
+        return _ROUNDED * math.hypot(facts.count, max(facts.scale, stated / abs(self.gain)))
 
     def last(self) -> LastContact:
         """The contact for later windows."""
         std = math.hypot(self.end.std / self.gain, self.rounded)
-        return LastContact(self.side, self.end.motor, self.end.position, std, self.fitted.window.mid_time)
+        return LastContact(self.side, self.end.motor, self.end.position, std, self.end.time)
 
     def shifted(self) -> float:
         """Change of the motor's way to the contact (rad) with the model free within its usual error, as far as the
         window tells the free model's."""
-        fitted, start = self.fitted, self.single
-        assert fitted.aligned is not None
-        free = with_free_model(fitted.aligned, fitted.servo)
+        start, aligned = self.single, self.learnt.aligned
+        free = with_free_model(aligned, self.learnt.servo)
         other = free.descend(np.array([*start.point, *np.zeros(start.factors.size)]), (False, True))
         moved = 0.5 * start.point.gap * abs(other.point.place - start.point.place)
-        variance = max(1.0, fitted.aligned.whitened.variance)
+        variance = max(1.0, aligned.whitened.variance)
         return max(0.0, moved - NORMAL_95 * 0.5 * start.point.gap * math.sqrt(variance * other.covariance[1, 1]))
 
     def doubt(self) -> float:
         """Root mean square (rad) of what machines and sensors that are not as assumed can do to the way."""
-        learnt, aligned = self.fitted.learnt, self.fitted.aligned
-        assert learnt is not None
-        assert aligned is not None
+        aligned = self.learnt.aligned
         at = np.array([*self._beside.point, *self._beside.factors])
         ramp = fastest(aligned.whitened.reduction, self.fitted.second)
-        return way_doubt(learnt.problem, at, max(1.0, aligned.whitened.variance), aligned.delay, ramp)
+        return way_doubt(self.learnt.problem, at, max(1.0, aligned.whitened.variance), aligned.delay, ramp)
 
 
 @dataclass(frozen=True)
@@ -148,86 +164,112 @@ class Pair:
         None: the windows do not show the gap, or another one must confirm it.
     reason : str
         Why there is none; empty where there is no contact on the other side yet.
+    between : GapBetween or None
+        None: there is no contact on the other side yet.
+    bend : float
+        rad/s, by which the growth has changed.
     """
 
     contact: LastContact
     estimate: GapEstimate | None = None
     reason: str = ""
+    between: GapBetween | None = None
+    bend: float = 0.0
+
+    def agrees(self, other: GapEstimate, gap_rate: float) -> bool:
+        """True where the contacts do not contradict another estimate of the same window.
+
+        `gap_rate`: assumed growth (rad/s), which counts where two contacts before have not shown it.
+        """
+        seen = self.between
+        if seen is None:
+            return True
+        elapsed, spread = other.time - seen.time, _AGREE * math.hypot(other.std_total, seen.std)
+        if math.isnan(seen.rate):
+            return abs(other.gap - seen.gap) <= spread + NORMAL_95 * gap_rate * elapsed
+        return abs(other.gap - seen.gap - seen.rate * elapsed) <= spread + self.bend * elapsed
 
     def added_to(self, alone: GapEstimate) -> GapEstimate:
-        """The estimate of the later window alone, with the contact and the reason."""
-        return replace(alone, contact=self.contact, reasons=(*alone.reasons, *filter(None, (self.reason,))))
+        """Another estimate of the later window, with the contact and, where it is not OK, the reason."""
+        reasons = () if alone.ok else filter(None, (self.reason,))
+        return replace(alone, contact=self.contact, reasons=(*alone.reasons, *reasons))
 
 
-def pair(here: OneContact, before: LastContact | None, prior: float | GapEstimate | None) -> Pair:
+def pair(here: OneContact, before: LastContact | None) -> Pair:
     """Estimate the gap from a window of one contact and the last contact of an earlier one on the other side.
 
-    The estimate belongs to the middle between both windows, because half of the gap is that of each. Without a `prior`
-    estimate from earlier windows a third window must confirm it: the encoder may have slipped in between.
+    The estimate belongs to the middle between both windows, because half of the gap is that of each. The contacts of a
+    third window must confirm it: the encoder may have slipped in between.
     """
     contact = here.last()
-    if before is None or not before.time < contact.time:
+    if before is None or not before.time < here.begin.time:
         return Pair(contact)
     if before.side == here.side:
-        return Pair(replace(contact, gap=before.gap, gap_std=before.gap_std))
+        return Pair(replace(contact, between=before.between))
     moved = (here.begin.position - before.position) / here.gain
-    gap = before.side * (before.motor + moved - here.begin.motor)
-    std = _spread(here, before, moved)
-    contact = replace(contact, gap=gap, gap_std=std)
-    possible = NORMAL_95 * here.fitted.settings.gap_rate * (contact.time - before.time)
-    if reason := _against(here, gap, std, possible):
-        return Pair(contact, reason=reason)
-    growth = gap - before.gap, math.hypot(std, before.gap_std)
-    if isinstance(prior, GapEstimate):
-        growth = 0.0, possible / NORMAL_95
-    elif not -_AGREE * growth[1] <= growth[0] <= possible + _AGREE * growth[1]:
-        return Pair(contact, reason=_unconfirmed(gap, before.gap))
-    return Pair(contact, replace(_stated(here, before, gap, std, growth), contact=contact))
+    gap, std = before.side * (before.motor + moved - here.begin.motor), _spread(here, before, moved)
+    between = _followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
+    contact, earlier = replace(contact, between=between), before.between
+    bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(between.rate - earlier.rate)
+    possible = NORMAL_95 * here.fitted.settings.gap_rate * (here.begin.time - before.time)
+    if reason := _against(here, between, possible) or _unconfirmed(between, earlier, possible):
+        return Pair(contact, None, reason, between, bend)
+    assert earlier is not None
+    return Pair(contact, replace(_stated(here, before, between, earlier), contact=contact), "", between, bend)
+
+
+def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
+    """The gap with its growth since an earlier one."""
+    if earlier is None or not now.time > earlier.time:
+        return now
+    return replace(now, rate=(now.gap - earlier.gap) / (now.time - earlier.time))
 
 
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
-    learnt = here.fitted.learnt
-    assert learnt is not None
-    pitch = math.sqrt(learnt.problem.prior.covariance[PITCH, PITCH])
+    pitch = math.sqrt(here.learnt.problem.prior.covariance[PITCH, PITCH])
     level = here.begin.std / here.gain
     return math.hypot(here.way_std + level, before.std, here.rounded, pitch * moved)
 
 
-def _against(here: OneContact, gap: float, std: float, possible: float) -> str:
-    """Reason against the gap (rad) between two contacts, for a `possible` growth between them (rad); empty: none."""
+def _against(here: OneContact, between: GapBetween, possible: float) -> str:
+    """Reason against the gap between two contacts, for a `possible` growth between them (rad); empty: none."""
     settings = here.fitted.settings
-    widest = std * here.fitted.evidence.caution
+    gap, least, widest = between.gap, -_AGREE * between.std, between.std * here.fitted.facts.caution
     if not widest <= settings.largest_std:
         return f"two contacts show the gap to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     # Half of the growth is on the side of the contact before, and the motor follows it.
-    if not here.way <= gap + _AGREE * std + 0.5 * possible:
+    if not gap >= max(here.way - 0.5 * possible, 0.0) + least:
         return f"the motor leads the screw by {_deg(here.way)}, more than the {_deg(gap)} between two contacts"
     if (shifted := here.shifted()) > settings.largest_shift:
         return f"with the model free the contact would move by {_deg(shifted)} more than its spread"
     return ""
 
 
-def _unconfirmed(gap: float, before: float) -> str:
-    if math.isnan(before):
-        return f"two contacts show a gap of {_deg(gap)}: another window must confirm it"
-    return f"two contacts show a gap of {_deg(gap)}, the two before {_deg(before)}"
+def _unconfirmed(now: GapBetween, earlier: GapBetween | None, possible: float) -> str:
+    """Reason for which the two contacts before do not confirm a gap; empty: they do."""
+    if earlier is None:
+        return f"two contacts show a gap of {_deg(now.gap)}: another window must confirm it"
+    spread = _AGREE * math.hypot(now.std, earlier.std)
+    if -spread <= now.gap - earlier.gap <= possible + spread:
+        return ""
+    return f"two contacts show a gap of {_deg(now.gap)}, the two before {_deg(earlier.gap)}"
 
 
-def _stated(here: OneContact, before: LastContact, gap: float, std: float, growth: tuple[float, float]) -> GapEstimate:
-    """Make the estimate of a gap (rad) with its standard deviation (rad).
-
-    `growth`: of the gap between both contacts with its standard deviation, rad. What looks like growth may be a sensor
-    that drifts to and fro, and is part of the spread.
-    """
-    fitted, (grown, spread) = here.fitted, growth
-    learnt, settings = fitted.learnt, fitted.settings
-    assert learnt is not None
-    std = math.hypot(std, 0.5 * grown)
+def _stated(here: OneContact, before: LastContact, now: GapBetween, earlier: GapBetween) -> GapEstimate:
+    """Make the estimate of the gap between two contacts."""
+    fitted, settings = here.fitted, here.fitted.settings
+    elapsed = now.time - earlier.time
+    steady = 0.0 if math.isnan(earlier.rate) else max(0.0, earlier.rate) * elapsed
+    # An encoder that slips, or a position that drifts to and fro, looks like growth once.
+    within = _WITHIN * settings.gap_rate * fitted.window.duration
+    std = math.hypot(now.std, _SUDDEN * abs(now.gap - earlier.gap - steady), within)
     total = math.hypot(std, settings.model_error, here.doubt())
     # The middle of both contacts, as if they were of one moment.
     levels = (before.position + here.begin.position) / here.gain - before.motor - here.begin.motor
-    offset = OffsetReading(0.5 * levels + 0.25 * here.side * grown, math.hypot(0.5 * total, 0.25 * spread))
+    grown = now.rate * (here.begin.time - before.time)
+    offset_std = math.hypot(0.5 * total, 0.25 * math.hypot(now.std, earlier.std))
+    gap = max(0.0, now.gap)
     return replace(
         fitted.blank,
         gap=gap,
@@ -235,12 +277,12 @@ def _stated(here: OneContact, before: LastContact, gap: float, std: float, growt
         std_total=total,
         interval=interval_95(gap, total),
         status=GapStatus.OK,
-        time=0.5 * (before.time + fitted.window.mid_time),
+        time=now.time,
         theta_d0=here.begin.motor - 0.5 * here.side * gap,
         rms=fitted.rms(),
         evaluations=_fit_of(fitted).evaluations,
-        offset=offset,
-        machine=learnt.reading_of_either(here.single.point, settings.calibration),
+        offset=OffsetReading(0.5 * levels + 0.25 * here.side * grown, offset_std),
+        machine=here.learnt.reading_of_either(here.single.point, settings.calibration),
     )
 
 
@@ -256,28 +298,39 @@ def _fit_of(fitted: WindowFit) -> WhitenedFit:
 
 def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _Touch]:
     """Contacts on a side with the screw where the window begins and where it ends, for the point of one contact."""
-    aligned, result = fitted.aligned, _fit_of(fitted)
+    aligned, result, window = fitted.aligned, _fit_of(fitted), fitted.window
     assert aligned is not None
     reduction, gain = result.reduction, result.reduction.response.static_gain
     excess = 0.0 if reduction.growth is None else float(result.shares[len(reduction.fixed())])
     # With the fit's own gap the motor may reach the other side so late that the last mass cannot have answered.
     traced = reduction.traced(single)
     screw = traced[SCREW] + excess * traced[BY_RATE]
-    touched = int(np.argmax(traced[BY_START] == 0.0)) - 0.5 * (screw.size - 1)
-    half = 0.5 * (single.gap + (reduction.rate + excess) * touched)
+    touched, furthest = int(np.argmax(traced[BY_START] == 0.0)), int(np.argmax(side * reduction.theta_m))
+    half = 0.5 * (single.gap + (reduction.rate + excess) * (touched - 0.5 * (screw.size - 1)))
     # Both channels are counted from their first samples.
-    level = float(fitted.window.position[max(aligned.shift, 0)] + result.shares[0])
+    level = float(window.position[max(aligned.shift, 0)] + result.shares[0])
     begins = level + gain * 0.5 * result.point.gap * result.point.place
-    ends = begins + gain * float(screw[-1] - screw[0])
-    furthest = side * float(np.max(side * reduction.theta_m))
+    begin, end = _level_stds(fitted, result)
+    first = window.start + max(-aligned.shift, 0) / window.sample_rate
+
+    def touch(angle: float, sample: int, position: float, std: float) -> _Touch:
+        return _Touch(aligned.first + float(angle), first + sample / window.sample_rate, position, std)
+
+    return (
+        touch(screw[0] + side * half, touched, begins, begin),
+        touch(reduction.theta_m[furthest], furthest, begins + gain * float(screw[-1] - screw[0]), end),
+    )
+
+
+def _level_stds(fitted: WindowFit, result: WhitenedFit) -> tuple[float, float]:
+    """Standard deviations (m) of the last mass's place at rest, with the screw where it was at first and at last."""
     solved = least_squares(result.rows[PLACE:], result.rows[RESIDUAL])
     scale = fitted.settings.calibration * math.sqrt(max(1.0, result.variance))
     weights = np.zeros(len(result.rows) - PLACE)
     weights[CONSTANT - PLACE] = 1.0
-    end_std = scale * solved.deviation(weights)
-    weights[0] = 0.5 * gain * result.point.gap
-    begin = _Touch(aligned.first + float(screw[0]) + side * half, begins, scale * solved.deviation(weights))
-    return begin, _Touch(aligned.first + furthest, ends, end_std)
+    last = scale * solved.deviation(weights)
+    weights[0] = 0.5 * result.reduction.response.static_gain * result.point.gap
+    return scale * solved.deviation(weights), last
 
 
 def _deg(angle: float) -> str:

@@ -22,6 +22,7 @@ from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and
 from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior, adapted
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
+    FitFacts,
     contacts_seen,
     judge,
     least_lead,
@@ -157,10 +158,16 @@ class WindowFit:
         return replace(stated, machine=self.learnt.reading(self.settings.calibration))
 
     @cached_property
+    def facts(self) -> FitFacts:
+        """Contact, counts and noise in the fit; there must be one."""
+        assert self.aligned is not None
+        return _facts(self.aligned, self.window, self.servo, self.settings, self.second)
+
+    @cached_property
     def evidence(self) -> FitEvidence:
         """Evidence for and against the fit; there must be one."""
         assert self.aligned is not None
-        evidence = _evidence(self.aligned, self.window, self.angle, self.servo, self.settings, self.second)
+        evidence = _evidence(self.facts, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
             evidence = _with_free_model(evidence, self.learnt, self.settings)
         if self.settings.gap_rate > 0.0 and max(evidence.scale, self.servo.position_resolution) > 0.0:
@@ -278,27 +285,34 @@ def _start(prior: float | GapEstimate | None) -> float:
     return 0.0 if value is None or not math.isfinite(value) else value
 
 
-def _evidence(
-    aligned: AlignedFit, window: Window, angle: Array, servo: Servo, settings: WhitenedSettings, second: float
-) -> FitEvidence:
+def _facts(aligned: AlignedFit, window: Window, servo: Servo, settings: WhitenedSettings, second: float) -> FitFacts:
     result = aligned.whitened
+    return FitFacts(
+        aligned=aligned,
+        travel=_travel(result),
+        unexplained=slow_share(result, second),
+        needed=travel_needed(result.point.gap, servo, settings),
+        smallest=least_bound(servo.encoder_resolution),
+        count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),
+        scale=counted(window.position) / abs(result.reduction.response.static_gain),
+        colour=max(0.0, 1.0 - result.noise.unpredicted / result.reduction.decimation.whiteness),
+    )
+
+
+def _evidence(
+    facts: FitFacts, window: Window, angle: Array, servo: Servo, settings: WhitenedSettings, second: float
+) -> FitEvidence:
+    aligned, result = facts.aligned, facts.aligned.whitened
     std = settings.calibration * result.std * math.sqrt(max(1.0, result.variance))
     gain, gap = result.reduction.response.static_gain, result.point.gap
     identifiable = math.isfinite(result.std)
     return FitEvidence(
-        aligned=aligned,
+        **vars(facts),
         std=std,
         interval=profile_interval(result, std, settings.calibration, aligned.largest, 1e-3 * aligned.tolerance**0.5),
-        travel=_travel(result),
         shift=model_shift(result, servo, settings.order, second) if identifiable else _NO_SHIFT,
         observer=observer_shift(result, servo, second) if identifiable else (0.0, math.inf),
         lost_motion=static_lost_motion(angle, window.position, window.sample_rate * second, gain, gap),
-        unexplained=slow_share(result, second),
-        needed=travel_needed(gap, servo, settings),
-        smallest=least_bound(servo.encoder_resolution),
-        count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),
-        scale=counted(window.position) / abs(gain),
-        colour=max(0.0, 1.0 - result.noise.unpredicted / result.reduction.decimation.whiteness),
     )
 
 

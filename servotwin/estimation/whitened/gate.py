@@ -118,25 +118,15 @@ _COLOURED = 5.4 / 3.3 - 1.0
 _ROUNDED = 0.4  # of a count: sqrt(2/12), as the encoder's error is not random at the two reversals that show a gap
 
 
-@dataclass(frozen=True, eq=False)
-class FitEvidence:
-    """Evidence for and against a fit.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitFacts:
+    """Contact, counts and noise in a fit: what costs little to compute.
 
     Attributes
     ----------
     aligned : AlignedFit
-    std : float
-        rad, calibrated.
-    interval : (float, float)
-        rad, profile likelihood.
     travel : Travel
         Of the fitted screw.
-    shift : ModelShift
-        By a free model.
-    observer : (float, float)
-        rad: by the observer form, and the standard deviation of that.
-    lost_motion : float
-        rad, range of the lead at rest.
     unexplained : float
         Slow part of the residual over that of the position.
     needed : float
@@ -147,29 +137,17 @@ class FitEvidence:
         rad, of the encoder, as stated or as it shows in the angle; 0: none.
     scale : float
         rad, of the position's counts as they show, seen through the pitch; 0: none.
-    doubt : float
-        rad, root mean square of what machines and sensors that are not as assumed can do to the gap; computed for
-        gaps that are accepted.
-    learnt : bool
-        True: the model's numbers are free in `std` already.
     colour : float
         Share of the noise's variance that is predicted beyond that of decimated white noise; 0: white.
     """
 
     aligned: AlignedFit
-    std: float
-    interval: Interval
     travel: Travel
-    shift: ModelShift
-    observer: tuple[float, float]
-    lost_motion: float
     unexplained: float
     needed: float
     smallest: float
     count: float = 0.0
     scale: float = 0.0
-    doubt: float = 0.0
-    learnt: bool = False
     colour: float = 0.0
 
     @property
@@ -181,6 +159,38 @@ class FitEvidence:
     def caution(self) -> float:
         """Factor on standard deviations for noise whose spectrum the window itself must show."""
         return 1.0 + _COLOURED * self.colour
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FitEvidence(FitFacts):
+    """Evidence for and against a fit.
+
+    Attributes
+    ----------
+    std : float
+        rad, calibrated.
+    interval : (float, float)
+        rad, profile likelihood.
+    shift : ModelShift
+        By a free model.
+    observer : (float, float)
+        rad: by the observer form, and the standard deviation of that.
+    lost_motion : float
+        rad, range of the lead at rest.
+    doubt : float
+        rad, root mean square of what machines and sensors that are not as assumed can do to the gap; computed for
+        gaps that are accepted.
+    learnt : bool
+        True: the model's numbers are free in `std` already.
+    """
+
+    std: float
+    interval: Interval
+    shift: ModelShift
+    observer: tuple[float, float]
+    lost_motion: float
+    doubt: float = 0.0
+    learnt: bool = False
 
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
@@ -201,18 +211,18 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
     return (GapStatus.MODEL_MISMATCH, mismatches) if mismatches else (GapStatus.OK, ())
 
 
-def sure_of_contact(evidence: FitEvidence, settings: WhitenedSettings) -> bool:
+def sure_of_contact(facts: FitFacts, settings: WhitenedSettings) -> bool:
     """False where a delay that cannot be takes the place of the motor's way to the contact."""
-    aligned, rows = evidence.aligned, evidence.aligned.whitened.rows
+    aligned, rows = facts.aligned, facts.aligned.whitened.rows
     if not settings.skew or abs(aligned.delay) <= settings.skew_limit:
         return True
     std = spread(rows[-1], rows[GAP:-1]) * math.sqrt(max(1.0, aligned.whitened.variance))
     return abs(aligned.delay) <= settings.skew_limit + NORMAL_95 * std
 
 
-def misfits(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[str, ...]:
+def misfits(facts: FitFacts, settings: WhitenedSettings) -> tuple[str, ...]:
     """List what the fit leaves of the window that neither noise nor the model explains."""
-    own = (_unexplained(evidence), _delayed(evidence, settings), _growing(evidence.aligned.whitened))
+    own = (_unexplained(facts), _delayed(facts, settings), _growing(facts.aligned.whitened))
     return tuple(filter(None, own))
 
 
@@ -281,14 +291,14 @@ def _spread(evidence: FitEvidence, settings: WhitenedSettings) -> str:
     return ""
 
 
-def _unexplained(evidence: FitEvidence) -> str:
-    if evidence.unexplained <= _UNEXPLAINED:
+def _unexplained(facts: FitFacts) -> str:
+    if facts.unexplained <= _UNEXPLAINED:
         return ""
-    return f"the model leaves {100.0 * evidence.unexplained:.0f} % of the position's slow motion unexplained"
+    return f"the model leaves {100.0 * facts.unexplained:.0f} % of the position's slow motion unexplained"
 
 
-def _delayed(evidence: FitEvidence, settings: WhitenedSettings) -> str:
-    delay = evidence.aligned.delay
+def _delayed(facts: FitFacts, settings: WhitenedSettings) -> str:
+    delay = facts.aligned.delay
     if abs(delay) <= settings.skew_limit:
         return ""
     allowed = 1e3 * settings.skew_limit

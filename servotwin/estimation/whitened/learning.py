@@ -185,6 +185,14 @@ def _reading(factors: Array, covariance: Array, softness: tuple[float, float]) -
     return MachineReading(tuple(factors.tolist()), tuple(covariance.ravel().tolist()), softness)
 
 
+def as_known(aligned: AlignedFit, servo: Servo, machine: FactorPrior) -> LearntFit:
+    """Take a fit with the factors that are known on a servo for one in which they were free."""
+    whitened = aligned.whitened
+    problem = FreeProblem(whitened.reduction, whitened.noise, servo, machine, aligned.largest)
+    here = problem.descend(np.array([*whitened.point, *machine.mean]), (True, True), evaluations=1)
+    return LearntFit(adapted(servo, machine.mean), aligned, here, problem)
+
+
 def learn_and_fit(
     theta_m: Array,
     position: Array,

@@ -19,8 +19,8 @@ from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapEstimate, GapStatus, LastContact, OffsetReading
 from servotwin.estimation.whitened.channels import motor_angle
-from servotwin.estimation.whitened.contact_pair import OneContact, pair
-from servotwin.estimation.whitened.estimator import WhitenedSettings, fit, fit_gap_only
+from servotwin.estimation.whitened.contact_pair import OneContact, Pair, pair
+from servotwin.estimation.whitened.estimator import WhitenedSettings, WindowFit, fit, fit_gap_only
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.scales import scales
@@ -44,7 +44,7 @@ def estimate_carrying(
 ) -> GapEstimate:
     """Estimate the gap from the window alone, or, where that shows too little, with what earlier windows showed.
 
-    That is the encoder's offset, or, until it is known, the last contact on the other side.
+    That is the encoder's offset, or the last contact on the other side, which must not contradict it.
 
     The estimate holds the offset for the trend. The carried offset is not used where the window shows both sides of the
     gap, so that an encoder that has slipped cannot spoil the estimate.
@@ -66,38 +66,61 @@ def estimate_carrying(
     """
     known = settings.offset is None and carried is not None and 0.0 < carried[1] < settings.largest_std
     # Where the machine is known well, a fit of the gap alone tells whether contact suffices.
-    gap_only = known and not (machine is not None and machine.wide)
+    gap_only = (known or before is not None) and not (machine is not None and machine.wide)
     fitted = (fit_gap_only if gap_only else fit)(window, servo, prior, settings, machine)
-    if gap_only and not fitted.one_sided():
+    paired = _pair(fitted, servo, machine, before)
+    if gap_only and not (fitted.one_sided() and (known or paired is not None)):
         fitted, gap_only = fit(window, servo, prior, settings, machine, fitted), False
-    if settings.offset is None and not known and (single := OneContact.of(fitted)) is not None:
-        made = pair(single, before, prior)
-        return made.estimate or made.added_to(fitted.concluded())
+        paired = _pair(fitted, servo, machine, before)
+    by_contacts = None if paired is None else paired.estimate
+    if by_contacts is not None and not known:
+        return by_contacts
+    made = _alone_or_aided(fitted, servo, machine, carried if known else None, paired, gap_only)
+    if by_contacts is not None and not made.ok:
+        return by_contacts
+    return made if paired is None else paired.added_to(made)
+
+
+def _pair(fitted: WindowFit, servo: Servo, machine: FactorPrior | None, before: LastContact | None) -> Pair | None:
+    """Look at the last contact of a fit, and at the one before; None: it has none for certain."""
+    one = None if fitted.settings.offset is not None else OneContact.of(fitted, servo, machine)
+    return None if one is None else pair(one, before)
+
+
+def _alone_or_aided(
+    fitted: WindowFit,
+    servo: Servo,
+    machine: FactorPrior | None,
+    carried: tuple[float, float] | None,
+    paired: Pair | None,
+    gap_only: bool,
+) -> GapEstimate:
+    """Estimate the gap from the window alone, or with a carried offset that does not contradict the last contact."""
+    window, prior, settings = fitted.window, fitted.prior, fitted.settings
+    if gap_only and carried is None:
+        fitted, gap_only = fit(window, servo, prior, settings, machine, fitted), False
     # A window of one contact cannot show the gap alone, and judging it takes longer than everything else here.
-    alone = None if known and fitted.one_sided() else fitted.concluded()
+    alone = None if carried is not None and fitted.one_sided() else fitted.concluded()
     if alone is not None:
         if settings.offset is None and alone.ok:
             return replace(alone, offset=read_offset(window, fitted.servo, alone, settings))
-        if not known or alone.status is GapStatus.MODEL_MISMATCH:
+        if carried is None or alone.status is GapStatus.MODEL_MISMATCH:
             return alone
     assert carried is not None
     aided = fit(window, servo, prior, replace(settings, offset=carried), machine)
     helped = aided.concluded()
-    if helped.ok and not helped.rms > _WORSE * fitted.rms():
+    agrees = paired is None or paired.agrees(helped, settings.gap_rate)
+    if helped.ok and agrees and not helped.rms > _WORSE * fitted.rms():
         slope = _slope(_columns(window, aided.servo, helped, settings))
         return replace(helped, offset=CarriedOffset(*carried, slope))
     if gap_only:
         fitted = fit(window, servo, prior, settings, machine, fitted)
-    paired = None if (single := OneContact.of(fitted)) is None else pair(single, before, prior)
-    if paired is not None and paired.estimate is not None:
-        return paired.estimate
-    refused = _refused(alone or fitted.concluded(), helped)
-    return refused if paired is None else paired.added_to(refused)
+    return _refused(alone or fitted.concluded(), helped)
 
 
 def _refused(alone: GapEstimate, helped: GapEstimate) -> GapEstimate:
     """Return the estimate of the window alone, with the reason for not using the other."""
-    if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH:
+    if not helped.ok or alone.status is GapStatus.MODEL_MISMATCH or helped.rms <= _WORSE * alone.rms:
         return alone
     worse = f"with the encoder's offset from earlier windows {helped.rms / alone.rms:.3g} times the residual is left"
     return replace(alone, reasons=(*alone.reasons, worse))
