@@ -14,6 +14,7 @@ from msgspec import structs
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import filtered_pid
 from servotwin.cosim.scenario import Scenario
+from servotwin.edge.guard import Limits
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.wear import Expectation
@@ -26,6 +27,7 @@ from servotwin.twin.twin import Twin
 HONEST = 2  # windows that are answered before a twin falls silent
 FACTOR = 3.0  # of a lie, either way
 SPREAD = math.radians(0.05)  # of an estimate, as it states
+BEYOND = 0.01  # of a range's larger end
 UNBOUNDED = Band(1.0, 1.0, 10.0, 1e6)
 
 
@@ -65,6 +67,8 @@ class HostileTwin:
     kind : TwinFault
     twin : Twin
         The twin without the fault.
+    limits : Limits
+        The edge's, of updates.
     own : Gains
         The servo's own.
     draw : random.Random
@@ -72,6 +76,7 @@ class HostileTwin:
 
     kind: TwinFault
     twin: Twin
+    limits: Limits
     own: Gains
     draw: random.Random
     version: int = 0
@@ -83,7 +88,7 @@ class HostileTwin:
     def of(cls, kind: TwinFault, scenario: Scenario, gap: float, draw: random.Random) -> HostileTwin:
         """For a scenario whose machine has this gap (rad)."""
         twin = deceived_twin(scenario, gap * _LIES.get(kind, 1.0))
-        return cls(kind, twin, gains(scenario), draw)
+        return cls(kind, twin, scenario.agent_settings().limits, gains(scenario), draw)
 
     def receive(self, message: Message, now: float) -> list[Message]:
         """Answer a message according to the fault."""
@@ -118,18 +123,20 @@ class HostileTwin:
         self.version = max(self.version, self.in_force) + 1
         return self.version
 
+    def _anywhere(self, lowest: float, highest: float) -> float:
+        beyond = BEYOND * max(abs(lowest), abs(highest))
+        return self.draw.uniform(lowest - beyond, highest + beyond)
+
     def _wanton(self, window: WindowMessage) -> list[Message]:
         """Draw each value anywhere in its range and a little beyond; state no gap to check it against."""
-        draw, own = self.draw, self.own
-        kp, kd, tf = (
-            own.Kp * draw.uniform(0.66, 1.04),
-            own.Kd * draw.uniform(0.66, 1.04),
-            own.Tf * draw.uniform(0.8, 1.2),
-        )
-        ki, feedforward, leave = own.Ki * draw.uniform(0.0, 0.052), draw.uniform(-0.104, 0.104), draw.uniform(0.0, 1.55)
+        draw, own, limits = self.draw, self.own, self.limits
+        kp, kd, tf = (self._anywhere(*limits.range_of(name, own)) for name in Gains.scaled)
+        ki = self._anywhere(0.0, own.Ki * limits.integral_factor)
+        feedforward = self._anywhere(-limits.feedforward, limits.feedforward)
+        leave = abs(self._anywhere(0.0, own.leave * limits.gain_factor if limits.leave is None else limits.leave))
         setting = Gains(kp, ki, kd, tf, draw.uniform(0.0, leave), leave, feedforward)
         version, identity = self._next(), (window.boot, window.sequence)
-        end, tolerance = window.start + 60.0, draw.choice([0.0, draw.uniform(0.0, 8.5e-5)])
+        end, tolerance = window.start + 60.0, draw.choice([0.0, abs(self._anywhere(0.0, limits.maximum))])
         update = Update(
             servo=window.servo,
             version=version,

@@ -331,7 +331,8 @@ def _receipt(receipt: JsonObject) -> str:
     if receipt["status"] == Reason.FELL_BACK:
         in_force = body.get("parameter_version")
         return f"version {receipt['version']} not applied: {receipt['status']}, as version {in_force}"
-    return f"version {receipt['version']} REFUSED by the edge: {receipt['status']}"
+    reason = ": ".join(filter(None, (receipt["status"], body.get("detail"))))
+    return f"version {receipt['version']} REFUSED by the edge: {reason}"
 
 
 def _effect(effect: JsonObject, units: Units) -> str:

@@ -76,7 +76,7 @@ _START = TableSpec(
 )
 _OWN = TableSpec(
     (*_LAWS, gains_stay_table),
-    "Gains in the middle of the box that updates must stay in; the controller's where absent.",
+    "The servo's own gains, from which the limits of updates count; the controller's where absent.",
     only=("gains_stay", *_GAINS),
     partial=True,
 )

@@ -24,6 +24,7 @@ from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.messages import Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.runtime.retry import Retry
@@ -102,7 +103,7 @@ class Commissioning:
     Parameters
     ----------
     servo : Servo or Axis
-        Its own controller's gains are the middle of the box for updates.
+        The limits of updates count from its own controller's gains.
     law : Controller, Cascade or LinearLaw
         The controller that runs.
     twin : TwinSettings
@@ -235,7 +236,7 @@ class Commissioning:
                 agent,
                 limits=guarded.limits if open_limits else self.recording.limits,
                 controller=self.law,
-                own=guarded.middle if open_limits else own,
+                own=own,
                 supervision=guarded.supervision,
             )
         if self.supervision is not None:
@@ -259,6 +260,7 @@ class Commissioning:
             longest_window_s=r.longest_window,
             longest_pre_trigger_s=r.longest_pre_trigger,
             probe=r.probe,
+            units=own_units(self.servo),
         )
 
     def _novelty(self) -> NoveltySettings | None:

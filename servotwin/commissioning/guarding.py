@@ -8,26 +8,28 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import msgspec
+import numpy as np
 
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
-from servotwin.control.retuning import friction_feedforward, strength
+from servotwin.control.retuning import friction_feedforward
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
 from servotwin.edge.watch import WatchSettings
 from servotwin.estimation.disturbance import holds_position
-from servotwin.messages import AnyGains, CascadeGains, Gains, LinearGains, Setting
+from servotwin.estimation.whitened.free_model import FactorPrior
+from servotwin.messages import Gains, LinearGains, Setting
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.redesign.certified.candidates import candidates_of
 from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.learnt_servo import learnt_servo, narrowed
 from servotwin.redesign.certified.margins import integral_shares
 from servotwin.redesign.certified.policy import CertifiedPolicy, band_of
 from servotwin.redesign.certified.uncertainty import PARAMETERS, LearntFactors, Uncertainty
@@ -39,19 +41,18 @@ from servotwin.twin.settings import TwinSettings
 PATIENCE = 1.0
 """Longest time that a change of the dead zone waits for an instant at which it neither opens nor closes the loop."""
 _ERROR_FLOORS = 10.0  # to a smallest step
-# Widens a box so that rounding does not exclude its own corner.
-_ROUNDING = 1.0 + 1e-9
+# Share of the stated half-widths that is open of a machine found at their end; with more it would not be found there.
+_OPEN = 0.5
 # Factor by which the resonance of a learnt machine may be off the model's, either way.
 _NOTCH_MOVES = 2.0
 _BELOW_HALF = 0.49
 
 
 class Guarding(NamedTuple):
-    """Supervision of the edge, limits of updates, and the middle of their box for gains."""
+    """Supervision of the edge, and limits of updates."""
 
     supervision: Supervision
     limits: Limits
-    middle: AnyGains
 
 
 def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guarding | None:
@@ -78,9 +79,8 @@ def guarding(servo: Plant, settings: TwinSettings, noise: float = 0.0) -> Guardi
     fallback = FallbackSet(Setting.of(verified.setting.tolerance, gains, band), settings.silence)
     supervision = supervision_of(servo, settings, fallback)
     sent = policy_of(servo, settings)
-    return Guarding(
-        supervision, *(_hysteresis_box(sent) if isinstance(sent, HysteresisPolicy) else _certified_box(policy))
-    )
+    limits = _hysteresis_limits(sent) if isinstance(sent, HysteresisPolicy) else certified_limits(policy)
+    return Guarding(supervision, limits)
 
 
 def supervision_of(servo: Plant, settings: TwinSettings, fallback: FallbackSet) -> Supervision:
@@ -109,31 +109,30 @@ def start_of(fallback: FallbackSet) -> Parameters:
     return Parameters(setting=fallback.setting, fallback=True)
 
 
-def _certified_box(policy: CertifiedPolicy) -> tuple[Limits, AnyGains]:
-    """Limits that admit the gains and dead zone of every candidate, and the gains in the middle of that box."""
-    own, demands = policy.servo.controller, policy.demands_within_band()
+def certified_limits(policy: CertifiedPolicy) -> Limits:
+    """Limits that admit the gains and dead zone of every candidate."""
+    law, demands = policy.servo.controller, policy.demands_within_band()
     laws = _candidates(policy, demands)
-    sent, centre = [gains_of(law) for law in laws], gains_of(own)
-    ends = {name: _range([getattr(gains, name) for gains in sent]) for name in centre.scaled}
-    middle = {name: math.copysign(math.sqrt(low * high), getattr(centre, name)) for name, (low, high) in ends.items()}
-    widest = max(math.sqrt(high / low) if low > 0.0 else 1.0 for low, high in ends.values())
+    sent, own = [gains_of(each) for each in laws], gains_of(law)
+    ranges: dict[str, Any] = {
+        name: _range([getattr(gains, name) for gains in sent]) for name in own.scaled if getattr(own, name)
+    }
     kick = _kick(laws)
-    factor = max(widest, kick / abs(middle["Kp"]) if kick else 0.0) * _ROUNDING
     notches = [gains.notch_hz for gains in sent if not isinstance(gains, LinearGains) and gains.notch_hz]
     dampings = [gains.notch_damping for gains in sent if not isinstance(gains, LinearGains) and gains.notch_hz]
-    leave = max([law.leave for law in laws] + [leave for _, leave in demands.hysteresis])
-    limits = Limits(
+    return Limits(
         maximum=demands.tolerance,
-        gain_factor=factor,
-        integral_factor=max(integral_shares(policy.servo, demands), default=0.0) * _ROUNDING,
-        feedforward=max(policy.feedforward_limit, policy.friction_feedforward_limit) * _ROUNDING,
+        gain_factor=max(1.0, kick / abs(own.Kp)) if isinstance(own, Gains) and kick else 1.0,
+        integral_factor=max(integral_shares(policy.servo, demands), default=0.0),
+        leave=max([each.leave for each in (law, *laws)] + [leave for _, leave in demands.hysteresis]),
+        feedforward=max(policy.feedforward_limit, policy.friction_feedforward_limit),
         # The centre follows the learnt machine.
         notch_min_hz=min(notches, default=0.0) / _NOTCH_MOVES,
-        notch_max_hz=min(max(notches, default=0.0) * _NOTCH_MOVES, _highest_notch(own)),
-        notch_damping=max(dampings, default=0.5 if isinstance(own, LinearLaw) else own.notch_damping),
+        notch_max_hz=min(max(notches, default=0.0) * _NOTCH_MOVES, _highest_notch(law)),
+        notch_damping=max(dampings, default=0.5 if isinstance(law, LinearLaw) else law.notch_damping),
         patience_s=PATIENCE * scales(policy.servo).time,
+        **ranges,
     )
-    return limits, _centre_of(centre, middle, _ROUNDING * max(leave, own.leave) / factor)
 
 
 def _highest_notch(own: AnyController) -> float:
@@ -150,51 +149,44 @@ def _kick(laws: list[AnyController]) -> float:
     )
 
 
-def _centre_of(own: AnyGains, middle: dict[str, float], leave: float) -> AnyGains:
-    """Gains in the middle of a box, with the own integral gain and nothing fed forward."""
-    if isinstance(own, Gains):
-        return Gains(middle["Kp"], own.Ki, middle["Kd"], middle["Tf"], 0.0, leave)
-    centre = msgspec.structs.replace(own, **middle, enter=0.0, leave=leave, feedforward=0.0)
-    if isinstance(centre, CascadeGains):
-        time = centre.velocity_gain / own.integral_gain if own.integral_gain else 0.0
-        return msgspec.structs.replace(centre, integral_time=time)
-    return msgspec.structs.replace(centre, integral_share=own.integral_gain / centre.gain)
-
-
 def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[AnyController]:
-    """Candidates for the stated ranges, those for a plant that the twin has learnt exactly, and those in between.
+    """Candidates for the stated ranges, and for machines within them that the twin has learnt exactly or in part.
 
-    What is left open of a learnt plant may rule its fastest laws out: then slower ones with a notch are candidates.
+    The fastest laws are those for a stiff and damped machine that is learnt exactly; the slowest ones, and slow ones
+    with a notch, those for a soft and lightly damped machine of which much is open.
     """
-    exact = policy.uncertainty.replace(
-        **dict.fromkeys(PARAMETERS, 0.0), learnt=LearntFactors(("k",), (0.0,), ((0.0,),))
-    )
-    stated = _laws(policy, policy.uncertainty, demands)
-    known = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
-    fastest = max(abs(strength(law)) for law in stated) / abs(strength(policy.servo.controller))
-    slower = tuple(scale for scale in demands.scales if scale <= fastest * _ROUNDING)
-    between = dataclasses.replace(known, scales=slower)
-    return [*stated, *_laws(policy, exact, known), *_laws(policy, exact, between)]
-
-
-def _laws(policy: CertifiedPolicy, known: Uncertainty, demands: Demands) -> list[AnyController]:
-    return [each.controller for each in candidates_of(policy.servo, known, demands, True, False)]
+    servo, known = policy.servo, policy.uncertainty
+    sure = dataclasses.replace(demands, beyond=dataclasses.replace(demands.beyond, k_T=0.0))
+    exact = known.replace(**dict.fromkeys(PARAMETERS, 0.0))
+    learnt = LearntFactors(("k_B",), (0.0,), ((known.k_B**2 / 3.0,),))
+    asked: list[tuple[Plant, Uncertainty, Demands]] = [
+        (servo, known, demands),
+        (servo, known.replace(learnt=learnt), demands),
+        (servo, exact.replace(learnt=LearntFactors(("k",), (0.0,), ((0.0,),))), sure),
+    ]
+    for end, open_part, ranges, wanted in ((1.0, 0.0, exact, sure), (-1.0, _OPEN, known, demands)):
+        widths = np.array([known.k, known.c, 0.0, 0.0])
+        prior = FactorPrior(np.log1p(end * widths), np.diag(np.square(open_part * widths) / 3.0))
+        found = learnt_servo(servo, known, prior, None)
+        if found is not None:
+            asked.append((found[0], narrowed(ranges, found[1]), wanted))
+    return [each.controller for one in asked for each in candidates_of(*one, True, False)]
 
 
 def _range(values: list[float]) -> tuple[float, float]:
-    return min(map(abs, values)), max(map(abs, values))
+    return min(values), max(values)
 
 
-def _hysteresis_box(policy: HysteresisPolicy) -> tuple[Limits, AnyGains]:
+def _hysteresis_limits(policy: HysteresisPolicy) -> Limits:
     """Limits that admit the servo's own gains only, and a dead zone of any width, which follows the estimated gap."""
-    own = policy.servo.controller.replace(enter=policy.enter, leave=policy.leave)
-    gains, patience = gains_of(own), PATIENCE * scales(policy.servo).time
+    own = policy.servo.controller
     limits = Limits(
-        gain_factor=_ROUNDING,
+        gain_factor=1.0,
+        leave=policy.leave,
         feedforward=max(abs(own.feedforward), abs(friction_feedforward(own))),
-        patience_s=patience,
+        patience_s=PATIENCE * scales(policy.servo).time,
     )
-    if isinstance(gains, LinearGains):
-        return limits, gains
-    notch = gains.notch_hz
-    return dataclasses.replace(limits, notch_min_hz=notch, notch_max_hz=notch, notch_damping=gains.notch_damping), gains
+    if isinstance(own, LinearLaw):
+        return limits
+    notch = own.notch_hz or 0.0
+    return dataclasses.replace(limits, notch_min_hz=notch, notch_max_hz=notch, notch_damping=own.notch_damping)

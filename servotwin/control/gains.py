@@ -4,6 +4,7 @@ from typing import Any, overload
 
 import msgspec
 
+from servotwin.config.keys import items_of
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, changes, values_of
 from servotwin.control.cascade import Cascade
@@ -104,6 +105,12 @@ def written_gains(gains: AnyGains, running: AnyController | None = None) -> Valu
     # Where nothing is said of them, a reader takes those of the running law.
     lacking = {"integral_time_s": 0.0, "notch_hz": 0.0} if isinstance(written, Cascade) else {}
     return {**lacking, **values}
+
+
+def key_of(controller: AnyController, name: str) -> str:
+    """Key in a file of a number of a controller's gains; the name itself of one that no file has."""
+    items = items_of(_MAKERS.get(type(controller), type(controller)))
+    return next((item.exact_name for item in items if item.name == name), name)
 
 
 def settable(kind: type) -> tuple[str, ...]:

@@ -147,7 +147,9 @@ def _answer(step: Trace) -> str:
     body = receipt["body"] or {}
     if receipt["status"] == Reason.FELL_BACK:
         return f"{_MET}: {receipt['status']}, as version {body.get('parameter_version')}"
-    return "applied it" if body.get("applied") else f"{_REFUSED}: {receipt['status']}"
+    if body.get("applied"):
+        return "applied it"
+    return ": ".join(filter(None, (_REFUSED, receipt["status"], body.get("detail"))))
 
 
 def _effect(effect: Trace | None, factor: float) -> str:

@@ -9,17 +9,40 @@ A repeated update gets its first answer again, so that a lost receipt costs noth
 the instant at which an admissible update is applied.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf
-from typing import Annotated
+from math import inf, nextafter
+from typing import Annotated, NamedTuple, TypeAlias
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import Key, check, key, settings
 from servotwin.edge.parameters import Parameters
 from servotwin.errors import InvalidInput
 from servotwin.messages import KNOWN_FIELDS, AnyGains, CascadeGains, Gains, LinearGains, Reason, Receipt, Update
 
-# A law whose gain is scaled and whose integral gain is not has its own integral gain but for rounding.
-_ROUNDED = 1.0 + 1e-9
+# Gains that are scaled, and written to a file in other units, are those of the box's corners but for rounding.
+_ROUNDING = 1e-9
+Range: TypeAlias = tuple[float, float]
+
+
+class Bounded(NamedTuple):
+    """A number of a law, by name, and the least and greatest value that an update may give it."""
+
+    name: str
+    value: float
+    least: float
+    greatest: float
+
+    @property
+    def is_allowed(self) -> bool:
+        """True where the value is in bounds, but for rounding."""
+        below, above = self.least - _ROUNDING * abs(self.least), self.greatest + _ROUNDING * abs(self.greatest)
+        return below <= self.value <= above
+
+
+def _range_key(name: str, of: str) -> Key:
+    """Key of the range of a gain."""
+    words = f"Lowest and highest {of}, on the own one's side of zero; where absent within gain_factor of the own one."
+    return key(name, infinite=True, help=words)
 
 
 @settings("limits")
@@ -63,12 +86,28 @@ class Limits:
         key(
             minimum=1.0,
             infinite=True,
-            help="Kp, Kd and Tf stay within this factor of the servo's own, either way; `leave` from above. The "
-            "velocity feedforward answers a step of the reference by at most so many times the answer of the own Kp. "
-            "Of a cascade position_gain, velocity_gain and speed_filter stay within it, and the acceleration "
-            "feedforward from above; of a linear law its gain.",
+            help="Gains and filter times without a range of their own stay within this factor of the servo's own, "
+            "either way; `leave` without a bound of its own, and a cascade's acceleration feedforward, from above. A "
+            "filtered PID's velocity feedforward answers a step of the reference by at most so many times the answer "
+            "of the own Kp.",
         ),
     ] = 4.0
+    Kp: Annotated[Range | None, _range_key("kp_v_per_m", "Kp")] = None
+    Kd: Annotated[Range | None, _range_key("kd_v_s_per_m", "Kd")] = None
+    Tf: Annotated[Range | None, _range_key("filter_time_s", "Tf")] = None
+    position_gain: Annotated[Range | None, _range_key("position_gain_per_s", "position_gain of a cascade")] = None
+    velocity_gain: Annotated[Range | None, _range_key("velocity_gain_v_s_per_rad", "velocity_gain of a cascade")] = None
+    speed_filter: Annotated[Range | None, _range_key("speed_filter_s", "speed_filter of a cascade")] = None
+    gain: Annotated[Range | None, _range_key("gain", "gain of a linear law")] = None
+    leave: Annotated[
+        float | None,
+        key(
+            "leave_tolerances",
+            minimum=0.0,
+            infinite=True,
+            help="Largest `leave`; where absent gain_factor times the own one.",
+        ),
+    ] = None
     integral_factor: Annotated[
         float,
         key(
@@ -136,6 +175,25 @@ class Limits:
             raise InvalidInput(
                 f"limits on a notch {self.notch_min_hz!r} Hz to {self.notch_max_hz!r} Hz: must be in order"
             )
+        for name, (lowest, highest) in self.ranges.items():
+            if not lowest <= highest:
+                raise InvalidInput(f"limits {name} = {lowest!r} to {highest!r}: must be in order")
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """The ranges of gains that are given, by the gain's name."""
+        names = (name for kind in (Gains, CascadeGains, LinearGains) for name in kind.scaled)
+        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+
+    def range_of(self, name: str, own: AnyGains) -> Range:
+        """Lowest and highest allowed value of a gain, for the servo's own gains; it keeps the sign of the own one."""
+        value, given = getattr(own, name), getattr(self, name)
+        if given is not None:
+            lowest, highest = given
+            return (max(lowest, 0.0) if value > 0.0 else lowest, min(highest, 0.0) if value < 0.0 else highest)
+        # A gain that the servo has does not vanish, whatever the factor.
+        least = max(abs(value) / self.gain_factor, nextafter(0.0, 1.0)) if value else 0.0
+        return _with_sign(value, least, _times(self.gain_factor, abs(value)))
 
     def allows_tolerance(self, tolerance: float) -> bool:
         """True where a tolerance (m) is in bounds."""
@@ -146,57 +204,63 @@ class Limits:
         return abs(new - old) <= self.max_step and (self.max_rate == inf or abs(new - old) <= self.max_rate * since)
 
     def allows_gains(self, gains: AnyGains, own: AnyGains) -> bool:
-        """True where gains lie in the box around the servo's own, which must be those of a law of the same kind."""
-        if type(gains) is not type(own):
-            return False
-        scaled = all(self._in_box(getattr(gains, name), getattr(own, name)) for name in gains.scaled)
-        integral = self._integral_in_box(getattr(gains, gains.integral), getattr(own, own.integral))
-        fed = max(abs(getattr(gains, name)) for name in gains.fed) <= self.feedforward
-        ahead = self._allows_motion(gains, own) and self._allows_notch(gains, own)
-        return scaled and integral and gains.leave <= _times(self.gain_factor, own.leave) and fed and ahead
+        """True where gains are those of a law of the same kind as the servo's own, and in bounds."""
+        return type(gains) is type(own) and self.out_of_bounds(gains, own) is None
 
-    def _allows_motion(self, gains: AnyGains, own: AnyGains) -> bool:
-        """True where the feedforwards of the reference's motion are in bounds."""
+    def out_of_bounds(self, gains: AnyGains, own: AnyGains) -> Bounded | None:
+        """The first number that is out of bounds, of gains of the same kind as the servo's own; None: there is none."""
+        return next((each for each in self._bounded(gains, own) if not each.is_allowed), None)
+
+    def _bounded(self, gains: AnyGains, own: AnyGains) -> Iterator[Bounded]:
+        """The bounded numbers of gains."""
+        for name in gains.scaled:
+            yield Bounded(name, getattr(gains, name), *self.range_of(name, own))
+        integral = getattr(own, own.integral)
+        whole = _with_sign(integral, 0.0, _times(self.integral_factor, abs(integral)))
+        yield Bounded(gains.integral, getattr(gains, gains.integral), *whole)
+        most = _times(self.gain_factor, own.leave) if self.leave is None else self.leave
+        yield Bounded("leave", gains.leave, 0.0, most)
+        for name in gains.fed:
+            yield Bounded(name, getattr(gains, name), -self.feedforward, self.feedforward)
+        yield from self._bounded_motion(gains, own)
+        yield from self._bounded_notch(gains, own)
+
+    def _bounded_motion(self, gains: AnyGains, own: AnyGains) -> Iterator[Bounded]:
+        """The feedforwards of the reference's motion."""
         if isinstance(gains, Gains) and isinstance(own, Gains):
-            kick = abs(gains.velocity_feedforward) <= _times(self.gain_factor, abs(own.Kp)) * gains.velocity_time
-            return kick or gains.velocity_feedforward == 0.0
-        if isinstance(gains, CascadeGains) and isinstance(own, CascadeGains):
+            kick = _times(self.gain_factor, abs(own.Kp)) * gains.velocity_time
+            yield Bounded("velocity_feedforward", gains.velocity_feedforward, -kick, kick)
+        elif isinstance(gains, CascadeGains) and isinstance(own, CascadeGains):
             # All of the reference's speed is fed forward by a share of one; more would overtake it.
-            speed = gains.velocity_feedforward <= max(1.0, own.velocity_feedforward)
-            return speed and gains.acceleration_feedforward <= _times(self.gain_factor, own.acceleration_feedforward)
-        return True
+            speed = max(1.0, own.velocity_feedforward)
+            yield Bounded("velocity_feedforward", gains.velocity_feedforward, 0.0, speed)
+            most = _times(self.gain_factor, own.acceleration_feedforward)
+            yield Bounded("acceleration_feedforward", gains.acceleration_feedforward, 0.0, most)
 
-    def _allows_notch(self, gains: AnyGains, own: AnyGains) -> bool:
-        """True where a notch is in bounds, or the servo's own."""
-        if isinstance(gains, LinearGains) or isinstance(own, LinearGains):
-            return True
-        if all(getattr(gains, name) == getattr(own, name) for name in ("notch_hz", "notch_damping", "notch_depth")):
-            return True
-        within = self.notch_min_hz <= gains.notch_hz <= self.notch_max_hz
-        return gains.notch_hz == 0.0 or (within and gains.notch_damping <= self.notch_damping)
+    def _bounded_notch(self, gains: AnyGains, own: AnyGains) -> Iterator[Bounded]:
+        """A notch other than the servo's own."""
+        if isinstance(gains, LinearGains) or isinstance(own, LinearGains) or gains.notch_hz == 0.0:
+            return
+        if any(getattr(gains, name) != getattr(own, name) for name in ("notch_hz", "notch_damping", "notch_depth")):
+            yield Bounded("notch_hz", gains.notch_hz, self.notch_min_hz, self.notch_max_hz)
+            yield Bounded("notch_damping", gains.notch_damping, 0.0, self.notch_damping)
 
     def allows_gains_step(self, old: AnyGains, new: AnyGains, own: AnyGains, since: float) -> bool:
         """True where gains may change from old to new, `since` seconds after the last change."""
         factor = self.gain_step if self.gain_rate == inf else min(self.gain_step, _power(self.gain_rate, since))
         if factor == inf:
             return True
+        smallest = {name: min(map(abs, self.range_of(name, own))) for name in new.scaled}
+        smallest[new.integral] = abs(getattr(own, new.integral)) / self.gain_factor
         return all(
-            _in_step(
-                getattr(old, name),
-                getattr(new, name),
-                abs(getattr(own, name)) / self.gain_factor,
-                factor,
-                falls_at_once=name == new.integral,
-            )
-            for name in (*new.scaled, new.integral)
+            _in_step(getattr(old, name), getattr(new, name), least, factor, falls_at_once=name == new.integral)
+            for name, least in smallest.items()
         )
 
-    def _integral_in_box(self, value: float, own: float) -> bool:
-        return value * own >= 0.0 and abs(value) <= _times(self.integral_factor, abs(own)) * _ROUNDED
 
-    def _in_box(self, value: float, own: float) -> bool:
-        raised, highest = _times(self.gain_factor, abs(value)), _times(self.gain_factor * self.gain_factor, abs(own))
-        return value * own >= 0.0 and abs(own) <= raised <= highest
+def _with_sign(of: float, least: float, greatest: float) -> Range:
+    """Lowest and highest value of numbers of some sizes, with the sign of a number."""
+    return (-greatest, 0.0 - least) if of < 0.0 else (least, greatest)
 
 
 def _times(factor: float, size: float) -> float:
@@ -300,7 +364,9 @@ def _judge_gains(gains: AnyGains, current: Parameters, limits: Limits, own: AnyG
     return Reason.APPLIED
 
 
-def receipt(update: Update, reason: Reason, sample: int, current: Parameters, here: Instant) -> Receipt:
+def receipt(
+    update: Update, reason: Reason, sample: int, current: Parameters, here: Instant, detail: str = ""
+) -> Receipt:
     """Make the receipt of a decision; `current` is in force after it."""
     is_applied = reason is Reason.APPLIED
-    return Receipt(here.servo, update.version, is_applied, sample, reason, current.version, here.boot)
+    return Receipt(here.servo, update.version, is_applied, sample, reason, current.version, here.boot, detail)

@@ -6,7 +6,9 @@ from math import inf, isfinite
 from typing import Annotated
 
 from servotwin.config.keys import check, key, settings
+from servotwin.config.own_units import VOLTS_METRES, OwnUnits
 from servotwin.control.cascade import Cascade
+from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
@@ -66,10 +68,12 @@ class AgentSettings:
         As configured: what updates start from, and the limits and filters that they do not change. None: updates set
         the tolerance only.
     own : gains, optional
-        The servo's own gains, in the middle of the box that updates must stay in; None: the controller's.
+        The servo's own gains, from which the limits of updates count; None: the controller's.
     supervision : Supervision
     window_filter : WindowFilterSettings, optional
         Chooses which windows are sent; None: all are.
+    units : OwnUnits
+        Of the machine, for what is said of refused gains.
     """
 
     servo: Annotated[str, key(help="Name of the servo.")]
@@ -117,6 +121,7 @@ class AgentSettings:
         key(help="Probing moves of the reference that the twin may request; none where absent."),
     ] = None
     window_filter: WindowFilterSettings | None = None
+    units: OwnUnits = field(default=VOLTS_METRES, compare=False)
 
     def __post_init__(self) -> None:
         for name in ("servo", "boot"):
@@ -132,6 +137,7 @@ class AgentSettings:
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
         self._check_notch()
+        self._check_ranges()
         if self.window_filter is not None:
             self.window_filter.check(self.sample_rate)
         fallback = self.supervision.fallback
@@ -146,6 +152,20 @@ class AgentSettings:
         if not self.limits.notch_max_hz < 0.5 * law.sample_rate:
             allowed = f"must be below half of the controller's {law.sample_rate!r} Hz"
             raise InvalidInput(f"limits notch_max_hz = {self.limits.notch_max_hz!r} Hz: {allowed}")
+
+    def _check_ranges(self) -> None:
+        """Check that the ranges of gains are for numbers of the controller, and leave each of them some room."""
+        if self.controller is None:
+            return
+        own = self.own or gains_of(self.controller)
+        for name, given in self.limits.ranges.items():
+            if name not in own.scaled:
+                allowed = f"the controller has no {name}; give {', '.join(own.scaled)}"
+                raise InvalidInput(f"limits {name} = {given!r}: {allowed}")
+            lowest, highest = self.limits.range_of(name, own)
+            if lowest > highest:
+                allowed = f"must reach to the side of zero of the servo's own {getattr(own, name)!r}"
+                raise InvalidInput(f"limits {name} = {given!r}: {allowed}")
 
     def _check_longest(self) -> None:
         """Check that the longest window and pre-trigger are at least the configured ones, and fit together."""

@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 from math import ceil, inf
 from typing import NamedTuple
 
-from servotwin.control.gains import gains_of, holds, with_gains
+from servotwin.config.own_units import VOLTS_METRES, OwnUnits
+from servotwin.control.gains import gains_of, holds, key_of, with_gains
 from servotwin.control.laws import AnyController, law_of
 from servotwin.edge.guard import Instant, Limits, is_repeat, judge, receipt, updated_parameters
 from servotwin.edge.parameters import FallbackSet, Parameters
@@ -47,17 +48,31 @@ class Rules:
     controller : Controller, Cascade or LinearLaw, optional
         Configured controller, with the limits that updates do not change. None: the edge knows no gains or thresholds.
     own : gains, optional
-        The servo's own gains, in the middle of the box; None: the controller's.
+        The servo's own gains; None: the controller's.
+    units : OwnUnits
+        Of the machine.
     """
 
     limits: Limits
     controller: AnyController | None = None
     own: AnyGains | None = None
+    units: OwnUnits = VOLTS_METRES
 
     @property
     def centre(self) -> AnyGains | None:
-        """Gains in the middle of the allowed box; None: no gains are accepted."""
+        """Gains from which the limits count; None: no gains are accepted."""
         return self.own if self.own is not None or self.controller is None else gains_of(self.controller)
+
+    def detail(self, update: Update, reason: Reason) -> str:
+        """The number of a refused update that is out of bounds, and what is allowed; empty: the reason says it all."""
+        gains, own, law = update.setting.gains, self.centre, self.controller
+        if reason is not Reason.GAINS_OUT_OF_BOUNDS or gains is None or own is None or type(gains) is not type(own):
+            return ""
+        found = self.limits.out_of_bounds(gains, own)
+        if found is None:
+            return ""
+        name = found.name if law is None else self.units.key(key_of(law, found.name))
+        return f"{name} = {found.value:.9g}: must be within {found.least:.9g} and {found.greatest:.9g}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +116,7 @@ def offer(state: Switch, update: Update, rules: Rules, here: Instant, error: flo
         return Transition(state)
     reason = _judge_with_pending(update, state, rules, here)
     if reason is not Reason.APPLIED:
-        return Transition(state, (receipt(update, reason, here.sample, current, here),))
+        return Transition(state, (receipt(update, reason, here.sample, current, here, rules.detail(update, reason)),))
     refused = () if pending is None else (receipt(pending.update, Reason.SUPERSEDED, here.sample, current, here),)
     after = apply_pending(replace(state, pending=PendingUpdate(update, here.sample)), rules, here, error)
     return Transition(after.state, refused + after.messages)
@@ -116,7 +131,8 @@ def apply_pending(state: Switch, rules: Rules, here: Instant, error: float | Non
     reason = _judge(update, current, rules, here)
     after = updated_parameters(update, current, here.sample)
     if reason is not Reason.APPLIED:
-        return Transition(replace(state, pending=None), (receipt(update, reason, here.sample, current, here),))
+        answer = receipt(update, reason, here.sample, current, here, rules.detail(update, reason))
+        return Transition(replace(state, pending=None), (answer,))
     patient = here.sample - pending.since < rules.limits.patience_s * here.rate
     if patient and not is_safe(current, after, rules.controller, error):
         return Transition(state)
@@ -226,7 +242,7 @@ class Supervisor:
 
     def __init__(self, settings: AgentSettings, recorder: Recorder, store: ParameterStore | None = None) -> None:
         self._settings, self._recorder, self._store = settings, recorder, store
-        self._rules = Rules(settings.limits, settings.controller, settings.own)
+        self._rules = Rules(settings.limits, settings.controller, settings.own, settings.units)
         self._state = Switch(self._first_parameters())
         self._fallback = settings.supervision.fallback
         self._watch = self._new_watch()

@@ -118,6 +118,7 @@ def _agent(table: Table, controller: AnyController | None) -> AgentSettings:
         parameters=read_start(start, start_gains),
         supervision=read_supervision(supervision, gains),
         window_filter=part(table, "novelty", NoveltySettings) if "novelty" in table.values else None,
+        units=table.units or VOLTS_METRES,
     )
     start.done()
     supervision.done()

@@ -46,7 +46,7 @@ class Gains(Struct, frozen=True):
     notch_depth: float = 0.1
 
     scaled: ClassVar[tuple[str, ...]] = ("Kp", "Kd", "Tf")
-    """Names of what an edge bounds by a factor either way; `integral` from above; `fed` by a command."""
+    """Names of what an edge bounds from below and above; `integral` from above; `fed` by a command."""
     integral: ClassVar[str] = "Ki"
     fed: ClassVar[tuple[str, ...]] = ("feedforward", "friction_feedforward")
 

@@ -161,7 +161,7 @@ def needed_fields(setting: Setting) -> tuple[str, ...]:
     return tuple(name for name in later if getattr(gains, name) != defaults.get(name))
 
 
-class Receipt(Struct, frozen=True, tag="receipt/1"):
+class Receipt(Struct, frozen=True, omit_defaults=True, tag="receipt/1"):
     """Receipt for an update: applied or refused.
 
     Attributes
@@ -175,6 +175,8 @@ class Receipt(Struct, frozen=True, tag="receipt/1"):
     parameter_version : int
         Version in force after the decision, on which the twin has to base its next update.
     boot : str
+    detail : str
+        The number that is out of bounds, and what is allowed; empty: the reason says it all.
     """
 
     servo: Name
@@ -184,6 +186,7 @@ class Receipt(Struct, frozen=True, tag="receipt/1"):
     reason: Reason
     parameter_version: Count
     boot: Name
+    detail: Annotated[str, Meta(max_length=256, pattern=r"\A[ -~]*\Z")] = ""
 
 
 class Fallback(Struct, frozen=True, tag="fallback/2"):

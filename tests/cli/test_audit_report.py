@@ -135,6 +135,10 @@ def test_a_refused_version_shows_why() -> None:
     assert (
         chain(link(1, estimate(), steps=[step(None, receipt)]))[-1].strip() == "version 3 REFUSED by the edge: expired"
     )
+    body = {"applied": False, "detail": "kp_v_per_m = 5: must be within 1 and 2"}
+    receipt = found("receipt", Reason.GAINS_OUT_OF_BOUNDS, version=3, body=body)
+    expected = "version 3 REFUSED by the edge: gains out of bounds: kp_v_per_m = 5: must be within 1 and 2"
+    assert chain(link(1, estimate(), steps=[step(None, receipt)]))[-1].strip() == expected
 
 
 def test_a_version_that_met_a_fallback_is_no_error() -> None:

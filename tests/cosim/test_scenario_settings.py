@@ -129,6 +129,7 @@ EDGE = (
 [recording.limits]
 patience_s = 2.0
 gain_factor = 2.5
+kp_v_per_m = [700.0, 2800.0]
 integral_factor = 0.05
 feedforward_v = 0.1
 maximum_mm = 0.2
@@ -159,7 +160,7 @@ def test_the_edge_looks_after_itself_as_a_scenario_says(tmp_path):
     assert agent.controller == scenario.law
     assert agent.own == own
     assert agent.limits == Limits(
-        maximum=0.2e-3, patience_s=2.0, gain_factor=2.5, integral_factor=0.05, feedforward=0.1
+        maximum=0.2e-3, patience_s=2.0, gain_factor=2.5, Kp=(700.0, 2800.0), integral_factor=0.05, feedforward=0.1
     )
     calm = Gains(own.Kp, 0.0, own.Kd, own.Tf, feedforward=0.01)
     fallback = FallbackSet(Setting(0.0, calm, Band(1e-4, 8e-5, 0.2, 2.0)), silence_s=60.0)
@@ -186,6 +187,8 @@ def test_without_an_edge_table_updates_set_the_tolerance_only(tmp_path):
         ("[edge.fallback]\nsilence_s = -1.0\n", "silence_s"),
         ("[edge.fallback.band]\nerror_mm = 0.1\n", "error_rms_mm"),
         ("[recording.limits]\ngain_factor = 0.5\n", "gain_factor"),
+        ("[recording.limits]\nkp_v_per_m = 2800.0\n", "recording.limits.kp_v_per_m = 2800.0 is not allowed; give two"),
+        ("[edge]\n[recording.limits]\nkd_v_s_per_m = [20.0, 300.0]\n", "limits Kd = (20.0, 300.0)"),
         ("[disturbances]\nfriction_n_m = -1.0\n", "friction_n_m"),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 from msgspec.structs import replace
 from sending_agent import SendingAgent
 
+from servotwin.config.own_units import OwnUnits
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.gains import gains_of
@@ -129,6 +130,46 @@ def test_stored_gains_of_another_law_do_not_end_the_edge(fallback: bool, tmp_pat
     assert agent.controller == CASCADE
     assert agent.parameters.setting == Setting.of(2e-4, OWN)
     assert permitted(store.load(), AgentSettings("axis-1", "b1", 1e3, 1.0, controller=CASCADE)) is None
+
+
+def test_each_gain_of_a_law_may_have_a_range() -> None:
+    limits = Limits(gain_factor=1.0, position_gain=(10.0, 20.0), velocity_gain=(3.0, 5.0), gain=(0.5, 1.0))
+    assert judged(replace(OWN, position_gain=10.0, velocity_gain=5.0, integral_time=0.2), limits) is Reason.APPLIED
+    for beyond in ({"position_gain": 20.1}, {"velocity_gain": 2.9}, {"speed_filter": 1.1e-3}):
+        assert judged(replace(OWN, **beyond), limits) is Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(LINEAR_OWN, gain=0.5), limits, LINEAR_OWN) is Reason.APPLIED
+    assert judged(replace(LINEAR_OWN, gain=0.49), limits, LINEAR_OWN) is Reason.GAINS_OUT_OF_BOUNDS
+
+
+@pytest.mark.parametrize(
+    ("law", "limits", "words"),
+    [
+        (CASCADE, Limits(Kp=(1.0, 2.0)), r"limits Kp = \(1.0, 2.0\): the controller has no Kp; give position_gain, "),
+        (PID, Limits(Kd=(-9.0, -1.0)), "limits Kd = .*: must reach to the side of zero of the servo's own 90.0"),
+    ],
+)
+def test_a_range_that_allows_the_controller_nothing_is_refused(law: AnyController, limits: Limits, words: str) -> None:
+    with pytest.raises(InvalidInput, match=words):
+        AgentSettings("axis-1", "b1", 1e3, controller=law, limits=limits)
+
+
+@pytest.mark.parametrize(
+    ("own", "limits", "changes", "detail"),
+    [
+        (PID, Limits(Kp=(3e3, 5e3)), {"Kp": 5001.0}, "kp_n_m_per_rad = 5001: must be within 3000 and 5000"),
+        (PID, Limits(), {"Ki": -1.0}, "ki_n_m_per_rad_s = -1: must be within 0 and 1000"),
+        (PID, Limits(), {"notch_hz": 4.0}, "notch_hz = 4: must be within 0 and 0"),
+        (CASCADE, Limits(), {"integral_time": 0.05}, "integral_gain = 60: must be within 0 and 30"),
+    ],
+)
+def test_a_receipt_says_which_gain_was_refused(
+    own: AnyController, limits: Limits, changes: dict[str, float], detail: str
+) -> None:
+    rules, gains = Rules(limits, own, units=OwnUnits("N m", "rad")), gains_of(own)
+    here, switch = Instant("axis-1", "b0", 10_000, 1000.0), Switch(Parameters(setting=Setting.of(1e-4, gains)))
+    (answer,) = offer(switch, updated(replace(gains, **changes)), rules, here, None).messages
+    assert isinstance(answer, Receipt)
+    assert (answer.reason, answer.detail) == (Reason.GAINS_OUT_OF_BOUNDS, detail)
 
 
 def test_gains_of_another_kind_of_law_are_refused() -> None:

@@ -84,6 +84,35 @@ def test_integral_action_has_a_bound_of_its_own() -> None:
     assert judged(replace(OWN, Ki=1001.0), Limits(integral_factor=0.05)) is Reason.GAINS_OUT_OF_BOUNDS
 
 
+@pytest.mark.parametrize(
+    ("changes", "inside"),
+    [
+        ({"Kp": 500.0}, True),
+        ({"Kp": 499.0}, False),
+        ({"Kp": 1200.0}, True),
+        ({"Kp": 1201.0}, False),  # within gain_factor
+        ({"Kd": -101.0}, True),
+        ({"Kd": 0.0}, True),  # of its range the part on the own side of zero counts
+        ({"Kd": 1.0}, False),
+        ({"Kd": -301.0}, False),
+        ({"Tf": 0.4}, True),  # no range: gain_factor
+        ({"Tf": 0.41}, False),
+        ({"leave": 1.5}, True),
+        ({"leave": 1.6}, False),
+    ],
+)
+def test_a_gain_with_a_range_stays_in_it(changes: dict[str, float], inside: bool) -> None:
+    limits = Limits(Kp=(500.0, 1200.0), Kd=(-300.0, 50.0), leave=1.5)
+    expected = Reason.APPLIED if inside else Reason.GAINS_OUT_OF_BOUNDS
+    assert judged(replace(OWN, **changes), limits) is expected
+
+
+def test_a_step_of_a_gain_counts_from_the_lower_end_of_its_range() -> None:
+    limits, least = Limits(Kp=(0.0, 1200.0), Kd=(-300.0, -50.0), gain_step=2.0), replace(OWN, Kd=-50.0)
+    assert judged(replace(OWN, Kd=-100.0), limits, least) is Reason.APPLIED
+    assert judged(replace(OWN, Kd=-101.0), limits, least) is Reason.GAINS_STEP_TOO_LARGE
+
+
 def test_a_servo_without_integral_action_gets_none() -> None:
     own = replace(OWN, Ki=0.0)
     assert not Limits().allows_gains(replace(own, Ki=1e-6), own)
@@ -130,7 +159,7 @@ def test_the_tolerance_has_a_speed_limit() -> None:
     [
         {"gain_factor": 0.9}, {"gain_step": 0.0}, {"gain_rate": nan}, {"feedforward": -0.1}, {"feedforward": nan},
         {"patience_s": -1.0}, {"patience_s": inf}, {"max_rate": 0.0},
-        {"integral_factor": -1.0},
+        {"integral_factor": -1.0}, {"Kp": (2.0, 1.0)}, {"Kp": (nan, 1.0)}, {"leave": -1.0},
     ],
 )  # fmt: skip
 def test_bad_limits_are_refused(values: dict[str, Any]) -> None:

@@ -113,7 +113,7 @@ def test_old_updates_are_refused_however_they_are_numbered() -> None:
 @pytest.mark.slow
 def test_a_loop_that_leaves_the_band_is_brought_back() -> None:
     """Settings that nobody certified, in bounds and a little beyond: every loop recovers."""
-    outcomes = [hostile.endured(seed, TwinFault.WANTON, QUICK) for seed in (49, 370)]
+    outcomes = [hostile.endured(seed, TwinFault.WANTON, QUICK) for seed in (2, 8)]
     assert all(outcome.recovered for outcome in outcomes)
     assert any(Cause.ERROR in outcome.fallbacks for outcome in outcomes)
     assert sum(outcome.refused[Reason.GAINS_OUT_OF_BOUNDS] for outcome in outcomes) > 0

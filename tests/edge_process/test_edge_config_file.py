@@ -92,6 +92,19 @@ def test_a_cascade_and_its_sets_come_back_bit_for_bit() -> None:
     assert again(config) == config
 
 
+def test_ranges_of_gains_come_back_and_are_written_where_they_are_given() -> None:
+    limits = Limits(Kp=(0.1 + 0.2, 1400.0), Kd=(-1.0 / 3.0, -0.1), Tf=(0.05, inf), leave=2.0)
+    config = EdgeConfig(
+        AgentSettings("axis-1", UNBOOTED, 1000.0, controller=LAW, limits=limits), "control", LAW, {"kind": "simulated"}
+    )
+    assert again(config) == config
+    written = tomllib.loads(edge_toml(config))["limits"]
+    assert written["kd_v_s_per_m"] == [-1.0 / 3.0, -0.1]
+    # Released edges do not know the keys.
+    plain = tomllib.loads(edge_toml(replace(config, agent=replace(config.agent, limits=Limits()))))["limits"]
+    assert set(written) - set(plain) == {"kp_v_per_m", "kd_v_s_per_m", "filter_time_s", "leave_tolerances"}
+
+
 def test_a_short_file_is_enough(tmp_path: Path) -> None:
     file = tmp_path / "edge.toml"
     file.write_text(PLAIN)

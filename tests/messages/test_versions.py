@@ -12,6 +12,7 @@ from servotwin.messages import (
     Hello,
     InvalidMessage,
     Reason,
+    Receipt,
     Refusal,
     Setting,
     Update,
@@ -78,3 +79,17 @@ def test_gains_of_another_law_are_needed_as_a_whole() -> None:
     cascade = Setting.of(1e-5, CascadeGains(20.0, 0.5))
     assert needed_fields(cascade) == ("law",)
     assert "law" in KNOWN_FIELDS
+
+
+def test_a_receipt_says_more_only_where_there_is_more_to_say() -> None:
+    """An older twin reads it without the detail, and an older edge's has none."""
+    receipt = Receipt("axis", 3, False, 100, Reason.GAINS_OUT_OF_BOUNDS, 2, "b1")
+    assert "detail" not in msgspec.msgpack.decode(encode(receipt))
+    told = msgspec.structs.replace(receipt, detail="kp_v_per_m = 5: must be within 1 and 2")
+    assert decode(encode(told)) == told
+    document = msgspec.msgpack.decode(encode(told))
+    del document["detail"]
+    assert decode(msgspec.msgpack.encode(document)) == receipt
+    # It is printed on terminals.
+    with pytest.raises(InvalidMessage):
+        decode(msgspec.msgpack.encode({**document, "detail": "\x1b[2J"}))

@@ -72,9 +72,9 @@ def test_the_box_of_the_edge_admits_every_candidate_and_not_much_more(axis: st.A
     guarded = Commissioning(axis, axis.controller, twin).guarding
     assert guarded is not None
     for design in candidates_of(axis, KNOWN, FEW, True, False):
-        assert guarded.limits.allows_gains(gains_of(design.controller), guarded.middle)
+        assert guarded.limits.allows_gains(gains_of(design.controller), gains_of(axis.controller))
     hot = gains_of(scaled(axis.controller, 9.0, (1.0, 1.0), 0.0))
-    assert not guarded.limits.allows_gains(hot, guarded.middle)
+    assert not guarded.limits.allows_gains(hot, gains_of(axis.controller))
 
 
 @pytest.mark.parametrize("integral_time", [None, 0.02])

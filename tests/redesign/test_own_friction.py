@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from servotwin.commissioning.guarding import _certified_box
+from servotwin.commissioning.guarding import certified_limits
 from servotwin.control.gains import gains_of
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
@@ -79,7 +79,7 @@ def test_the_least_friction_is_fed_forward_and_edges_take_it_where_no_bias_is_st
         assert sorted(pushes) == pytest.approx([0.0, (1.0 - width) * own])
     policy = CertifiedPolicy(POSITIONER, SMALL, FEW, feedforward_limit=0.0)
     assert policy.friction_feedforward_limit == pytest.approx(own)
-    limits, centre = _certified_box(policy)
+    limits, centre = certified_limits(policy), gains_of(POSITIONER.controller)
     fed = gains_of(POSITIONER.controller.replace(Ki=0.0, friction_feedforward=0.75 * own))
     assert limits.allows_gains(fed, centre)
     assert not limits.allows_gains(gains_of(POSITIONER.controller.replace(friction_feedforward=1.1 * own)), centre)

@@ -216,7 +216,7 @@ def test_a_learnt_plant_gets_a_setting_that_the_stated_ranges_forbid() -> None:
     box = guarding(SERVO, TwinSettings(demands=policy.demands))
     assert box is not None
     assert after.setting.gains is not None
-    assert box.limits.allows_gains(after.setting.gains, box.middle)
+    assert box.limits.allows_gains(after.setting.gains, gains_of(SERVO.controller))
 
 
 @pytest.mark.slow
@@ -230,7 +230,7 @@ def test_the_box_of_the_edge_admits_the_candidates_of_a_machine_learnt_more_or_l
         learnt = LearntFactors(("k", "c", "p"), (0.0,) * 3, tuple(map(tuple, covariance)))
         laws = [each.controller for each in candidates_of(servo, ranges.replace(learnt=learnt), Demands(), True, False)]
         assert any(law.notch_hz and law.Kp < servo.controller.Kp for law in laws)
-        assert all(box.limits.allows_gains(gains_of(law), box.middle) for law in laws)
+        assert all(box.limits.allows_gains(gains_of(law), gains_of(servo.controller)) for law in laws)
 
 
 def motor(back_emf: float, friction: float, bias: float, std: float) -> LearntMotor:
