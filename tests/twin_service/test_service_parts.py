@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from servotwin.messages import Refusal
 from servotwin.runtime.prometheus import metric_lines
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.http_edge import LongPolls
 from servotwin.twin_service.http_server import BodyReader
@@ -251,6 +252,15 @@ def test_a_flood_of_refusals_writes_few_lines_and_tells_how_many_it_left_out(cap
     first, second = caplog.records[101:]
     assert (first.servo, first.omitted) == ("ax-2", 4900)
     assert not hasattr(second, "omitted")
+
+
+def test_a_poll_of_a_store_that_is_away_is_refused_for_now():
+    async def away(*_args):
+        raise StoreUnavailable("not available now (connection refused)")
+
+    with pytest.raises(RequestRejected) as refused:
+        asyncio.run(LongPolls(away, 10).messages("ax-1", 0, 0.0))
+    assert refused.value.refusal is Refusal.UNAVAILABLE
 
 
 def test_polls_read_the_store_only_when_there_may_be_a_message():
