@@ -43,7 +43,8 @@ HEAD = """# Configuration reference
 
 Made by `make reference` from the declarations in the code: do not edit. A file may leave out every key that is not
 required. Where a key has two names, a file may give either; the unit is the end of the name. Editors that know TOML
-schemas (Even Better TOML, Taplo) check a file against the schema of its kind in `docs/schemas`.
+schemas (Even Better TOML, Taplo) check a file against the schema of its kind in `docs/schemas`. No number is above 1e30
+in size, no time above 1e9 s (30 years), no integer above 1e15; a text has 1000 printable characters at most.
 
 The files of a scenario, of an edge and of a twin name commands and positions in the units of their machine. Below are
 those of a voltage and of a position in metres. Of an axis that commands a torque `v` is `n_m` and `voltage` `torque`,

@@ -29,6 +29,10 @@ class _Required:
 
 REQUIRED = _Required()
 
+_LARGEST, _LONGEST_S, _LARGEST_INTEGER = 1e30, 1e9, 10**15
+"""Largest sizes of a number, of a time in seconds (30 years) and of an integer: products of larger ones overflow."""
+_LONGEST_TEXT = 1000
+
 
 @dataclass(frozen=True, slots=True)
 class Range:
@@ -181,6 +185,8 @@ class Table:
         value = self.values[key]
         if isinstance(value, bool) or not isinstance(value, int) or not allowed.accepts(value):
             raise self.invalid(key, allowed.whole)
+        if abs(value) > _LARGEST_INTEGER:
+            raise self.invalid(key, f"{allowed.whole}, of at most {_LARGEST_INTEGER:g} in size")
         return value
 
     def text(
@@ -192,6 +198,8 @@ class Table:
         value = self.values[key]
         if not isinstance(value, str):
             raise self.invalid(key, "a text in quotes")
+        if len(value) > _LONGEST_TEXT or not value.isprintable():
+            raise self.invalid(key, f"a text of at most {_LONGEST_TEXT} characters, without line breaks and the like")
         if choices is not None and value not in choices:
             raise self.invalid(key, f"one of {_listed(choices)}{did_you_mean(value, choices)}")
         return value
@@ -255,6 +263,9 @@ class Table:
         if not allowed.accepts(number):
             shown = _shown(value)
             raise InvalidInput(f"{self.source}: {self.path(key)} = {shown} is not allowed; give {allowed}{alternative}")
+        largest = _LONGEST_S if unit_of(key).si == "s" else _LARGEST
+        if largest < abs(number) < math.inf:
+            raise self.invalid(key, f"{allowed}, of at most {largest:g} in size")
         return number
 
     def _missing(self, key: str, default: object) -> bool:

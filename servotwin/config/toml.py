@@ -135,7 +135,12 @@ def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> A
         start = base if isinstance(base, type(item.default)) else item.default
         return part(table, name, item.type, folder, start if dataclasses.is_dataclass(start) else None)
     read_value = _plain(table, item, name, folder)
-    return read_value if declared.parse is None else declared.parse(table, name, read_value, folder)
+    if declared.parse is None:
+        return read_value
+    try:
+        return declared.parse(table, name, read_value, folder)
+    except OSError as error:
+        raise table.invalid(name, f"a file that can be read ({error.strerror or error})") from None
 
 
 def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:

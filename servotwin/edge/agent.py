@@ -89,8 +89,7 @@ class Agent:
         self.settings = settings
         self.windows_cut = 0
         self.outlet = LocalOutlet(settings, outbox) if outlet is None else outlet
-        capacity = max(settings.longest_samples + 1, settings.period_samples, settings.rest_samples)
-        self._recorder = recorder(tuple(CHANNELS), capacity)
+        self._recorder = recorder(tuple(CHANNELS), settings.kept_samples)
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outlet.unacknowledged:
             self._supervisor.window_sent(0.0)

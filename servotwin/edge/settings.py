@@ -19,6 +19,11 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import NAME_PATTERN, AnyGains
 from servotwin.runtime.retry import Retry
 
+_MOST_SAMPLES = 10_000_000
+"""Samples in the ring buffer; of four channels 320 MB."""
+_LONGEST_VERSION = 256
+"""Characters that a message allows."""
+
 
 @settings("supervision")
 @dataclass(frozen=True, slots=True)
@@ -128,6 +133,8 @@ class AgentSettings:
             if not re.fullmatch(NAME_PATTERN, getattr(self, name)):
                 raise InvalidInput(f"agent {name} = {getattr(self, name)!r}: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
         check(self)
+        if len(self.model_version) > _LONGEST_VERSION:
+            raise InvalidInput(f"agent model_version: must be at most {_LONGEST_VERSION} characters")
         for name in ("window_s", "pre_trigger_s"):
             _check_whole(name, getattr(self, name), self.sample_rate)
         if self.window_samples < 1:
@@ -136,6 +143,7 @@ class AgentSettings:
             allowed = f"must be below window_s = {self.window_s!r} s"
             raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
         self._check_longest()
+        self._check_memory()
         self._check_notch()
         self._check_ranges()
         if self.window_filter is not None:
@@ -180,6 +188,19 @@ class AgentSettings:
         if not self.longest_pre_trigger_samples < self.longest_samples:
             allowed = f"must be below the longest window, {self.longest_samples / self.sample_rate!r} s"
             raise InvalidInput(f"agent longest_pre_trigger_s = {self.longest_pre_trigger_s!r} s: {allowed}")
+
+    def _check_memory(self) -> None:
+        """Check that the samples that are kept fit into memory."""
+        if self.kept_samples > _MOST_SAMPLES:
+            raise InvalidInput(
+                f"agent window_s, longest_window_s, rest_s of a probe or period_s of the supervision keep "
+                f"{self.kept_samples:g} samples at {self.sample_rate!r} Hz: must be at most {_MOST_SAMPLES}"
+            )
+
+    @property
+    def kept_samples(self) -> int:
+        """Number of the last samples that the agent keeps."""
+        return max(self.longest_samples + 1, self.period_samples, self.rest_samples)
 
     @property
     def longest_samples(self) -> int:

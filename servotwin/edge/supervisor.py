@@ -85,11 +85,15 @@ class PendingUpdate:
 
 @dataclass(frozen=True, slots=True)
 class Switch:
-    """State of the switch: parameters in force, the pending update, and the number of fallbacks so far."""
+    """State of the switch: parameters in force, the pending update, and the number of fallbacks so far.
+
+    With `superseded` another edge of the servo has taken over, and no update is applied any more.
+    """
 
     current: Parameters
     pending: PendingUpdate | None = None
     fallbacks: int = 0
+    superseded: bool = False
 
 
 class Transition(NamedTuple):
@@ -154,9 +158,12 @@ def restore(state: Switch, former: Parameters, here: Instant) -> Transition:
     return _replace(state, new, former.setting.gains, Violation(Cause.DRIVE, 0.0, 0.0), _REFUSE_AFTER_DRIVE_S, here)
 
 
-def refuse_pending(state: Switch, here: Instant) -> Transition:
-    """Refuse the pending update; the parameters in force stay."""
-    return Transition(replace(state, pending=None), _refused_pending(state, Reason.AFTER_FALLBACK, state.current, here))
+def supersede(state: Switch, fallback: FallbackSet | None, here: Instant) -> Transition:
+    """Fall back where there is a fallback set, and refuse every update: they are for the edge that has taken over."""
+    state = replace(state, superseded=True)
+    if fallback is not None and not state.current.fallback:
+        return fall_back(state, fallback, Violation(Cause.CONFLICT, 0.0, 0.0), here)
+    return Transition(replace(state, pending=None), _refused_pending(state, Reason.TAKEN_OVER, state.current, here))
 
 
 def _refused_pending(state: Switch, reason: Reason, current: Parameters, here: Instant) -> tuple[Receipt, ...]:
@@ -177,9 +184,8 @@ def _replace(
     message = Fallback(
         here.servo, here.boot, here.sample, *violation, old.version, version, Setting.of(new.setting.tolerance, gains)
     )
-    return Transition(
-        Switch(new, None, state.fallbacks + 1), (*_refused_pending(state, Reason.FELL_BACK, new, here), message)
-    )
+    after = replace(state, current=new, pending=None, fallbacks=state.fallbacks + 1)
+    return Transition(after, (*_refused_pending(state, Reason.FELL_BACK, new, here), message))
 
 
 def is_safe(old: Parameters, new: Parameters, controller: AnyController | None, error: float | None) -> bool:
@@ -215,7 +221,9 @@ def _judge(update: Update, current: Parameters, rules: Rules, here: Instant) -> 
 
 
 def _judge_with_pending(update: Update, state: Switch, rules: Rules, here: Instant) -> Reason:
-    """Judge as `_judge` does, and refuse an update that is not newer than the pending one."""
+    """Judge as `_judge` does, and refuse one that is not newer than the pending one, or is for another edge."""
+    if state.superseded:
+        return Reason.TAKEN_OVER
     reason = _judge(update, state.current, rules, here)
     if reason is not Reason.APPLIED or state.pending is None:
         return reason
@@ -280,14 +288,8 @@ class Supervisor:
         return self._advance(restore(self._state, former, self._here))
 
     def superseded(self) -> Messages:
-        """Fall back where there is a fallback set, since another edge of the servo has taken over.
-
-        The twin's updates are not for this one any more, so the pending one is refused in every case.
-        """
-        if self._fallback is None or self.parameters.fallback:
-            return self._advance(refuse_pending(self._state, self._here))
-        violation = Violation(Cause.CONFLICT, 0.0, 0.0)
-        return self._advance(fall_back(self._state, self._fallback, violation, self._here))
+        """Fall back where there is a fallback set, since another edge of the servo has taken over; take no updates."""
+        return self._advance(supersede(self._state, self._fallback, self._here))
 
     def window_sent(self, now: float) -> None:
         """Note that a window is on its way to the twin."""

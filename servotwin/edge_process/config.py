@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -279,7 +280,10 @@ def _secret(what: str, file: str | None, variable: str | None, folder: Path, env
     assert file is not None
     path = folder / file
     try:
-        if path.stat().st_mode & 0o077:
+        mode = path.stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise InvalidInput(f"{path}: holds no {what}: it is a folder")
+        if mode & 0o077:
             raise InvalidInput(f"{path}: others than its owner may open it; give it mode 0600")
         return _checked(what, path.read_text(encoding="utf-8").strip(), str(path))
     except (OSError, UnicodeDecodeError) as error:

@@ -102,11 +102,17 @@ def _agent(table: Table, controller: AnyController | None) -> AgentSettings:
     settable = controller if read(table, update_gains_table) else None
 
     def gains(inner: Table) -> AnyGains | None:
-        stay = read(inner, gains_stay_table)
+        stay, _ = read(inner, gains_stay_table), given(inner)
         return None if stay or settable is None else read_gains(inner, settable)
 
     def start_gains(inner: Table) -> AnyGains | None:
-        return read_gains(inner, settable) if settable is not None and has_gains(inner, type(settable)) else None
+        return read_gains(inner, settable) if given(inner) and settable is not None else None
+
+    def given(inner: Table) -> bool:
+        found = controller is not None and has_gains(inner, type(controller))
+        if found and settable is None:
+            raise InvalidInput(f"[{inner.name}] has gains, which need update_gains = true; set that, or leave them out")
+        return found
 
     start, supervision = table.table("start"), table.table("supervision")
     agent: AgentSettings = read(

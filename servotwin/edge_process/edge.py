@@ -96,7 +96,7 @@ class EdgeRuntime:
         self.counts: Counter[str] = Counter()
         self.due: int | None = None
         self.ticks = TickHistogram()
-        self._boot, self._boots = boot, 0
+        self._boot, self._boots, self._superseded = boot, 0, False
         self._outlet, self._child, self._recorder = outlet, child, recorder
         self._manager = manager or ServiceManager({})
         self._check_due = self._status_due = clock()
@@ -127,6 +127,8 @@ class EdgeRuntime:
         self._boots += 1
         self.counts[f"boot: {why}"] += 1
         self.agent = self._new_agent(StoredParameters.of(self.agent.parameters).parameters())
+        if self._superseded:
+            self.send(self.agent.superseded())
 
     def exchange(self) -> None:
         """Exchange a piece with the link process, and give the agent the messages that have arrived."""
@@ -139,6 +141,7 @@ class EdgeRuntime:
             self.agent.outlet_changed()
         if received.superseded:
             log("conflict", boot=self.agent.settings.boot)
+            self._superseded = True
             self.send(self.agent.superseded())
         if received.reconnected:
             self._outlet.send_letter(self.agent.hello())

@@ -29,15 +29,31 @@ def check(config: EdgeConfig) -> None:
     InvalidInput
         The token, the broker's password, the certificates, a library of the link or a folder is missing.
     """
-    for key in ("outbox", "parameters", "status", "boots"):
-        name = getattr(config.files, key)
-        folder = config.path(name).parent
-        if not folder.is_dir():
-            raise InvalidInput(f"{config.source}: [keep]: {key} = {name!r}: there is no folder {folder}")
+    _check_files(config)
     if config.twin is not None:
         token_of(config.twin, config.folder)
         password_of(config.twin, config.folder)
         _check_link(config, config.twin)
+
+
+def _check_files(config: EdgeConfig) -> None:
+    """Check that each file can be written in its place, and is no other file of the edge."""
+    twin = config.twin
+    others = {} if twin is None else {"token_file": twin.token_file, "password_file": twin.password_file}
+    taken = {config.path(name).resolve(): key for key, name in others.items() if name is not None}
+    taken[Path(config.source).resolve()] = "this file itself"
+    for key in ("outbox", "parameters", "status", "boots"):
+        name = getattr(config.files, key)
+        path, where = config.path(name), f"{config.source}: [keep]: {key} = {name!r}"
+        try:
+            if not path.parent.is_dir():
+                raise InvalidInput(f"{where}: there is no folder {path.parent}")
+            if path.is_dir():
+                raise InvalidInput(f"{where}: is a folder; give the name of a file")
+        except OSError as error:
+            raise InvalidInput(f"{where}: cannot be used ({error.strerror})") from None
+        if (other := taken.setdefault(path.resolve(), key)) != key:
+            raise InvalidInput(f"{where}: is {other}; give another name")
 
 
 def _check_link(config: EdgeConfig, twin: TwinLink) -> None:

@@ -113,14 +113,15 @@ class MqttCallbacks(NamedTuple):
         Called after the subscription; the argument is True where the broker has forgotten the session.
     lost : callable
         Called with the reason when the connection broke or was refused.
-    no_subscriber : callable
-        Called with the number of a message that the broker accepted although its topic has no subscriber.
+    not_delivered : callable
+        Called with the number of a message that the broker delivers to nobody, and why: its topic has no subscriber
+        ("": the broker accepted it), or the broker refuses it.
     """
 
     message: Callable[[str, bytes, Callable[[], None]], None]
     ready: Callable[[bool], None]
     lost: Callable[[str], None]
-    no_subscriber: Callable[[int], None] = lambda _: None
+    not_delivered: Callable[[int, str], None] = lambda _number, _why: None
 
 
 class Connection:
@@ -190,7 +191,9 @@ class Connection:
 
     def _published(self, _client: Client, _user: Any, mid: int, reason: Any, _properties: Any) -> None:
         if reason.value == _NO_SUBSCRIBERS:
-            self._events.no_subscriber(mid)
+            self._events.not_delivered(mid, "")
+        elif reason.is_failure:
+            self._events.not_delivered(mid, f"the broker refuses what this user sends ({reason})")
 
     def _message(self, _client: Client, _user: Any, message: MQTTMessage) -> None:
         number, mid, qos = self._number, message.mid, message.qos

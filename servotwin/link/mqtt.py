@@ -76,12 +76,12 @@ class MqttTransport:
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
         self._waiting: dict[int, Future[MqttResponse | UnknownPeer]] = {}
         self._published: dict[int, Future[MqttResponse | UnknownPeer]] = {}
-        self._without_subscriber: set[int] = set()
+        self._not_delivered: dict[int, str] = {}
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
         name = f"servotwin-edge-{servo}" + (f"-{run}" if run else "")
         session = MqttSession(name, (response_topic(servo), TWIN_GONE), session_s)
         self._connection = Connection(
-            broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._no_subscriber)
+            broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._undelivered)
         )
 
     def deliver(self, parcel: Parcel) -> None:
@@ -160,20 +160,20 @@ class MqttTransport:
             raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
         with self._lock:
             self._published[number] = future
-            # The broker may report that there is no subscriber before `publish` has returned the number.
-            without_subscriber = number in self._without_subscriber
-            self._without_subscriber.discard(number)
-        if without_subscriber:
-            _set_result(future, Unreachable(_NO_SUBSCRIBER))
+            # The broker may report this before `publish` has returned the number.
+            why = self._not_delivered.pop(number, None)
+        if why is not None:
+            _set_result(future, Unreachable(why))
         return number
 
-    def _no_subscriber(self, number: int) -> None:
+    def _undelivered(self, number: int, why: str) -> None:
+        why = why or _NO_SUBSCRIBER
         with self._lock:
             future = self._published.get(number)
             if future is None:
-                self._without_subscriber.add(number)
+                self._not_delivered[number] = why
         if future is not None:
-            _set_result(future, Unreachable(_NO_SUBSCRIBER))
+            _set_result(future, Unreachable(why))
 
     def _message(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
         """Handle a response, or the news that a twin is gone; ignore anything else."""

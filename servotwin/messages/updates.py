@@ -30,6 +30,7 @@ class Reason(StrEnum):
     SUPERSEDED = "a newer update came before it could be applied"
     AFTER_FALLBACK = "too soon after a fallback"
     FELL_BACK = "the edge fell back meanwhile"
+    TAKEN_OVER = "another edge of the servo has taken over"
     NOT_KNOWN = "needs what this edge does not know"
 
 

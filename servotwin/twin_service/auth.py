@@ -367,11 +367,15 @@ def read_secret(path: Path) -> str:
 def _check_private(path: Path) -> None:
     """Refuse a file that others than its owner may read or write; raises InvalidInput."""
     try:
-        mode = stat.S_IMODE(path.stat().st_mode)
+        mode = path.stat().st_mode
     except OSError as error:
         raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
+    if stat.S_ISDIR(mode):
+        raise InvalidInput(f"{path}: is a folder; give the name of a file")
     if mode & 0o077:
-        raise InvalidInput(f"{path}: has mode {mode:04o}, so that others may open it; make it 0600: chmod 600 {path}")
+        raise InvalidInput(
+            f"{path}: has mode {stat.S_IMODE(mode):04o}, so that others may open it; make it 0600: chmod 600 {path}"
+        )
 
 
 def write_private(path: Path, text: str) -> None:

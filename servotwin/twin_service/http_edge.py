@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from servotwin import __version__
 from servotwin.link.seal import TO_EDGE, key_of, seal
 from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, encode
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import OutgoingMessage, PutResult
 from servotwin.twin_service.auth import EdgeGate
 from servotwin.twin_service.claims import EdgeClaims
@@ -105,7 +106,7 @@ class LongPolls:
         Raises
         ------
         RequestRejected
-            TOO_MANY polls wait.
+            TOO_MANY polls wait. UNAVAILABLE: the store cannot be read.
         """
         if self.open >= self._limit:
             raise RequestRejected(Refusal.TOO_MANY, f"{self._limit} polls wait already")
@@ -142,7 +143,10 @@ class LongPolls:
         # Where other processes post too, only the store knows.
         if not self._shared and after >= self._empty_after.get(servo, _NEVER):
             return ()
-        messages = await self._read(servo, after)
+        try:
+            messages = await self._read(servo, after)
+        except StoreUnavailable:
+            raise RequestRejected(Refusal.UNAVAILABLE, "the store cannot be read now") from None
         # A message that was posted while the store was read may not be in what was read.
         if not messages and notifications == self._notifications[servo]:
             self._empty_after[servo] = after

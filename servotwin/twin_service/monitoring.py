@@ -25,7 +25,7 @@ _SECONDS = (0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0
 _WATCHED = ("alarm", "failed", "fallback", "withdrawn")
 """Kinds of evidence that an operator must see."""
 _POSTED = ("taken", "refused", "dropped")
-_REFUSAL_LINES, _REFUSAL_LINES_PER_S = 100.0, 1.0
+_MOST_LINES, _LINES_PER_S = 100.0, 1.0
 _Labels = tuple[str, ...]
 _STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message", "taskName"}
 """Attributes that every log record has."""
@@ -107,10 +107,32 @@ class Histogram:
         yield Sample(below, suffix="_count")
 
 
-class RefusalLog:
-    """Log lines of refused requests: of each code the first hundred, then one a second.
+class _LineLimit:
+    """Limit of log lines of one kind: the first hundred, then one a second.
 
-    Whoever sends refused requests in a loop, a stranger too, must not fill the disk with lines; all are counted.
+    Whoever makes the service write lines in a loop, a stranger too, must not fill the disk with them.
+    """
+
+    def __init__(self, monotonic: Callable[[], float]) -> None:
+        self._monotonic = monotonic
+        self._lines: dict[str, tuple[float, float]] = {}
+        self._omitted = collections.Counter[str]()
+
+    def take(self, kind: str) -> int | None:
+        """Return how many lines of a kind were omitted before the present one; None: omit this one too."""
+        now = self._monotonic()
+        lines, at = self._lines.get(kind, (_MOST_LINES, now))
+        lines = min(_MOST_LINES, lines + _LINES_PER_S * (now - at))
+        written = lines >= 1.0
+        self._lines[kind] = lines - written, now
+        if written:
+            return self._omitted.pop(kind, 0)
+        self._omitted[kind] += 1
+        return None
+
+
+class RefusalLog:
+    """Log lines of refused requests, limited for each code; all are counted.
 
     Parameters
     ----------
@@ -120,22 +142,30 @@ class RefusalLog:
     """
 
     def __init__(self, log: logging.Logger, monotonic: Callable[[], float] = time.monotonic) -> None:
-        self._log, self._monotonic = log, monotonic
-        self._lines: dict[str, tuple[float, float]] = {}
-        self._omitted = collections.Counter[str]()
+        self._log, self._limit = log, _LineLimit(monotonic)
 
     def write(self, code: str, **about: Any) -> None:
         """Write a line, or count it; the next line of the code tells how many were `omitted`."""
-        log, now = self._log, self._monotonic()
-        lines, at = self._lines.get(code, (_REFUSAL_LINES, now))
-        lines = min(_REFUSAL_LINES, lines + _REFUSAL_LINES_PER_S * (now - at))
-        written = lines >= 1.0
-        self._lines[code] = lines - written, now
-        if not written:
-            self._omitted[code] += 1
-            return
-        omitted = {"omitted": self._omitted.pop(code)} if code in self._omitted else {}
-        log.info("refused", extra={**about, "code": code, **omitted})
+        log, omitted = self._log, self._limit.take(code)
+        if omitted is not None:
+            log.info("refused", extra={**about, "code": code, **({"omitted": omitted} if omitted else {})})
+
+
+class _ServerLines(logging.Filter):
+    """Limits the lines of the HTTP server, one of which any bytes that are no request cause."""
+
+    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+        super().__init__()
+        self._limit = _LineLimit(monotonic)
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Let a line pass, with the number of those `omitted` before it."""
+        if not record.name.startswith("uvicorn"):
+            return True
+        omitted = self._limit.take(str(record.msg))
+        if omitted:
+            record.omitted = omitted
+        return omitted is not None
 
 
 class Metrics:
@@ -207,6 +237,7 @@ def configure_logging(level: str, stream: TextIO | None = None) -> logging.Handl
     """
     handler = logging.StreamHandler(stream or sys.stderr)
     handler.setFormatter(_JsonLines())
+    handler.addFilter(_ServerLines())
     service = logging.getLogger("servotwin")
     service.setLevel(level.upper())
     server = logging.getLogger("uvicorn")

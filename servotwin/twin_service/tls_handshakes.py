@@ -16,7 +16,7 @@ from typing import Any, cast
 _HANDSHAKE_S = 10.0
 """s for a handshake: a few round trips, and its turn among those of all edges after an outage."""
 _BUFFERED = 64 * 1024
-"""Bytes that may come with the end of a handshake, before the connection's protocol is there."""
+"""Bytes that came with the end of a handshake, from which nothing more is read until the connection is handed on."""
 
 
 class TlsHandshakes:
@@ -76,9 +76,10 @@ class _Handshake(asyncio.Protocol):
         self._handshakes, self._options = handshakes, options
         self._early, self._ended = bytearray(), False
         self._task: asyncio.Task[None] | None = None
+        self._accepted: asyncio.Transport | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        accepted = cast(asyncio.Transport, transport)
+        accepted = self._accepted = cast(asyncio.Transport, transport)
         if not self._handshakes.enter(accepted):
             accepted.abort()
             return
@@ -87,8 +88,9 @@ class _Handshake(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         self._early += data
-        if len(self._early) > _BUFFERED:
-            self._ended = True  # the handshake's task closes it
+        # An edge sends a window of any size right after its handshake, and the loop may be busy meanwhile.
+        if len(self._early) > _BUFFERED and self._accepted is not None:
+            self._accepted.pause_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002
         self._ended = True
@@ -115,6 +117,8 @@ class _Handshake(asyncio.Protocol):
         protocol.connection_made(encrypted)
         if self._early:
             protocol.data_received(bytes(self._early))
+        if self._accepted is not None:
+            self._accepted.resume_reading()
 
 
 def address_of(transport: asyncio.BaseTransport) -> str:

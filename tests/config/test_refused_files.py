@@ -158,6 +158,16 @@ TOKEN = 'token_file = "token"\n'
         (f'[twin]\nurl = "mqtt://h"\n{TOKEN}user = "u"\npassword_file = "none"', "none: the password cannot be read"),
         ('[keep]\noutbox = "no/outbox.sqlite"', "[keep]: outbox = 'no/outbox.sqlite': there is no folder "),
         ('[keep]\nstatus = "/no/status.json"', "[keep]: status = '/no/status.json': there is no folder /no"),
+        ("[own]\nkp_v_per_m = 1.0", "edge.toml: [own] has gains, which need update_gains = true; set that, or"),
+        ("[start]\nkp_v_per_m = 1.0", "edge.toml: [start] has gains, which need update_gains = true; set that, or"),
+        ('[keep]\noutbox = ""', "[keep]: outbox = '': is a folder; give the name of a file"),
+        ('[keep]\nstatus = "boots"', "[keep]: boots = 'boots': is status; give another name"),
+        ('[keep]\nstatus = "edge.toml"', "[keep]: status = 'edge.toml': is this file itself; give another name"),
+        (
+            f'[twin]\nurl = "https://h"\n{TOKEN}[keep]\nboots = "./token"',
+            "boots = './token': is token_file; give another",
+        ),
+        ('[twin]\nurl = "https://h"\ntoken_file = ""', ": holds no token: it is a folder"),
     ],
 )
 def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, expected: str) -> None:

@@ -79,8 +79,12 @@ def test_an_edge_that_was_superseded_drops_the_update_that_waits(fallback: Fallb
     assert agent.receive(update(1, 0, 1.0)) == []
     receipt, *rest = (out.message for out in agent.superseded())
     assert isinstance(receipt, Receipt)
-    assert (receipt.version, receipt.reason) == (1, Reason.AFTER_FALLBACK if fallback is None else Reason.FELL_BACK)
+    assert (receipt.version, receipt.reason) == (1, Reason.TAKEN_OVER if fallback is None else Reason.FELL_BACK)
     assert len(rest) == (fallback is not None)
+    # One that was on its way already, and would be applied otherwise.
+    [late] = (out.message for out in agent.receive(update(7, agent.parameters.version, agent.time)))
+    assert isinstance(late, Receipt)
+    assert (late.version, late.reason) == (7, Reason.TAKEN_OVER)
     feed(agent, 5.0)
     assert agent.parameters.version == (0 if fallback is None else 2)
 

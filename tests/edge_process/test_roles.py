@@ -30,6 +30,7 @@ from servotwin.messages import (
     Cause,
     Fallback,
     Probe,
+    Reason,
     Receipt,
     Request,
     Setting,
@@ -208,6 +209,24 @@ def test_parameters_in_force_are_carried_into_a_new_boot(far: LinkEnd) -> None:
         pass
     assert edge.agent.settings.boot == "b0.2"
     assert edge.counts == {"boot: samples missing": 1, "boot: machine counts anew": 1}
+
+
+def test_an_edge_that_was_superseded_takes_no_update_in_a_later_boot_either(far: LinkEnd) -> None:
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    edge = edge_of(box)
+    role = ControlRole(edge, ScriptedDrive([*samples(0, 5), *samples(1000, 5)]))
+    far.send(frames.SupersededFrame())
+    for _ in range(7):
+        role.step()
+    far.send(frames.MessageFrame(1, encode(update(1, 1e-4, boot="b0.1"))))
+    for _ in range(3):
+        role.step()
+    assert (edge.agent.settings.boot, edge.agent.parameters.version) == ("b0.1", 0)
+    exchange_all(box)
+    (receipt,) = letters(far, Receipt)
+    assert isinstance(receipt, Receipt)
+    assert receipt.reason is Reason.TAKEN_OVER
 
 
 @pytest.mark.parametrize("then", [samples(1000, 3), [DriveSample(15, 1e-3, 0.0, math.nan), *samples(16, 3)]])

@@ -60,7 +60,7 @@ def test_the_rules_that_the_guide_shows_are_enough_and_keep_others_out(tmp_path:
         with twin(twins, store), edge(edges, wait_s=0.1) as here, edge(edges, "axis-2", timeout_s=1.0) as other:
             here.deliver(parcel(0))
             assert here.listen(0) == []
-            with pytest.raises(Unreachable):
+            with pytest.raises(Unreachable, match=r"the broker refuses what this user sends \(Not authorized\)"):
                 other.deliver(parcel(0, "axis-2"))
     assert (kept(store), kept(store, "axis-2")) == ([0], [])
 

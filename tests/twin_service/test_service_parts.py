@@ -5,6 +5,8 @@ import io
 import json
 import logging
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 from hypothesis import given
@@ -12,6 +14,7 @@ from hypothesis import strategies as st
 
 from servotwin.messages import Refusal
 from servotwin.runtime.prometheus import metric_lines
+from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import OutgoingMessage
 from servotwin.twin_service.http_edge import LongPolls
 from servotwin.twin_service.http_server import BodyReader
@@ -189,22 +192,29 @@ def test_metrics_are_prometheus_text():
     assert len({line for line in text.splitlines() if line.startswith("# TYPE")}) == text.count("# TYPE")
 
 
+@contextmanager
+def logged(stream: io.StringIO) -> Iterator[None]:
+    """The service's logging, into `stream`."""
+    handler = configure_logging("info", stream)
+    try:
+        yield
+    finally:
+        for name in ("servotwin", "uvicorn"):
+            logging.getLogger(name).removeHandler(handler)
+            logging.getLogger(name).propagate = True
+            logging.getLogger(name).setLevel(logging.NOTSET)
+
+
 def test_a_log_line_is_one_json_object_whatever_it_holds():
     stream = io.StringIO()
-    handler = configure_logging("info", stream)
     log = logging.getLogger("servotwin.test")
-    try:
+    with logged(stream):
         log.info("a\nb", extra={"servo": "x\ny", "number": math.nan, "thing": object()})
         log.debug("unseen")
         try:
             raise ValueError("it")
         except ValueError:
             log.exception("bad")
-    finally:
-        for name in ("servotwin", "uvicorn"):
-            logging.getLogger(name).removeHandler(handler)
-            logging.getLogger(name).propagate = True
-            logging.getLogger(name).setLevel(logging.NOTSET)
     first, second = (json.loads(line) for line in stream.getvalue().splitlines())
     assert (first["message"], first["servo"], first["level"], first["where"]) == (
         "a\nb",
@@ -213,6 +223,18 @@ def test_a_log_line_is_one_json_object_whatever_it_holds():
         "servotwin.test",
     )
     assert "ValueError: it" in second["exception"]
+
+
+def test_a_flood_of_bytes_that_are_no_request_writes_few_lines():
+    stream = io.StringIO()
+    with logged(stream):
+        for _ in range(5000):
+            logging.getLogger("uvicorn.error").warning("Invalid HTTP request received.")
+        logging.getLogger("uvicorn.error").warning("Unsupported upgrade request.")
+        logging.getLogger("servotwin.test").warning("another")
+    lines = [json.loads(line)["message"] for line in stream.getvalue().splitlines()]
+    assert len(lines) == 102
+    assert lines[-2:] == ["Unsupported upgrade request.", "another"]
 
 
 def test_a_flood_of_refusals_writes_few_lines_and_tells_how_many_it_left_out(caplog):
@@ -230,6 +252,15 @@ def test_a_flood_of_refusals_writes_few_lines_and_tells_how_many_it_left_out(cap
     first, second = caplog.records[101:]
     assert (first.servo, first.omitted) == ("ax-2", 4900)
     assert not hasattr(second, "omitted")
+
+
+def test_a_poll_of_a_store_that_is_away_is_refused_for_now():
+    async def away(*_args):
+        raise StoreUnavailable("not available now (connection refused)")
+
+    with pytest.raises(RequestRejected) as refused:
+        asyncio.run(LongPolls(away, 10).messages("ax-1", 0, 0.0))
+    assert refused.value.refusal is Refusal.UNAVAILABLE
 
 
 def test_polls_read_the_store_only_when_there_may_be_a_message():

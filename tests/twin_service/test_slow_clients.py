@@ -1,7 +1,9 @@
 """Clients that never finish: handshakes, heads and bodies are bounded in time, and handshakes in number."""
 
 import asyncio
+import socket
 import ssl
+import time
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
@@ -128,6 +130,33 @@ def test_a_handshake_that_never_finishes_is_cut(tmp_path: Path, monkeypatch: pyt
             writer.close()
         assert b" 503 " in await health(address, trusted)  # no workers here
         assert server.handshakes == 0
+
+    serving(tmp_path, service, body)
+
+
+def window_at_once(address: tuple[str, int], trusted: ssl.SSLContext, size: int) -> bytes:
+    """First line of the answer to a body that is sent with the end of the handshake."""
+    with (
+        socket.create_connection(address, PATIENCE) as plain,
+        trusted.wrap_socket(plain, server_hostname=address[0]) as line,
+    ):
+        line.sendall(PUT + f"\r\nContent-Length: {size}\r\n\r\n".encode() + b"x" * size)
+        return line.recv(4096).partition(b"\r\n")[0]
+
+
+@pytest.mark.parametrize("size", [1000, 300_000, 2_000_000])
+def test_a_window_right_after_the_handshake_arrives_whatever_its_size(tmp_path: Path, size: int) -> None:
+    service, trusted = tls(tmp_path)
+
+    async def busy() -> None:
+        while True:
+            time.sleep(0.05)  # so that the end of the handshake and the window are read together
+            await asyncio.sleep(0.0)
+
+    async def body(_server: HttpServer, address: tuple[str, int]) -> None:
+        other = asyncio.create_task(busy())
+        assert b" 400 " in await asyncio.to_thread(window_at_once, address, trusted, size)
+        other.cancel()
 
     serving(tmp_path, service, body)
 
