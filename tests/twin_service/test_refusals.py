@@ -10,7 +10,7 @@ from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, hello, serve
 
 from servotwin.twin_service import limits, refusals
 
-SLOW, CLIENTS, LASTS = 0.3, 5, 1.5
+SLOW, CLIENTS, LASTS = 0.3, 5, 0.9
 MOST = 100 + round(10 * LASTS) + CLIENTS * (round(LASTS / SLOW) + 1)
 """Refusals that are answered at once, and those of clients that each wait for the one before."""
 
