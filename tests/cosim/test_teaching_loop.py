@@ -91,6 +91,7 @@ def test_where_it_is_not_allowed_nothing_moves_and_one_alarm_says_what_to_do(
     assert any(sentence in alarm for sentence in needed)
 
 
+@pytest.mark.slow
 def test_a_window_that_tells_too_little_for_another_reason_does_not_lack_the_ratio() -> None:
     """One step touches one flank: moves of different lengths are not what is missing."""
     once = stage(TUNED_ON[0], duration=10.0)
