@@ -14,6 +14,7 @@ from servotwin.messages import Receipt, Setting, Update, decode, encode
 from servotwin.twin_service.http_server import HttpServer, listening_socket
 
 
+@pytest.mark.slow
 def test_a_crowd_sends_every_window_until_it_is_acknowledged_and_notes_that(tmp_path: Path) -> None:
     """Two servos, and a token that the twin refuses; the twin is away for a while."""
 

@@ -22,7 +22,7 @@ def kinds(loop: Loop) -> list[tuple[str, bool]]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("seed", "number"), explored([*TUNED_ON, *NOT_TUNED_ON], 0, 2, 3))
+@pytest.mark.parametrize(("seed", "number"), explored([*TUNED_ON, *NOT_TUNED_ON], 0, 2))
 def test_moves_of_different_lengths_are_requested_once_and_every_later_window_tells_the_gap(
     seed: int, number: int
 ) -> None:
@@ -81,7 +81,8 @@ ADVICE = "move by different lengths once"
 def test_where_it_is_not_allowed_nothing_moves_and_one_alarm_says_what_to_do(
     excitation: ExcitationSettings | None, probe: ProbeLimits | None, words: str, outcomes: list[RequestOutcome]
 ) -> None:
-    loop, alarms = stage(TUNED_ON[1], excitation, probe, duration=34.0).run_with_alarms()
+    duration = 34.0 if outcomes else 22.0  # an edge's answer takes a window or two; one more comes after the alarm
+    loop, alarms = stage(TUNED_ON[1], excitation, probe, duration=duration).run_with_alarms()
     assert kinds(loop) == [("reference", False)] * len(loop.windows)
     assert [answer.outcome for answer in loop.answers] == outcomes
     (alarm,) = [sentence for sentence in alarms if ADVICE in sentence]
@@ -90,6 +91,7 @@ def test_where_it_is_not_allowed_nothing_moves_and_one_alarm_says_what_to_do(
     assert any(sentence in alarm for sentence in needed)
 
 
+@pytest.mark.slow
 def test_a_window_that_tells_too_little_for_another_reason_does_not_lack_the_ratio() -> None:
     """One step touches one flank: moves of different lengths are not what is missing."""
     once = stage(TUNED_ON[0], duration=10.0)

@@ -24,6 +24,7 @@ def page_file(tmp_path_factory):
     return folder / "gap.html"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("theme", ["light", "dark"])
 @pytest.mark.parametrize(("width", "columns"), [(360, 1), (768, 2), (1440, 2)])
 def test_nothing_is_cut_off(browser, page_file, width, columns, theme):

@@ -280,6 +280,7 @@ def test_probing_moves_are_refused_where_the_drive_cannot_make_them(edge: Runnin
     assert "edge.toml: edge.probe: this drive cannot move its reference" in edge.log()
 
 
+@pytest.mark.slow
 def test_a_second_edge_on_the_same_files_is_refused_and_the_first_goes_on(
     edge: RunningEdge, machine: StubMachine
 ) -> None:

@@ -97,6 +97,7 @@ def test_an_agent_that_was_superseded_falls_back_once_and_says_why() -> None:
     assert agent.superseded() == []
 
 
+@pytest.mark.slow
 def test_a_twin_gets_windows_again_a_full_disk_is_said_and_a_corrupt_outbox_is_logged(
     tmp_path: Path, twin: FakeTwin, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -29,6 +29,7 @@ longest_s = 0.1
 [twin]
 url = "http://127.0.0.1:{port}"
 token_file = "token"
+wait_s = 0.2
 """
 PATIENCE = 60.0
 

@@ -49,6 +49,7 @@ def estimated(name: str, units: AxisUnits) -> tuple[Run, GapEstimate]:
     return run, estimate_gap(Window.from_run(run, half, 2.0 * half), axis)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MOVES)
 @pytest.mark.parametrize("units", UNITS)
 def test_an_axis_in_other_units_moves_and_is_estimated_alike(name: str, units: AxisUnits) -> None:

@@ -102,6 +102,7 @@ def test_too_few_samples_of_a_swing_are_refused_with_the_rate_that_is_needed() -
     Commissioning(semi, law, twin, recording).check_window()
 
 
+@pytest.mark.slow
 def test_a_motor_that_turns_sharply_between_samples_is_refused() -> None:
     """Of a gap that is small beside what the samples leave open of the motor's place."""
     law = DRIVE.pidf.replace(Kp=2.0, Kd=0.3, Tf=0.005, sample_rate=150.0)

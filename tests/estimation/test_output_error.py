@@ -119,6 +119,7 @@ def test_a_load_that_friction_holds_does_not_creep() -> None:
         assert bool(np.any(moved.position != 0.0)) is moves
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "force", "errors"), [(0.0, 3.0, (2e-3, 1e-4)), (4.0, 3.0, (2.5e-3, 6e-4))])
 def test_friction_and_gravity_act_on_the_load(friction: float, force: float, errors: tuple[float, float]) -> None:
     """What holds the load, or turns its speed round, is seen between parts of a sample only: that is the error."""
@@ -133,6 +134,7 @@ def test_friction_and_gravity_act_on_the_load(friction: float, force: float, err
     assert abs(estimate.gap - 0.03) < 0.01 * 0.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("axis", "gap"), [(TWO_MASS, 0.03), (UNDAMPED, 0.1), (TWO_LOADS, 0.03), (HARDLY_DAMPED, 0.1)])
 def test_the_gap_of_a_free_shaft_is_found_without_noise(axis: Axis, gap: float) -> None:
     estimate = estimate_gap(recorded(axis, gap), axis)
@@ -200,6 +202,7 @@ def test_a_gap_of_five_micrometres_shows_in_counts_of_a_tenth() -> None:
     assert estimate.interval[0] < gap < estimate.interval[1]
 
 
+@pytest.mark.slow
 def test_one_flank_gives_a_lower_bound() -> None:
     time = np.arange(2000) / 1000.0
     angle = np.where(time < 1.0, time, 2.0 - time)
@@ -210,6 +213,7 @@ def test_one_flank_gives_a_lower_bound() -> None:
     assert math.isinf(estimate.interval[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("start", "duration"), [(11.0, 8.0), (5.0, 12.0)])
 def test_a_load_that_hangs_from_one_flank_does_not_show_a_gap_of_zero(start: float, duration: float) -> None:
     """With a gap of zero, friction and damping of other sizes explain the window within a fifth of a count."""
@@ -228,6 +232,7 @@ def test_a_load_that_hangs_from_one_flank_does_not_show_a_gap_of_zero(start: flo
     assert estimate.interval[0] <= 0.036
 
 
+@pytest.mark.slow
 def test_one_flank_is_found_where_a_gap_of_zero_and_its_noise_hide_it() -> None:
     """The load's mass is 12 % and its damping 25 % off; the motor pushes it against a spring and a constant force."""
     axis = Axis(

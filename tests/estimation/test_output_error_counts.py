@@ -26,6 +26,7 @@ from servotwin.plant.signals import Array, SquareWave
 from servotwin.simulation import simulate
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("far", [55.2e-6, 70e-6])
 def test_a_motor_that_creeps_through_its_gap_repeats_one_error_of_rounding(far: float) -> None:
     """The load rests at one count meanwhile: taken for many small errors these said 3.03 +- 0.05 deg for 3.6."""
@@ -122,6 +123,7 @@ def test_a_lag_of_straight_lines_is_exact() -> None:
     assert np.array_equal(lagged(kinked, 0.0), kinked)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("motion", "seed"), [(_sine, [9012, 1]), (_moves, [9011, 2])])
 def test_a_lag_between_the_encoders_is_not_taken_for_gap(motion: Callable[..., Array], seed: list[int]) -> None:
     """Not fitted, a lag of 5 ms left these gaps 4.1 +- 1.1 % and 2.9 +- 0.9 % off."""
@@ -181,6 +183,7 @@ def test_a_motor_that_creeps_in_noise_tells_its_gap_no_better_than_ratio_and_del
     assert estimate.interval[0] <= gap <= estimate.interval[1]
 
 
+@pytest.mark.slow
 def test_the_best_fit_in_noise_is_one_of_many_gaps() -> None:
     axis = Axis.preset("stepper-stage")
     window, gap = _counted(_creep, 304, noise=2.0, off=True)

@@ -26,6 +26,7 @@ def screw(kind: str = "none") -> tuple[float, Window]:
     return gap, window
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "words"),
     [

@@ -60,6 +60,7 @@ def test_the_statistic_of_jitter_has_the_stated_distribution_in_white_noise() ->
         assert np.mean(np.greater(tests, value)) == pytest.approx(1.0 - quantile, rel=0.35)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [1e-9, 1e-7, 1e-5])
 def test_friction_leaves_the_motion_smooth_in_every_number(step: float) -> None:
     """A load that was held, or was not, by rounding made jumps of a thousandth of the gap: derivatives were up to a

@@ -46,6 +46,7 @@ def test_a_sensor_that_errs_with_its_way_widens_the_interval_and_nothing_else_do
     assert wrong.interval[0] <= gap <= wrong.interval[1]
 
 
+@pytest.mark.slow
 def test_slow_motion_that_may_hide_all_of_the_gap_is_refused() -> None:
     axis = Axis.preset("ball-screw")
     gap = 2e-5 / axis.p

@@ -214,6 +214,7 @@ def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -
             here.deliver(parcel(0))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", [wire.request_topic, wire.response_topic])
 def test_a_broker_that_swaps_its_clients_topics_loses_nothing_and_brings_no_update_to_the_wrong_edge(
     server: Mosquitto, store: Store, monkeypatch: pytest.MonkeyPatch, way: Callable[[str], str]
@@ -301,6 +302,7 @@ def test_without_a_broker_the_twin_is_unreachable() -> None:
         here.deliver(parcel(0))
 
 
+@pytest.mark.slow
 def test_a_second_edge_of_a_servo_takes_over_over_a_broker_too(server: Mosquitto, store: Store) -> None:
     at = Broker(server.url)
     with twin(at, store) as there, edge(at, run="b1-aa") as first, edge(at, run="b1-bb") as second:

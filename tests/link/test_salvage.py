@@ -148,6 +148,7 @@ def test_windows_that_are_only_in_the_log_are_rescued(
     box.close()
 
 
+@pytest.mark.slow
 def test_a_large_outbox_is_rescued_in_little_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     samples, windows = 30_000, 120  # 55 kB each
     path = tmp_path / "outbox.sqlite"

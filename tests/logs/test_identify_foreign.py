@@ -124,6 +124,7 @@ def test_a_stated_travel_that_is_not_the_log_s_is_refused(tmp_path, made, option
     assert re.search(message, " ".join(result.stderr.split()))
 
 
+@pytest.mark.slow
 def test_dates_of_files_and_of_one_day_are_no_wear(tmp_path):
     logs = [
         csv(tmp_path / f"{place}.csv", rows(recording(gap=gap, ratio=RATIO, seconds=8.0, rate=100.0)))
@@ -147,6 +148,7 @@ def test_dates_of_files_and_of_one_day_are_no_wear(tmp_path):
     assert "its load is in mm" in mixed.stderr
 
 
+@pytest.mark.slow
 def test_a_page_of_the_gap(tmp_path, made):
     log = csv(tmp_path / "log <b>.csv", rows(made))
     result = CliRunner().invoke(app, ["identify", str(log), "--page", str(tmp_path / "gap.html")])

@@ -140,6 +140,7 @@ def test_the_chosen_setting_is_verified_alone_while_the_question_is_nearly_the_s
     assert searches.count == 2
 
 
+@pytest.mark.slow
 def test_the_chosen_setting_follows_the_friction_as_it_becomes_known(monkeypatch: pytest.MonkeyPatch) -> None:
     def evidence(friction: float, **more: object) -> Evidence:
         std = 1.5e-3

@@ -67,6 +67,7 @@ def test_a_setting_is_verified_and_its_certificate_is_stored(axis: st.Axis) -> N
     assert _decoder.decode(_encoder.encode(stored)) == stored
 
 
+@pytest.mark.slow
 def test_the_box_of_the_edge_admits_every_candidate_and_not_much_more(axis: st.Axis) -> None:
     twin = TwinSettings(policy="certified", uncertainty=KNOWN, demands=FEW)
     guarded = Commissioning(axis, axis.controller, twin).guarding

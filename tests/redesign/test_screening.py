@@ -131,6 +131,7 @@ def test_after_the_first_the_settings_that_settle_most_surely_are_verified() -> 
     assert tried(Screening(question), [*plain, *far], far) == [*plain[:3], *far[:3]]
 
 
+@pytest.mark.slow
 def test_a_refusal_names_the_largest_step_that_would_allow_what_friction_leaves() -> None:
     """`gantry` in steps of up to 2.5 mm: friction of 1.56 N m holds 750 N m/m 2.08 mm off, less what is fed forward; a
     tenth of the step may be left, and two counts."""

@@ -53,6 +53,7 @@ def pieces(signal: SignalLike) -> PiecewiseCubic:
     return PiecewiseCubic.constant(signal) if isinstance(signal, float) else signal.pieces(2.0)
 
 
+@pytest.mark.slow
 @examples(40, deadline=None)
 @given(
     rate=st.sampled_from(RATES),

@@ -31,6 +31,7 @@ def old(store: Store, today: float, keep: float = 30.0) -> int:
     return count
 
 
+@pytest.mark.slow
 def test_without_gaps_age_is_the_time_since_the_receipt(store: Store) -> None:
     filled(store, [0.5 * n for n in range(100)])
     assert old(store, 50.0) == 40  # the one of day 20 is just as old as is kept

@@ -79,6 +79,7 @@ def test_a_gap_that_moved_is_estimated_at_once(moved: float) -> None:
     assert ("axis", "boot-1", 11) not in twin.log.estimates
 
 
+@pytest.mark.slow
 def test_what_triage_remembers_is_part_of_the_state() -> None:
     whole, twin = fed(new(), windows(GAP)), fed(new(), windows(GAP)[:3])
     reborn = fed(Twin("axis", twin.model, twin.log, twin.state()), windows(GAP)[3:])
@@ -86,6 +87,7 @@ def test_what_triage_remembers_is_part_of_the_state() -> None:
     assert reborn.log.glances == whole.log.glances
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("unknowns", [(), (0.015, 0.0)])
 def test_unknowns_of_another_version_or_model_are_not_used(unknowns: tuple[float, ...]) -> None:
     """The window is estimated, and its unknowns serve the next."""

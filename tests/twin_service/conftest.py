@@ -8,9 +8,19 @@ import httpx
 import pytest
 from service_system import served, twin_file
 
+from servotwin.twin_service import http_edge, refusals
 from servotwin.twin_service.service import TwinService
 
 Body = Callable[[TwinService, httpx.AsyncClient], Coroutine[Any, Any, None]]
+
+
+@pytest.fixture(scope="module")
+def no_pause_for_refused():
+    """Refused requests are answered at once, where a test is not about who is held back for how long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(refusals, "_SLOW_S", 0.0)
+        patch.setattr(http_edge, "REFUSED_POLL_S", 0.0)
+        yield
 
 
 @pytest.fixture

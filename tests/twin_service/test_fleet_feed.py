@@ -236,6 +236,7 @@ def test_a_page_that_does_not_read_counts_and_is_cut_off(tmp_path, monkeypatch, 
     with_service(tmp_path, body)
 
 
+@pytest.mark.slow
 def test_a_process_of_its_own_reads_what_changed_and_a_thread_where_it_is_lost(tmp_path):
     async def body(system, client):
         await asyncio.to_thread(say_hello, system.store, "ax-1", 5.0)

@@ -69,6 +69,7 @@ async def answered(app: Any, scope: dict[str, Any], parts: list[bytes]) -> tuple
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_pause_for_refused")
 @given(st.lists(requests(), min_size=1, max_size=40))
 @examples(15, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_malformed_request_is_answered_in_the_form_of_the_api(tmp_path_factory, requested):

@@ -10,11 +10,12 @@ from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, hello, serve
 
 from servotwin.twin_service import limits, refusals
 
-SLOW, CLIENTS, LASTS = 0.3, 5, 1.5
+SLOW, CLIENTS, LASTS = 0.3, 5, 0.9
 MOST = 100 + round(10 * LASTS) + CLIENTS * (round(LASTS / SLOW) + 1)
 """Refusals that are answered at once, and those of clients that each wait for the one before."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "path", "token"),
     [
@@ -59,6 +60,7 @@ def test_whoever_repeats_a_refused_request_is_slowed_down(
     asyncio.run(body())
 
 
+@pytest.mark.slow
 def test_beside_a_flood_another_sender_waits_for_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Strangers and the edge come from one address; what tells them apart is the edge's token."""
     monkeypatch.setattr(refusals, "_SLOW_S", SLOW)

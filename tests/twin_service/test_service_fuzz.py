@@ -113,6 +113,7 @@ def test_decompression_gives_no_more_than_is_allowed(data, encoding, whole):
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("no_pause_for_refused")
 @given(st.text(max_size=100), st.text(max_size=40))
 @examples(25, deadline=None)
 def test_headers_and_queries(tmp_path_factory, header, query):

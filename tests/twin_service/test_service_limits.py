@@ -6,6 +6,7 @@ import time
 import zlib
 
 import httpx
+import pytest
 from service_requests import code, put
 from service_system import OTHER, TOKEN, bearer, hello, place, unpacked, window
 
@@ -16,6 +17,7 @@ from servotwin.twin_service import http_edge
 from servotwin.twin_service.limits import RateLimiter
 
 
+@pytest.mark.usefixtures("no_pause_for_refused")
 def test_a_stranger_who_knocks_in_a_loop_does_not_fill_the_log(serving, caplog):
     caplog.set_level("INFO")
 

@@ -116,6 +116,7 @@ def test_a_session_counts_as_authenticated_and_a_forged_one_does_not(
     serving(tmp_path, "unauthenticated_per_address = 1", body)
 
 
+@pytest.mark.slow
 def test_connections_without_a_token_are_bounded_in_all_and_one_address_has_half_of_the_places(tmp_path: Path) -> None:
     async def body(connect: Connect) -> None:
         first, second = await connect(""), await connect("")
@@ -148,6 +149,7 @@ def test_without_tokens_and_behind_a_proxy_no_connection_is_limited(tmp_path: Pa
     assert asyncio.run(limit("", True)) is not None
 
 
+@pytest.mark.slow
 def test_a_servos_token_holds_a_bounded_number_of_connections_and_the_newest_live(tmp_path: Path) -> None:
     async def body(connect: Connect) -> None:
         held = [await connect(TOKEN) for _ in range(4)]

@@ -98,10 +98,15 @@ class FitProblem(Protocol):
 
 
 def whitened_rows(
-    problem: FitProblem, values: Array, noise: Autoregression, free: Flags, rate: float = 0.0
+    problem: FitProblem,
+    values: Array,
+    noise: Autoregression,
+    free: Flags,
+    rate: float = 0.0,
+    misfit: Array | None = None,
 ) -> tuple[Array, Array, Array]:
-    """Whitened residual (M,) and its derivatives (u, M), the prior's at the end, and the misfit."""
-    steps, raw = _STEP * problem.sizes(), problem.misfit(values, rate)
+    """Whitened residual (M,) and its derivatives (u, M), the prior's at the end, and the `misfit`, known or not."""
+    steps, raw = _STEP * problem.sizes(), problem.misfit(values, rate) if misfit is None else misfit
     table = np.zeros((values.size + 1, raw.size))
     table[0] = raw
     for i in np.flatnonzero(free):
@@ -149,7 +154,8 @@ def descend(
             move = (ahead - values) @ rows
             if -float(move @ (2.0 * residual + move)) <= max(_GAIN / residual.size, least_gain) * cost:
                 return Fit(values, residual, rows, cost, raw, count)
-            white = noise.whiten(problem.misfit(ahead, rate)[None])[0]
+            misfit = problem.misfit(ahead, rate)
+            white = noise.whiten(misfit[None])[0]
             prior = problem.model.root @ ahead
             after, count = float(white @ white + prior @ prior), count + 1
             better = after < cost
@@ -157,7 +163,7 @@ def descend(
         if not better:
             break
         values = ahead
-        residual, rows, raw = whitened_rows(problem, values, noise, free, rate)
+        residual, rows, raw = whitened_rows(problem, values, noise, free, rate, misfit)
         cost = float(residual @ residual)
     return Fit(values, residual, rows, cost, raw, count)
 

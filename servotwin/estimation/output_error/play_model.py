@@ -81,9 +81,10 @@ class PlayModel:
 
 
 def lagged(values: Array, samples: float) -> Array:
-    """A signal (N,) behind a first-order lag of a number of samples, straight between them."""
-    out = np.empty(values.size)
-    decay = math.exp(-1.0 / samples) if samples > 0.0 else 0.0
+    """A signal (N,) behind a first-order lag of a number of samples, straight between them; itself without a lag."""
+    if not samples > 0.0:
+        return values
+    out, decay = np.empty(values.size), math.exp(-1.0 / samples)
     slope = samples * (1.0 - decay)
     out[0] = values[0]
     lag(values, decay, 1.0 - slope, slope - decay, out)

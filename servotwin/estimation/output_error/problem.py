@@ -23,6 +23,7 @@ _WIDE = 5.0  # of the lead's range
 _SLOW = 0.1  # of the motor's largest speed
 _MOVED, _FEWEST = 0.02, 8  # of the window: what shows the first speed; samples
 _ON_A_LINE = 1.5  # times the noise, or a count: what a line leaves of them
+_REMEMBERED = 2  # delays: that of the unknowns, and the moved one of their derivatives
 _SHARPEST = 0.1  # of the window: larger parts in which the motor's speed jumps are its usual motion
 
 
@@ -90,19 +91,33 @@ class Problem:
 
         The motor's angle is delayed in place of the position: the load's motion begins with the first sample.
         """
-        drive = delayed(self.drive, float(values[DELAY]) / self.interval)
-        return self.model.simulate(drive, self.position, self.interval, values, rate)
+        return self.model.simulate(self._late_drive(values), self.position, self.interval, values, rate)
 
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
-        drive = delayed(self.drive, float(values[DELAY]) / self.interval)
-        return self._less_measured(self.model.position(drive, self.position, self.interval, values, rate))
+        return self._less_measured(
+            self.model.position(self._late_drive(values), self.position, self.interval, values, rate)
+        )
 
     def misfit_in_growing_gap(self, values: Array, sizes: Array) -> Array:
         """`misfit` (m,) of a model without dynamics whose gap has `sizes` (N,), shares of the one in the unknowns."""
         assert isinstance(self.model, PlayModel)
-        drive = delayed(self.drive, float(values[DELAY]) / self.interval)
+        drive = self._late_drive(values)
         return self._less_measured(self.model.position_in_growing_gap(drive, self.interval, values, sizes))
+
+    def _late_drive(self, values: Array) -> Array:
+        """Motor (N,) as late as the unknowns (u,) say; most derivatives move another unknown than the delay."""
+        samples, known = float(values[DELAY]) / self.interval, self._late
+        if samples not in known:
+            if len(known) == _REMEMBERED:
+                known.pop(next(iter(known)))
+            known[samples] = delayed(self.drive, samples)
+        return known[samples]
+
+    @cached_property
+    def _late(self) -> dict[float, Array]:
+        """The motor (N,) as late by numbers of samples, the last few."""
+        return {}
 
     def _less_measured(self, position: Array) -> Array:
         """A model's position (N,) less the measured one, (m,)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -84,33 +85,73 @@ def judge(
         Standard deviation of the noise of the motor's angle beyond its counts, at the load (m or rad), where nothing
         smooths it.
     """
-    best, problem = found.best, found.problem
-    half, std = float(best.values[HALF]), math.hypot(best.std(HALF, found.free), rounded(found))
+    known = _known_half(found, settings, unit, possible, jitter)
+    likely = found.best.values if possible is None else possible.unknowns
+    mismatches = _mismatches(found, likely, settings.gap_rate / unit, settings.model_share * known.half)
+    if mismatches:
+        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
+    bounded = _bounded(found, known)
+    if bounded is not None:
+        return bounded
+    allowed = _allowed(found, known.half, settings)
+    doubts, explained = _doubts(found, known, allowed, unit)
+    if not doubts:
+        return JudgedFit(GapStatus.OK, known.half, known.std, explained)
+    ratio = None
+    if possible is not None and known.std > allowed:
+        ratio = _unknown_ratio(found, possible, settings, allowed, unit)
+    reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
+    return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, known.std, known.total, reasons, ratio)
+
+
+class _KnownHalf(NamedTuple):
+    """Half gap with its standard deviation, statistical and in total, m or rad at the load."""
+
+    half: float
+    std: float
+    total: float
+
+
+def _known_half(
+    found: Search, settings: OutputErrorSettings, unit: float, possible: PossibleHalf | None, jitter: float
+) -> _KnownHalf:
+    half, std = float(found.best.values[HALF]), math.hypot(found.best.std(HALF, found.free), rounded(found))
     if possible is not None:
         half, std = possible.mean, math.hypot(std, possible.std)
     std *= settings.calibration
     growth = grown(found, settings.gap_rate / unit)
-    floor = 0.5 * _ROUNDED * problem.count
+    floor = 0.5 * _ROUNDED * found.problem.count
     total = math.hypot(_DOUBT * std, settings.model_share * half, floor, growth, _RATCHET * jitter)
-    likely = best.values if possible is None else possible.unknowns
-    mismatches = _mismatches(found, likely, settings.gap_rate / unit, settings.model_share * half)
-    if mismatches:
-        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
+    return _KnownHalf(half, std, total)
+
+
+def _bounded(found: Search, known: _KnownHalf) -> JudgedFit | None:
+    """Decide on a window that one flank explains nearly as well as two; None: it does not."""
+    best, count = found.best, found.problem.count
     singles = [one_flank(found)]
-    if half <= NORMAL_95 * total:
+    if known.half <= NORMAL_95 * known.total:
         singles += one_flank_without_a_gap(found)
     single = min(singles, key=lambda fit: fit.cost)
-    if (single.cost - best.cost) / best.variance() < _BELIEVED or any(_alike(found, fit) for fit in singles):
-        bound = _BOUND * 2.0 * smallest_half(found, single) - problem.count
-        enough = bound > _BOUND_COUNTS * problem.count
-        words = "one flank explains the window nearly as well as two"
-        status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
-        return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
-    allowed = _allowed(found, half, settings)
-    model = problem.model
-    friction = model.hidden_friction(best.values) if isinstance(model, ShaftModel) else 0.0
+    rise = (single.cost - best.cost) / best.variance()
+    if not (rise < _BELIEVED or any(_alike(found, fit) for fit in singles)):
+        return None
+    bound = _BOUND * 2.0 * smallest_half(found, single) - count
+    enough = bound > _BOUND_COUNTS * count
+    words = "one flank explains the window nearly as well as two"
+    status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
+    return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
+
+
+def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tuple[tuple[str, ...], float]:
+    """List what speaks against a half gap, and its standard deviation with all that the model leaves.
+
+    `allowed` (m or rad at the load) is a standard deviation.
+    """
+    half, std, total = known
+    model = found.problem.model
+    friction = model.hidden_friction(found.best.values) if isinstance(model, ShaftModel) else 0.0
     left, times = unexplained(found), time_jitter(found)
-    found_doubts = (
+    doubts = (
         _wide(std, allowed, unit),
         _rival(found, half, total, unit),
         _hidden(found, half),
@@ -118,14 +159,9 @@ def judge(
         _of_slow_motion(left, half, allowed, unit),
         _of_jitter(times, allowed, unit),
     )
-    doubts = tuple(filter(None, found_doubts))
-    if not doubts:
-        contact = moved_by_contact(found)
-        explained = math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
-        return JudgedFit(GapStatus.OK, half, std, explained)
-    ratio = None if possible is None or std <= allowed else _unknown_ratio(found, possible, settings, allowed, unit)
-    reasons = doubts if ratio is None else (*doubts, _not_told(ratio))
-    return JudgedFit(GapStatus.UNIDENTIFIABLE, math.nan, std, total, reasons, ratio)
+    contact = 0.0 if any(doubts) else moved_by_contact(found)
+    explained = math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
+    return tuple(filter(None, doubts)), explained
 
 
 def _alike(found: Search, single: Fit) -> bool:

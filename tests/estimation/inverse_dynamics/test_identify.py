@@ -70,6 +70,7 @@ def test_the_band_is_that_of_the_motion():
     assert fit["inertia"] == pytest.approx(PARAMETERS["inertia"], rel=0.02)
 
 
+@pytest.mark.slow
 def test_intervals_hold_under_friction_that_no_model_has():
     """Cyclic friction, drift and knocks: two hundred seeds gave 94 to 100 %."""
     seeds = range(50, 90)

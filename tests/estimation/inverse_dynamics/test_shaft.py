@@ -34,6 +34,7 @@ def test_a_gap_makes_the_shaft_seem_softer():
     assert 0.94 * true < shaft.resonance < 0.99 * true
 
 
+@pytest.mark.slow
 def test_a_late_encoder_is_told_from_elasticity():
     whole = elastic()
     places = np.arange(whole.load.size)

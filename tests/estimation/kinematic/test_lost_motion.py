@@ -53,6 +53,7 @@ def test_a_load_that_runs_ahead_of_its_motor_is_doubted():
     assert estimate_lost_motion(recording(lag=-2e-3)).ok
 
 
+@pytest.mark.slow
 def test_a_long_lag_of_a_fast_motion_is_no_wind_up_by_acceleration():
     # Its column is right to first order; what is left was taken for wind-up, and gap and wind-up looked alike.
     found = estimate_lost_motion(recording(lag=12e-3, speed=4.0, rate=1000.0, seconds=60.0))
@@ -110,6 +111,7 @@ def test_a_short_recording_gives_no_false_bound(shift):
     assert found.interval_motor[0] <= 0.2 <= found.interval_motor[1]
 
 
+@pytest.mark.slow
 def test_a_swinging_load_is_no_gap():
     # A resonance in place of a gap: y'' + 2 d w y' + w^2 y = w^2 r m.
     time, motor = swings()
@@ -165,6 +167,7 @@ def test_play_is_the_play_operator_from_the_first_contact_on():
     assert set(np.unique(side)) == {-1, 0, 1}
 
 
+@pytest.mark.slow
 def test_intervals_cover():
     # Errors that are neither white nor Gaussian: a random walk of the offset, a cyclic error, counts.
     inside = accepted = 0
