@@ -219,7 +219,5 @@ class Fallback(Struct, frozen=True, tag="fallback/2"):
     setting: Setting
 
     def __post_init__(self) -> None:
-        require(
-            all_finite((self.measured, self.allowed, self.setting.tolerance)),
-            "fallback measured, allowed and tolerance must be finite",
-        )
+        require(all_finite((self.measured, self.allowed)), "fallback measured and allowed must be finite")
+        require(self.setting.has_valid_tolerance(), f"fallback tolerance {self.setting.tolerance} m is not allowed")

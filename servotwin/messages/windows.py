@@ -207,9 +207,9 @@ class Hello(Struct, frozen=True, tag="hello/2"):
     protocol: Count = 1
 
     def __post_init__(self) -> None:
-        require(
-            all_finite((self.time, self.rate, self.setting.tolerance)), "hello time, rate and tolerance must be finite"
-        )
+        require(isfinite(self.time), f"hello time {self.time} s is not finite")
+        require(isfinite(self.rate) and self.rate > 0.0, f"hello rate {self.rate} Hz is not positive")
+        require(self.setting.has_valid_tolerance(), f"hello tolerance {self.setting.tolerance} m is not allowed")
 
 
 class Acknowledge(Struct, frozen=True, tag="ack/1"):

@@ -93,6 +93,19 @@ def test_a_response_that_no_structure_has_is_refused(changes: dict[str, Any], wo
         msgspec.structs.replace(RESPONSE, **changes)
 
 
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"time": math.nan}, "time nan s is not finite"),
+        ({"rate": 0.0}, "rate 0.0 Hz is not positive"),
+        ({"setting": Setting(-1.0)}, "tolerance -1.0 m is not allowed"),
+    ],
+)
+def test_a_hello_of_no_machine_is_refused(changes: dict[str, Any], words: str) -> None:
+    with pytest.raises(InvalidMessage, match=words):
+        msgspec.structs.replace(HELLO, **changes)
+
+
 def test_a_window_has_an_identity() -> None:
     w = window()
     assert w.identity == ("axis-1", "b0", 4)
