@@ -149,7 +149,10 @@ class OneContact:
         aligned = self.learnt.aligned
         at = np.array([*self._beside.point, *self._beside.factors])
         ramp = fastest(aligned.whitened.reduction, self.fitted.second)
-        return way_doubt(self.learnt.problem, at, max(1.0, aligned.whitened.variance), aligned.delay, ramp)
+        return math.hypot(
+            way_doubt(self.learnt.problem, at, max(1.0, aligned.whitened.variance), aligned.delay, ramp),
+            self.learnt.way_moved(at, self.fitted.settings.calibration),
+        )
 
 
 @dataclass(frozen=True)

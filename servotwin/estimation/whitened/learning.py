@@ -38,6 +38,7 @@ from servotwin.plant.signals import Array
 _TURNS = 5
 _STILL = 0.1  # standard deviations of a factor: a smaller move needs no other turn
 _TOGETHER = 5.0  # spreads: as unlikely for four factors as LARGEST is for one
+_GAP_ROW, _PLACE_ROW = 0, 1  # of the derivatives
 _AT_END = 1e-3  # of the range of a factor
 _SHOWN = 1.0  # information on the softness beyond what is usual of it: below, the window says nothing
 _MOST_KNOWN = 1e7  # of the softness: no number of windows tells it better than to 0.0003
@@ -52,7 +53,7 @@ class WindowSoftness(NamedTuple):
     value, information : float
         The structure's stiffness over the screw's, and one over its variance in noise of variance 1.
     slope : float
-        rad, change of the gap per softness, the model's factors moving along.
+        Change of the gap (rad), or of the place, per softness, the model's factors moving along.
     """
 
     value: float
@@ -135,14 +136,26 @@ class LearntFit:
 
     @cached_property
     def _softness(self) -> WindowSoftness:
-        """The screw's softness as this window alone shows it.
+        """The screw's softness as this window alone shows it."""
+        return self._softness_at(np.array([*self.free.point, *self.free.factors]), _GAP_ROW)
+
+    def way_moved(self, at: Array, calibration: float) -> float:
+        """Root mean square (rad) of what the softness does to the motor's way to the only contact of a window.
+
+        `at` (6,) is a point in so wide a gap that the window has no other contact.
+        """
+        soft, scale = self._softness_at(at, _PLACE_ROW), self.scale(calibration)
+        return 0.5 * float(at[0]) * soft.moved(self.problem.prior.softness, scale)
+
+    def _softness_at(self, at: Array, first: int) -> WindowSoftness:
+        """The screw's softness as this window alone shows it, and its effect on gap or place (`first` row).
 
         With what earlier windows told of the factors it would show none: on a rigid screw, these took it up.
         """
         usual = FactorPrior.of_spreads(*FREEDOM)
         problem = replace(self.problem, prior=usual, compliance=COMPLIANCE)
-        residual, rows = problem.rows(np.array([*self.free.point, *self.free.factors]), keep=True)
-        solved = least_squares(rows, residual)
+        residual, rows = problem.rows(at, keep=True)
+        solved = least_squares(rows[first:], residual)
         covariance = solved.root.T @ solved.root
         variance = float(covariance[-1, -1])
         # Without what is usual of it, which is part of the solution and must not count with every window.
