@@ -37,6 +37,7 @@ from servotwin.plant.servo import Servo
 _AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
 _SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
 _WITHIN = 0.25  # standard deviations per growth within a window, which its one contact hardly tells from the way to it
+_PITCH = 0.002  # least standard deviation of the pitch: noise and cyclic errors of the angle bend it beyond its own
 _ROUNDED = math.sqrt(1.0 / 12.0)  # of a count, at each contact
 
 
@@ -230,7 +231,7 @@ def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
 
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
-    pitch = math.sqrt(here.learnt.problem.prior.covariance[PITCH, PITCH])
+    pitch = max(_PITCH, math.sqrt(here.learnt.problem.prior.covariance[PITCH, PITCH]))
     level = here.begin.std / here.gain
     return math.hypot(here.way_std + level, before.std, here.rounded, pitch * moved)
 
