@@ -22,6 +22,7 @@ from servotwin.edge.guard import Limits
 from servotwin.edge.parameters import FallbackSet, Parameters
 from servotwin.edge.settings import Supervision
 from servotwin.edge.watch import WatchSettings
+from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.messages import Gains, LinearGains, Setting
@@ -170,7 +171,17 @@ def _candidates(policy: CertifiedPolicy, demands: Demands) -> list[AnyController
         found = learnt_servo(servo, known, prior, None)
         if found is not None:
             asked.append((found[0], narrowed(ranges, found[1]), wanted))
-    return [each.controller for one in asked for each in candidates_of(*one, True, False)]
+    return [law for number, one in enumerate(asked) for law in _laws(*one, needed=number == 0)]
+
+
+def _laws(servo: Plant, known: Uncertainty, demands: Demands, needed: bool) -> list[AnyController]:
+    """Laws of the candidates for a question; none where no law is within the bounds, unless they are `needed`."""
+    try:
+        return [each.controller for each in candidates_of(servo, known, demands, True, False)]
+    except InvalidInput:
+        if needed:
+            raise
+        return []
 
 
 def _range(values: list[float]) -> tuple[float, float]:

@@ -26,6 +26,10 @@ SHORT = Recording(window=1.0, pre_trigger=0.0, longest_window=2.0, longest_pre_t
 PROBED = Recording(probe=ProbeLimits(2e-4, 20.0))
 MAY_PROBE = ExcitationSettings(probe=2e-4, interval=30.0)
 SMALL = SquareWave(2e-5, 20.0)  # steps of 0.04 mm: 7.2 deg of the screw, within the gap
+# Steps upwards only, of 2 and of 0.04 mm: two contacts on the same side show no gap.
+UPWARDS, SMALL_UPWARDS = (
+    Samples([0.0, 10.0, 20.0, 30.0, 40.0], [n * size for n in range(1, 6)]) for size in (2e-3, 4e-5)
+)
 
 
 def calm(excitation: ExcitationSettings | None, rate: float | None = None, **changes: object) -> Scenario:
@@ -59,7 +63,7 @@ def test_short_windows_without_pre_trigger_lead_to_longer_ones_and_to_the_gap(ra
 
 def test_an_edge_that_refuses_longer_windows_gets_no_second_request() -> None:
     short = Recording(window=1.0, pre_trigger=0.0)
-    loop = cosimulate(calm(ExcitationSettings(), recording=short, reference=SquareWave(1e-3, 20.0), duration=50.0))
+    loop = cosimulate(calm(ExcitationSettings(), recording=short, reference=UPWARDS, duration=50.0))
     assert [answer.outcome for answer in loop.answers] == [RequestOutcome.TOO_LARGE]
     assert not any(estimate.ok for estimate in loop.estimates)
     last = loop.excitations[-1].reason
@@ -107,12 +111,20 @@ def test_what_a_probing_move_showed_spares_the_next_one() -> None:
 def test_where_it_is_not_allowed_nothing_moves_and_the_reason_is_kept(
     settings: ExcitationSettings, recording: Recording, words: str, requests: int
 ) -> None:
-    loop = cosimulate(calm(settings, recording=recording, reference=SMALL, duration=36.0))
+    loop = cosimulate(calm(settings, recording=recording, reference=SMALL_UPWARDS, duration=36.0))
     assert {window.reason for window in loop.windows} == {"reference"}
     assert not any(estimate.ok for estimate in loop.estimates)
     assert len(loop.requests) == requests
     assert loop.excitations[-1].reason.endswith(words)
-    assert set(np.round(np.abs(loop.run.reference), 12)) == {2e-5}
+    assert np.array_equal(loop.run.reference, SMALL_UPWARDS.pieces(36.0).on(loop.run.time))
+
+
+@pytest.mark.slow
+def test_steps_to_and_fro_within_the_gap_show_it_without_a_probing_move() -> None:
+    loop = cosimulate(calm(ExcitationSettings(), recording=PROBED, reference=SMALL, duration=36.0))
+    assert [estimate.ok for estimate in loop.estimates] == [False, False, False, True]
+    assert error(loop, 3) < 0.02
+    assert loop.excitations[-1].reason == "the window shows the gap"
 
 
 def test_nothing_is_requested_unless_configured() -> None:
