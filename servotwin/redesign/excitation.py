@@ -153,6 +153,8 @@ class WindowSummary:
         m, root mean square of what the estimate leaves unexplained; NaN: not known.
     taught : bool
         True where it told the ratio.
+    unconfirmed : bool
+        True where its contact and that of the window before show a gap for the first time.
     """
 
     time: float
@@ -163,6 +165,7 @@ class WindowSummary:
     ratio: UnknownRatio | None = None
     noise: float = math.nan
     taught: bool = False
+    unconfirmed: bool = False
 
 
 @dataclass(frozen=True)
@@ -249,6 +252,10 @@ class ExcitationPolicy:
             return self._window(state)
         if state.misses < self.settings.after:
             return Decision(state, None, self._missed(state))
+        if window.unconfirmed:
+            return Decision(
+                state, None, f"{self._missed(state)}, but two contacts show it: the next one may confirm it"
+            )
         return self._probe(state, window)
 
     def needed(self, window: WindowSummary) -> float:

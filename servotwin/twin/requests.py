@@ -132,10 +132,10 @@ class Requests:
             state = RequestState(boot=window.boot, excitation=state.excitation.rebooted(), attempts=state.attempts)
         long = window.reason in (PROBE, TEACHING) or long_enough(*_extent(window), self.policy.settings)
         upper = min(self.widest, widest, estimate.interval[1])
-        taught = estimate.ok and estimate.machine is not None
-        summary = WindowSummary(
-            now, estimate.status, long, upper, _slack(in_force), estimate.ratio, estimate.rms, taught
-        )
+        taught, contact = estimate.ok and estimate.machine is not None, estimate.contact
+        first = contact is not None and contact.between is not None and math.isnan(contact.between.rate)
+        slack, ratio = _slack(in_force), estimate.ratio
+        summary = WindowSummary(now, estimate.status, long, upper, slack, ratio, estimate.rms, taught, first)
         decision = self.policy.decide(state.excitation, summary)
         state = replace(state, excitation=decision.state)
         if estimate.ok and state.pending is not None and isinstance(state.pending.ask, Probe):

@@ -73,7 +73,7 @@ def test_an_edge_that_refuses_longer_windows_gets_no_second_request() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("rate", [None, 1000.0])
 def test_steps_within_the_gap_lead_to_a_probing_move_and_to_the_gap(rate: float | None) -> None:
-    loop = cosimulate(calm(MAY_PROBE, rate, recording=PROBED, reference=SMALL, duration=19.0))
+    loop = cosimulate(calm(MAY_PROBE, rate, recording=PROBED, reference=SMALL_UPWARDS, duration=19.0))
     assert [kind for kind, _ in kinds(loop)] == ["reference", "reference", "probe"]
     assert [status is GapStatus.OK for _, status in kinds(loop)] == [False, False, True]
     (request,) = loop.requests
@@ -86,13 +86,13 @@ def test_steps_within_the_gap_lead_to_a_probing_move_and_to_the_gap(rate: float 
     moved = loop.run.reference - loop.scenario.reference.pieces(19.0).on(loop.run.time)
     first, hold = loop.answers[0].sample, round(0.85 * 5000.0)
     assert np.array_equal(np.flatnonzero(np.abs(moved) > 1e-9), np.arange(first, first + hold))
-    assert np.max(np.abs(loop.run.position)) < 2e-5 + 1.2 * request.ask.size
+    assert np.max(np.abs(loop.run.position)) < 8e-5 + 1.2 * request.ask.size
 
 
 @pytest.mark.slow
 def test_what_a_probing_move_showed_spares_the_next_one() -> None:
     """It tells the encoder's offset too, with which the small steps show the gap in one contact."""
-    loop = cosimulate(calm(MAY_PROBE, recording=PROBED, reference=SMALL, duration=50.0))
+    loop = cosimulate(calm(MAY_PROBE, recording=PROBED, reference=SMALL_UPWARDS, duration=50.0))
     assert len(loop.requests) == 1
     assert [status is GapStatus.OK for _, status in kinds(loop)] == [False, False, True, True, True, True]
     assert all(error(loop, index) < 5e-3 for index in range(2, 6))
@@ -124,7 +124,9 @@ def test_steps_to_and_fro_within_the_gap_show_it_without_a_probing_move() -> Non
     loop = cosimulate(calm(ExcitationSettings(), recording=PROBED, reference=SMALL, duration=36.0))
     assert [estimate.ok for estimate in loop.estimates] == [False, False, False, True]
     assert error(loop, 3) < 0.02
-    assert loop.excitations[-1].reason == "the window shows the gap"
+    reasons = [each.reason for each in loop.excitations]
+    assert reasons[1].endswith("but two contacts show it: the next one may confirm it")
+    assert reasons[3] == "the window shows the gap"
 
 
 def test_nothing_is_requested_unless_configured() -> None:
@@ -133,8 +135,8 @@ def test_nothing_is_requested_unless_configured() -> None:
 
 
 WHILE_PROBING: list[tuple[float, SignalLike]] = [
-    (14.0, Samples([0.0, 10.0, 14.0], [2e-5, -2e-5, 1e-4])),
-    (14.0002, Samples([0.0, 10.0, 14.0002, 14.0004], [2e-5, -2e-5, 1e-4, 5e-5])),
+    (14.0, Samples([0.0, 10.0, 14.0], [2e-5, 6e-5, 1e-4])),
+    (14.0002, Samples([0.0, 10.0, 14.0002, 14.0004], [2e-5, 6e-5, 1e-4, 5e-5])),
 ]
 
 

@@ -52,6 +52,15 @@ def test_a_lower_bound_counts_as_too_little_information() -> None:
     assert asks(ALLOWED, [replace(SHORT, status=GapStatus.LOWER_BOUND), SHORT])[-1] == LongerWindow(2.0, 0.3)
 
 
+def test_a_probing_move_waits_for_the_window_that_may_confirm_what_two_contacts_show() -> None:
+    first = replace(LONG, unconfirmed=True)
+    waits, asked = run(ALLOWED, [LONG, first, LONG])[1:]
+    assert waits.ask is None
+    assert waits.reason.endswith("but two contacts show it: the next one may confirm it")
+    assert isinstance(asked.ask, Probe)
+    assert isinstance(asks(ALLOWED, [replace(SHORT, unconfirmed=True)] * 2)[1], LongerWindow)
+
+
 @pytest.mark.parametrize("status", [GapStatus.OK, GapStatus.MODEL_MISMATCH])
 def test_an_estimate_and_a_model_mismatch_reset_the_count(status: GapStatus) -> None:
     assert asks(ALLOWED, [SHORT, replace(SHORT, status=status), SHORT]) == [None] * 3
