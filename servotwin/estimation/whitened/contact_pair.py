@@ -36,6 +36,7 @@ from servotwin.plant.servo import Servo
 
 _AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
 _SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
+_VAGUE = 2.0  # times the largest standard deviation of an estimate
 _WITHIN = 0.25  # standard deviations per growth within a window, which its one contact hardly tells from the way to it
 _ROUNDED = math.sqrt(1.0 / 12.0)  # of a count, at each contact
 
@@ -66,6 +67,8 @@ class OneContact:
         Fit of one contact in the widest gap, with the machine free within what is known of it.
     begin, end : _Touch
         On this side, with the screw where it was at first and at last.
+    apart : float
+        rad, between the way to the contact of `single` and that of `fitted`, whose level the positions are.
     """
 
     fitted: WindowFit
@@ -74,6 +77,7 @@ class OneContact:
     single: FreeFit
     begin: _Touch
     end: _Touch
+    apart: float
 
     @classmethod
     def of(cls, fitted: WindowFit, servo: Servo, machine: FactorPrior | None) -> OneContact | None:
@@ -212,9 +216,11 @@ def pair(here: OneContact, before: LastContact | None) -> Pair:
     moved = (here.begin.position - before.position) / here.gain
     gap, std = before.side * (before.motor + moved - here.begin.motor), _spread(here, before, moved)
     between = _followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
-    contact, earlier = replace(contact, between=between), before.between
+    earlier, settings = before.between, here.fitted.settings
+    # What is known so badly confirms no other gap.
+    contact = replace(contact, between=between if std <= _VAGUE * settings.largest_std else earlier)
     bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(between.rate - earlier.rate)
-    possible = NORMAL_95 * here.fitted.settings.gap_rate * (here.begin.time - before.time)
+    possible = NORMAL_95 * settings.gap_rate * (here.begin.time - before.time)
     if reason := _against(here, between, possible) or _unconfirmed(between, earlier, possible):
         return Pair(contact, None, reason, between, bend)
     assert earlier is not None
@@ -231,8 +237,9 @@ def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
     pitch = math.sqrt(here.learnt.problem.prior.covariance[PITCH, PITCH])
-    level = here.begin.std / here.gain
-    return math.hypot(here.way_std + level, before.std, here.rounded, pitch * moved)
+    way, level = here.way_std, here.begin.std / here.gain
+    unsure = max(0.0, here.apart - NORMAL_95 * way)
+    return math.hypot(way + level, unsure, before.std, here.rounded, pitch * moved)
 
 
 def _against(here: OneContact, between: GapBetween, possible: float) -> str:
@@ -265,8 +272,9 @@ def _stated(here: OneContact, before: LastContact, now: GapBetween, earlier: Gap
     elapsed = now.time - earlier.time
     steady = 0.0 if math.isnan(earlier.rate) else max(0.0, earlier.rate) * elapsed
     # An encoder that slips, or a position that drifts to and fro, looks like growth once.
+    sudden = math.hypot(now.gap - earlier.gap - steady, earlier.std)
     within = _WITHIN * settings.gap_rate * fitted.window.duration
-    std = math.hypot(now.std, _SUDDEN * abs(now.gap - earlier.gap - steady), within)
+    std = math.hypot(now.std, _SUDDEN * sudden, within)
     total = math.hypot(std, settings.model_error, here.doubt())
     # The middle of both contacts, as if they were of one moment.
     levels = (before.position + here.begin.position) / here.gain - before.motor - here.begin.motor
@@ -299,8 +307,8 @@ def _fit_of(fitted: WindowFit) -> WhitenedFit:
     return fitted.aligned.whitened
 
 
-def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _Touch]:
-    """Contacts on a side with the screw where the window begins and where it ends, for the point of one contact."""
+def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _Touch, float]:
+    """`begin`, `end` and `apart` of a `OneContact`, for the point of one contact."""
     aligned, result, window = fitted.aligned, _fit_of(fitted), fitted.window
     assert aligned is not None
     reduction, gain = result.reduction, result.reduction.response.static_gain
@@ -309,10 +317,15 @@ def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _To
     traced = reduction.traced(single)
     screw = traced[SCREW] + excess * traced[BY_RATE]
     touched, furthest = int(np.argmax(traced[BY_START] == 0.0)), int(np.argmax(side * reduction.theta_m))
-    half = 0.5 * (single.gap + (reduction.rate + excess) * (touched - 0.5 * (screw.size - 1)))
+    grown = (reduction.rate + excess) * (touched - 0.5 * (screw.size - 1))
+    at = float(screw[0]) + side * 0.5 * (single.gap + grown)
+    # The constant belongs to the fit's own way to the contact: a motion at first may hide some of it, and a short push
+    # the other way may come before.
+    fits = reduction.traced(result.point)
+    own = fits[SCREW] + excess * fits[BY_RATE]
+    apart = abs(float(own[0]) + side * 0.5 * (result.point.gap + grown) - at)
     # Both channels are counted from their first samples.
     level = float(window.position[max(aligned.shift, 0)] + result.shares[0])
-    begins = level + gain * 0.5 * result.point.gap * result.point.place
     begin, end = _level_stds(fitted, result)
     first = window.start + max(-aligned.shift, 0) / window.sample_rate
 
@@ -320,8 +333,9 @@ def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _To
         return _Touch(aligned.first + float(angle), first + sample / window.sample_rate, position, std)
 
     return (
-        touch(screw[0] + side * half, touched, begins, begin),
-        touch(reduction.theta_m[furthest], furthest, begins + gain * float(screw[-1] - screw[0]), end),
+        touch(at, touched, level + gain * float(own[0]), begin),
+        touch(reduction.theta_m[furthest], furthest, level + gain * side * float(np.max(side * own)), end),
+        apart,
     )
 
 
