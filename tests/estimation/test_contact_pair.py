@@ -149,6 +149,19 @@ def test_a_gap_that_is_hardly_known_confirms_none():
     assert slipped[1].contact.between.gap == pytest.approx(GAP + 1.0 * DEG, abs=0.01 * DEG)
 
 
+def test_a_gap_narrower_than_the_lead_of_the_motor_before_does_not_count():
+    """It closes by a degree between both windows, and two pairs of before show its mean by chance."""
+    closed = SCurve(GAP, GAP - 1.0 * DEG, 0.5, begin=15.0)
+    closing = simulate(CALM, 30.0, reference=SquareWave(2.5e-4, 20.0), gap=closed, theta_d0=0.2 * GAP, sample_rate=1e3)
+    first, second = noisy([Window.from_run(closing, start, 2.0) for start in STARTS[:2]])
+    contact = estimates([first])[0].contact
+    assert contact.lead == pytest.approx(GAP, abs=0.1 * DEG)
+    before = replace(contact, between=GapBetween(GAP - 0.5 * DEG, 0.001 * DEG, 5.0))
+    made = estimate_carrying(second, CALM, None, SETTINGS, None, KNOWN, before)
+    assert not made.ok
+    assert "the motor leads the screw by 28 deg" in made.reasons[-1]
+
+
 @pytest.mark.parametrize("slip", [-1.0, 1.0])
 def test_an_encoder_that_slips_between_two_windows_confirms_nothing(slip):
     """The pair that straddles the slip is off by it; neither it nor the next pair, which it contradicts, counts."""

@@ -136,7 +136,8 @@ class OneContact:
     def last(self) -> LastContact:
         """The contact for later windows."""
         std = math.hypot(self.end.std / self.gain, self.rounded)
-        return LastContact(self.side, self.end.motor, self.end.position, std, self.end.time)
+        lead = max(0.0, self.way - self.apart - NORMAL_95 * self.way_std)
+        return LastContact(self.side, self.end.motor, self.end.position, std, self.end.time, lead=lead)
 
     def shifted(self) -> float:
         """Change of the motor's way to the contact (rad) with the model free within its usual error, as far as the
@@ -221,7 +222,7 @@ def pair(here: OneContact, before: LastContact | None) -> Pair:
     contact = replace(contact, between=between if std <= _VAGUE * settings.largest_std else earlier)
     bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(between.rate - earlier.rate)
     possible = NORMAL_95 * settings.gap_rate * (here.begin.time - before.time)
-    if reason := _against(here, between, possible) or _unconfirmed(between, earlier, possible):
+    if reason := _against(here, between, before.lead, possible) or _unconfirmed(between, earlier, possible):
         return Pair(contact, None, reason, between, bend)
     assert earlier is not None
     return Pair(contact, replace(_stated(here, before, between, earlier), contact=contact), "", between, bend)
@@ -242,15 +243,19 @@ def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     return math.hypot(way + level, unsure, before.std, here.rounded, pitch * moved)
 
 
-def _against(here: OneContact, between: GapBetween, possible: float) -> str:
-    """Reason against the gap between two contacts, for a `possible` growth between them (rad); empty: none."""
+def _against(here: OneContact, between: GapBetween, lead: float, possible: float) -> str:
+    """Reason against the gap between two contacts, for a `possible` growth between them (rad); empty: none.
+
+    `lead`: of the motor in the window before, rad.
+    """
     settings = here.fitted.settings
     gap, least, widest = between.gap, -_AGREE * between.std, between.std * here.fitted.facts.caution
     if not widest <= settings.largest_std:
         return f"two contacts show the gap to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     # Half of the growth is on the side of the contact before, and the motor follows it.
-    if not gap >= max(here.way - 0.5 * possible, 0.0) + least:
-        return f"the motor leads the screw by {_deg(here.way)}, more than the {_deg(gap)} between two contacts"
+    if not gap >= max(here.way - 0.5 * possible, lead, 0.0) + least:
+        ahead = max(here.way, lead)
+        return f"the motor leads the screw by {_deg(ahead)}, more than the {_deg(gap)} between two contacts"
     if (shifted := here.shifted()) > settings.largest_shift:
         return f"with the model free the contact would move by {_deg(shifted)} more than its spread"
     return ""
