@@ -107,6 +107,8 @@ class LastContact:
         s, when the motor was there.
     between : GapBetween, optional
         The gap between the contact before, on the other side, and this one; None: there was none.
+    lead : float
+        rad, motor's way to this side in its window at least: the gap was no narrower.
     """
 
     side: float
@@ -115,6 +117,7 @@ class LastContact:
     std: float
     time: float
     between: GapBetween | None = None
+    lead: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from servotwin.estimation import whitened
+from servotwin.estimation.core.response import response
 from servotwin.estimation.estimate import CarriedOffset, GapBetween, GapEstimate, GapStatus, LastContact, OffsetReading
 from servotwin.estimation.learning.trend import TrendSettings
 from servotwin.estimation.learning.wear import Wear
@@ -15,7 +16,7 @@ from servotwin.estimation.whitened import estimate_carrying
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SCurve, SquareWave
+from servotwin.plant.signals import Samples, SCurve, SquareWave
 from servotwin.simulation import Run, simulate
 
 DEG = math.radians(1.0)
@@ -39,8 +40,12 @@ def run(worn: float = 0.0) -> Run:
 
 
 def windows(noise: float = 0.0, seed: int = 0, worn: float = 0.0) -> list[Window]:
+    return noisy([Window.from_run(run(worn), start, 2.0) for start in STARTS], noise, seed)
+
+
+def noisy(made: list[Window], noise: float = 1e-7, seed: int = 0) -> list[Window]:
+    """With white noise (m) on the position."""
     rng = np.random.default_rng(seed)
-    made = [Window.from_run(run(worn), start, 2.0) for start in STARTS]
     return [each.replace(position=each.position + noise * rng.standard_normal(each.position.size)) for each in made]
 
 
@@ -103,12 +108,58 @@ def test_moves_that_no_window_shows_change_nothing():
     assert made[-1].contact.between.gap == pytest.approx(GAP, abs=0.01 * DEG)
 
 
+@pytest.mark.parametrize("start", [9.7, 10.2, 10.4, 11.0])
+def test_where_the_screw_rests_is_told_by_windows_that_begin_in_a_move(start):
+    """Motions at first hide where the screw was then; where it is at last must not suffer from that."""
+    contact = estimates(noisy([Window.from_run(run(), start, 2.0)]), gap_rate=0.1 * DEG)[0].contact
+    screw = contact.motor - contact.side * 0.5 * GAP
+    assert contact.position / response(CALM, 1e3).static_gain == pytest.approx(screw, abs=3.0 * contact.std)
+
+
+def test_a_window_that_begins_with_a_short_push_the_other_way_shows_no_gap():
+    """The screw goes on by a quarter of a degree first, by which the way to the contact is too short."""
+    steps = Samples([0.0, 2.0, 10.0, 12.0], [0.0, 2.5e-4, -2.5e-4, 2.5e-4])
+    turned = simulate(CALM, 14.0, reference=steps, gap=GAP, theta_d0=0.2 * GAP, sample_rate=1e3)
+    first, second = estimates(noisy([Window.from_run(turned, 9.7, 2.25), Window.from_run(turned, 11.95, 2.0)]))
+    assert first.contact.side == -1.0
+    assert not second.ok
+    assert second.contact.between is None
+    assert "two contacts show the gap to" in second.reasons[-1]
+
+
 def test_two_pushes_the_same_way_show_no_gap():
     first, second, third, _ = windows()
     made = estimates([first, third, second])
     assert not any(each.ok for each in made)
     assert made[1].contact.between is None
     assert made[2].contact is not None
+
+
+def test_a_gap_that_is_hardly_known_confirms_none():
+    """The pair before is right by chance only: the next one, after a slip, must not rest on it."""
+    first, second, third, _ = windows()
+    contact = estimates([first])[0].contact
+    vague = replace(contact, motor=contact.motor - 1.0 * DEG, std=1.0 * DEG)
+    before, slipped = vague, []
+    for window in (second, third.replace(theta_m=third.theta_m - 1.0 * DEG)):
+        slipped.append(estimate_carrying(window, CALM, None, SETTINGS, None, KNOWN, before))
+        before = slipped[-1].contact
+    assert slipped[0].contact.between is None
+    assert not slipped[1].ok
+    assert slipped[1].contact.between.gap == pytest.approx(GAP + 1.0 * DEG, abs=0.01 * DEG)
+
+
+def test_a_gap_narrower_than_the_lead_of_the_motor_before_does_not_count():
+    """It closes by a degree between both windows, and two pairs of before show its mean by chance."""
+    closed = SCurve(GAP, GAP - 1.0 * DEG, 0.5, begin=15.0)
+    closing = simulate(CALM, 30.0, reference=SquareWave(2.5e-4, 20.0), gap=closed, theta_d0=0.2 * GAP, sample_rate=1e3)
+    first, second = noisy([Window.from_run(closing, start, 2.0) for start in STARTS[:2]])
+    contact = estimates([first])[0].contact
+    assert contact.lead == pytest.approx(GAP, abs=0.1 * DEG)
+    before = replace(contact, between=GapBetween(GAP - 0.5 * DEG, 0.001 * DEG, 5.0))
+    made = estimate_carrying(second, CALM, None, SETTINGS, None, KNOWN, before)
+    assert not made.ok
+    assert "the motor leads the screw by 28 deg" in made.reasons[-1]
 
 
 @pytest.mark.parametrize("slip", [-1.0, 1.0])

@@ -36,6 +36,7 @@ from servotwin.plant.servo import Servo
 
 _AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
 _SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
+_VAGUE = 2.0  # times the largest standard deviation of an estimate
 _WITHIN = 0.25  # standard deviations per growth within a window, which its one contact hardly tells from the way to it
 _PITCH = 0.002  # least standard deviation of the pitch: noise and cyclic errors of the angle bend it beyond its own
 _ROUNDED = math.sqrt(1.0 / 12.0)  # of a count, at each contact
@@ -67,6 +68,8 @@ class OneContact:
         Fit of one contact in the widest gap, with the machine free within what is known of it.
     begin, end : _Touch
         On this side, with the screw where it was at first and at last.
+    apart : float
+        rad, between the way to the contact of `single` and that of `fitted`, whose level the positions are.
     """
 
     fitted: WindowFit
@@ -75,6 +78,7 @@ class OneContact:
     single: FreeFit
     begin: _Touch
     end: _Touch
+    apart: float
 
     @classmethod
     def of(cls, fitted: WindowFit, servo: Servo, machine: FactorPrior | None) -> OneContact | None:
@@ -133,7 +137,8 @@ class OneContact:
     def last(self) -> LastContact:
         """The contact for later windows."""
         std = math.hypot(self.end.std / self.gain, self.rounded)
-        return LastContact(self.side, self.end.motor, self.end.position, std, self.end.time)
+        lead = max(0.0, self.way - self.apart - NORMAL_95 * self.way_std)
+        return LastContact(self.side, self.end.motor, self.end.position, std, self.end.time, lead=lead)
 
     def shifted(self) -> float:
         """Change of the motor's way to the contact (rad) with the model free within its usual error, as far as the
@@ -156,42 +161,57 @@ class OneContact:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pair:
-    """Result of two contacts.
+    """The contact of a window, and the gap between it and the contact before, if that is on the other side.
 
     Attributes
     ----------
+    here : OneContact
     contact : LastContact
-        The later one, with the gap between both.
-    estimate : GapEstimate or None
-        None: the windows do not show the gap, or another one must confirm it.
-    reason : str
-        Why there is none; empty where there is no contact on the other side yet.
-    between : GapBetween or None
+        For later windows, with the gap.
+    before : LastContact or None
         None: there is no contact on the other side yet.
-    bend : float
-        rad/s, by which the growth has changed.
+    between : GapBetween or None
+        None without `before`.
     """
 
+    here: OneContact
     contact: LastContact
-    estimate: GapEstimate | None = None
-    reason: str = ""
+    before: LastContact | None = None
     between: GapBetween | None = None
-    bend: float = 0.0
 
-    def agrees(self, other: GapEstimate, gap_rate: float) -> bool:
+    @cached_property
+    def reason(self) -> str:
+        """Why the contacts show no gap, or another window must confirm it; empty: they do, or there is one only."""
+        if self.before is None or self.between is None:
+            return ""
+        possible = NORMAL_95 * self.here.fitted.settings.gap_rate * (self.here.begin.time - self.before.time)
+        against = _against(self.here, self.between, self.before.lead, possible)
+        return against or _unconfirmed(self.between, self.before.between, possible)
+
+    @property
+    def estimate(self) -> GapEstimate | None:
+        """Estimate of the gap by both contacts; None: they show none."""
+        if self.before is None or self.between is None or self.reason:
+            return None
+        assert self.before.between is not None
+        made = _stated(self.here, self.before, self.between, self.before.between)
+        return replace(made, contact=self.contact)
+
+    def agrees(self, other: GapEstimate) -> bool:
         """True where the contacts do not contradict another estimate of the same window.
 
-        `gap_rate`: assumed growth (rad/s), which counts where two contacts before have not shown it.
+        Where two contacts before have not shown the growth, the one that is assumed counts.
         """
-        seen = self.between
+        seen, earlier = self.between, None if self.before is None else self.before.between
         if seen is None:
             return True
         elapsed, spread = other.time - seen.time, _AGREE * math.hypot(other.std_total, seen.std)
         if math.isnan(seen.rate):
-            return abs(other.gap - seen.gap) <= spread + NORMAL_95 * gap_rate * elapsed
-        return abs(other.gap - seen.gap - seen.rate * elapsed) <= spread + self.bend * elapsed
+            return abs(other.gap - seen.gap) <= spread + NORMAL_95 * self.here.fitted.settings.gap_rate * elapsed
+        bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(seen.rate - earlier.rate)
+        return abs(other.gap - seen.gap - seen.rate * elapsed) <= spread + bend * elapsed
 
     def added_to(self, alone: GapEstimate) -> GapEstimate:
         """Another estimate of the later window, with the contact and, where it is not OK, the reason."""
@@ -200,26 +220,22 @@ class Pair:
 
 
 def pair(here: OneContact, before: LastContact | None) -> Pair:
-    """Estimate the gap from a window of one contact and the last contact of an earlier one on the other side.
+    """Find the gap between a window of one contact and the last contact of an earlier one on the other side.
 
-    The estimate belongs to the middle between both windows, because half of the gap is that of each. The contacts of a
-    third window must confirm it: the encoder may have slipped in between.
+    An estimate of it belongs to the middle between both contacts, because half of the gap is that of each. The contacts
+    of a third window must confirm it: the encoder may have slipped in between.
     """
     contact = here.last()
     if before is None or not before.time < here.begin.time:
-        return Pair(contact)
+        return Pair(here, contact)
     if before.side == here.side:
-        return Pair(replace(contact, between=before.between))
+        return Pair(here, replace(contact, between=before.between))
     moved = (here.begin.position - before.position) / here.gain
     gap, std = before.side * (before.motor + moved - here.begin.motor), _spread(here, before, moved)
     between = _followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
-    contact, earlier = replace(contact, between=between), before.between
-    bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(between.rate - earlier.rate)
-    possible = NORMAL_95 * here.fitted.settings.gap_rate * (here.begin.time - before.time)
-    if reason := _against(here, between, possible) or _unconfirmed(between, earlier, possible):
-        return Pair(contact, None, reason, between, bend)
-    assert earlier is not None
-    return Pair(contact, replace(_stated(here, before, between, earlier), contact=contact), "", between, bend)
+    # What is known so badly confirms no other gap.
+    vague = std > _VAGUE * here.fitted.settings.largest_std
+    return Pair(here, replace(contact, between=before.between if vague else between), before, between)
 
 
 def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
@@ -232,19 +248,24 @@ def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
     pitch = max(_PITCH, math.sqrt(here.learnt.problem.prior.covariance[PITCH, PITCH]))
-    level = here.begin.std / here.gain
-    return math.hypot(here.way_std + level, before.std, here.rounded, pitch * moved)
+    way, level = here.way_std, here.begin.std / here.gain
+    unsure = max(0.0, here.apart - NORMAL_95 * way)
+    return math.hypot(way + level, unsure, before.std, here.rounded, pitch * moved)
 
 
-def _against(here: OneContact, between: GapBetween, possible: float) -> str:
-    """Reason against the gap between two contacts, for a `possible` growth between them (rad); empty: none."""
+def _against(here: OneContact, between: GapBetween, lead: float, possible: float) -> str:
+    """Reason against the gap between two contacts, for a `possible` growth between them (rad); empty: none.
+
+    `lead`: of the motor in the window before, rad.
+    """
     settings = here.fitted.settings
     gap, least, widest = between.gap, -_AGREE * between.std, between.std * here.fitted.facts.caution
     if not widest <= settings.largest_std:
         return f"two contacts show the gap to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
     # Half of the growth is on the side of the contact before, and the motor follows it.
-    if not gap >= max(here.way - 0.5 * possible, 0.0) + least:
-        return f"the motor leads the screw by {_deg(here.way)}, more than the {_deg(gap)} between two contacts"
+    if not gap >= max(here.way - 0.5 * possible, lead, 0.0) + least:
+        ahead = max(here.way, lead)
+        return f"the motor leads the screw by {_deg(ahead)}, more than the {_deg(gap)} between two contacts"
     if (shifted := here.shifted()) > settings.largest_shift:
         return f"with the model free the contact would move by {_deg(shifted)} more than its spread"
     return ""
@@ -266,8 +287,9 @@ def _stated(here: OneContact, before: LastContact, now: GapBetween, earlier: Gap
     elapsed = now.time - earlier.time
     steady = 0.0 if math.isnan(earlier.rate) else max(0.0, earlier.rate) * elapsed
     # An encoder that slips, or a position that drifts to and fro, looks like growth once.
+    sudden = math.hypot(now.gap - earlier.gap - steady, earlier.std)
     within = _WITHIN * settings.gap_rate * fitted.window.duration
-    std = math.hypot(now.std, _SUDDEN * abs(now.gap - earlier.gap - steady), within)
+    std = math.hypot(now.std, _SUDDEN * sudden, within)
     total = math.hypot(std, settings.model_error, here.doubt())
     # The middle of both contacts, as if they were of one moment.
     levels = (before.position + here.begin.position) / here.gain - before.motor - here.begin.motor
@@ -300,8 +322,8 @@ def _fit_of(fitted: WindowFit) -> WhitenedFit:
     return fitted.aligned.whitened
 
 
-def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _Touch]:
-    """Contacts on a side with the screw where the window begins and where it ends, for the point of one contact."""
+def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _Touch, float]:
+    """`begin`, `end` and `apart` of a `OneContact`, for the point of one contact."""
     aligned, result, window = fitted.aligned, _fit_of(fitted), fitted.window
     assert aligned is not None
     reduction, gain = result.reduction, result.reduction.response.static_gain
@@ -310,10 +332,15 @@ def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _To
     traced = reduction.traced(single)
     screw = traced[SCREW] + excess * traced[BY_RATE]
     touched, furthest = int(np.argmax(traced[BY_START] == 0.0)), int(np.argmax(side * reduction.theta_m))
-    half = 0.5 * (single.gap + (reduction.rate + excess) * (touched - 0.5 * (screw.size - 1)))
+    grown = (reduction.rate + excess) * (touched - 0.5 * (screw.size - 1))
+    at = float(screw[0]) + side * 0.5 * (single.gap + grown)
+    # The constant belongs to the fit's own way to the contact: a motion at first may hide some of it, and a short push
+    # the other way may come before.
+    fits = reduction.traced(result.point)
+    own = fits[SCREW] + excess * fits[BY_RATE]
+    apart = abs(float(own[0]) + side * 0.5 * (result.point.gap + grown) - at)
     # Both channels are counted from their first samples.
     level = float(window.position[max(aligned.shift, 0)] + result.shares[0])
-    begins = level + gain * 0.5 * result.point.gap * result.point.place
     begin, end = _level_stds(fitted, result)
     first = window.start + max(-aligned.shift, 0) / window.sample_rate
 
@@ -321,8 +348,9 @@ def _touches(fitted: WindowFit, single: Point, side: float) -> tuple[_Touch, _To
         return _Touch(aligned.first + float(angle), first + sample / window.sample_rate, position, std)
 
     return (
-        touch(screw[0] + side * half, touched, begins, begin),
-        touch(reduction.theta_m[furthest], furthest, begins + gain * float(screw[-1] - screw[0]), end),
+        touch(at, touched, level + gain * float(own[0]), begin),
+        touch(reduction.theta_m[furthest], furthest, level + gain * side * float(np.max(side * own)), end),
+        apart,
     )
 
 

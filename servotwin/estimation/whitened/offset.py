@@ -72,13 +72,12 @@ def estimate_carrying(
     if gap_only and not (fitted.one_sided() and (known or paired is not None)):
         fitted, gap_only = fit(window, servo, prior, settings, machine, fitted), False
         paired = _pair(fitted, servo, machine, before)
-    by_contacts = None if paired is None else paired.estimate
-    if by_contacts is not None and not known:
+    if paired is not None and not known and (by_contacts := paired.estimate) is not None:
         return by_contacts
     made = _alone_or_aided(fitted, servo, machine, carried if known else None, paired, gap_only)
-    if by_contacts is not None and not made.ok:
-        return by_contacts
-    return made if paired is None else paired.added_to(made)
+    if paired is None:
+        return made
+    return (not made.ok and paired.estimate) or paired.added_to(made)
 
 
 def _pair(fitted: WindowFit, servo: Servo, machine: FactorPrior | None, before: LastContact | None) -> Pair | None:
@@ -109,7 +108,7 @@ def _alone_or_aided(
     assert carried is not None
     aided = fit(window, servo, prior, replace(settings, offset=carried), machine)
     helped = aided.concluded()
-    agrees = paired is None or paired.agrees(helped, settings.gap_rate)
+    agrees = paired is None or paired.agrees(helped)
     if helped.ok and agrees and not helped.rms > _WORSE * fitted.rms():
         slope = _slope(_columns(window, aided.servo, helped, settings))
         return replace(helped, offset=CarriedOffset(*carried, slope))
