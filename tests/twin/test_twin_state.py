@@ -36,7 +36,7 @@ from servotwin.messages import (
     decode,
 )
 from servotwin.plant.servo import Servo
-from servotwin.plant.signals import SquareWave
+from servotwin.plant.signals import Samples
 from servotwin.redesign.excitation import ExcitationSettings
 from servotwin.twin.evidence_log import EvidenceLog
 from servotwin.twin.lookups import LookupState
@@ -86,12 +86,12 @@ def run(scenario: Scenario, remote: Reborn | None = None) -> Loop:
 
 
 def probed() -> Scenario:
-    """Steps within the gap: the twin asks for longer windows, then for a probing move."""
+    """Steps within the gap, one way: the twin asks for longer windows, then for a probing move."""
     calm = Scenario.preset("calm")
     excitation = ExcitationSettings(probe=2e-4, interval=30.0)
     twin = calm.twin.replace(excitation=excitation, uncertainty=calm.twin.uncertainty.replace(gap=(0.0, 25.0 * DEG)))
     recording = Recording(probe=ProbeLimits(2e-4, 20.0))
-    reference = SquareWave(2e-5, 20.0)
+    reference = Samples([0.0, 10.0, 20.0, 30.0], [4e-5, 8e-5, 1.2e-4, 1.6e-4])
     return calm.replace(gap=10.0 * DEG, twin=twin, recording=recording, reference=reference, duration=35.0)
 
 
