@@ -183,7 +183,7 @@ class Pair:
 
     @cached_property
     def reason(self) -> str:
-        """Why the contacts show no gap, or another window must confirm it; empty: they do, or there is one only."""
+        """Reason for which the contacts show no gap, or not yet; empty: they do, or there is one contact only."""
         if self.before is None or self.between is None:
             return ""
         possible = NORMAL_95 * self.here.fitted.settings.gap_rate * (self.here.begin.time - self.before.time)

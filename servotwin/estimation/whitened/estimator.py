@@ -15,7 +15,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.core.visible import counted, least_bound
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, Interval, interval_95, no_estimate
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle, refused
 from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
@@ -39,6 +39,7 @@ from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
 from servotwin.estimation.whitened.profile import profile_interval
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift, fastest, model_shift, observer_shift
+from servotwin.estimation.whitened.statement import stated
 from servotwin.estimation.window import Window
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
@@ -123,7 +124,7 @@ class WindowFit:
 
     def rms(self) -> float:
         """Root mean square of the fit's residual, m."""
-        return math.nan if self.aligned is None else _residual_rms(self.aligned.whitened)
+        return math.nan if self.aligned is None else self.aligned.whitened.residual_rms
 
     def concluded(self) -> GapEstimate:
         """Judge the fit and make the estimate."""
@@ -152,10 +153,10 @@ class WindowFit:
             reasons = (*fault, *reasons)
         if status is GapStatus.OK:
             evidence = replace(evidence, doubt=self._doubt(evidence), learnt=self.learnt is not None)
-        stated = _stated(self.blank, evidence, status, reasons, self.prior, self.settings)
+        made = stated(self.blank, evidence, status, reasons, self.prior, self.settings)
         if self.learnt is None or not teaches:
-            return stated
-        return replace(stated, machine=self.learnt.reading(self.settings.calibration))
+            return made
+        return replace(made, machine=self.learnt.reading(self.settings.calibration))
 
     @cached_property
     def facts(self) -> FitFacts:
@@ -189,7 +190,7 @@ class WindowFit:
     def _one_contact(self, evidence: FitEvidence, contacts: ContactEvidence, reasons: tuple[str, ...]) -> GapEstimate:
         """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
         fitted = evidence.aligned.whitened
-        blank = replace(self.blank, reasons=reasons, rms=_residual_rms(fitted), evaluations=fitted.evaluations)
+        blank = replace(self.blank, reasons=reasons, rms=fitted.residual_rms, evaluations=fitted.evaluations)
         bound = lower_bound(evidence, self.settings) if sure_of_contact(evidence, self.settings) else 0.0
         if bound >= evidence.smallest:  # the lead, which costs far more, can only lower it
             bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings))
@@ -336,11 +337,6 @@ def _spread_to(evidence: FitEvidence, std: float) -> FitEvidence:
     return replace(evidence, std=std, interval=interval)
 
 
-def _residual_rms(result: WhitenedFit) -> float:
-    """Root mean square of the residual, m."""
-    return float(np.sqrt(np.mean(result.residual**2)))
-
-
 def _travel(result: WhitenedFit) -> Travel:
     """Sum up the screw's motion without the end of the window, to which the last mass cannot have answered."""
     reduction, model = result.reduction, result.reduction.response
@@ -348,58 +344,6 @@ def _travel(result: WhitenedFit) -> Travel:
     middle = result.point.gap - 0.5 * reduction.rate * (reduction.theta_m.size - count)
     at = result.point.screw(0.0)._replace(gap=middle, rate=reduction.rate)
     return travel(reduction.theta_m[:count], at)
-
-
-def _stated(
-    blank: GapEstimate,
-    evidence: FitEvidence,
-    status: GapStatus,
-    reasons: tuple[str, ...],
-    prior: float | GapEstimate | None,
-    settings: WhitenedSettings,
-) -> GapEstimate:
-    """Fill a blank estimate from the evidence."""
-    fitted = evidence.aligned.whitened
-    result = replace(
-        blank,
-        status=status,
-        reasons=reasons,
-        rms=_residual_rms(fitted),
-        evaluations=fitted.evaluations,
-    )
-    if status is GapStatus.LOWER_BOUND:
-        bound = lower_bound(evidence, settings)
-        return replace(result, gap=bound, std=math.inf, std_total=math.inf, interval=(bound, math.inf))
-    if status is not GapStatus.OK:
-        return result
-    first = evidence.aligned.first + 0.5 * fitted.point.gap * fitted.point.place
-    total, interval = _widened(evidence, settings)
-    result = replace(result, gap=fitted.point.gap, std=evidence.std, std_total=total, theta_d0=first, interval=interval)
-    return _combined(result, prior) if settings.combine and isinstance(prior, GapEstimate) else result
-
-
-def _widened(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[float, Interval]:
-    """Standard deviation (rad) and interval of the gap with errors outside the model and the doubt in it.
-
-    Beside a machine that is being learnt the doubt is one more random part. The doubt in a model that is taken as exact
-    contains that model's own error, the same in all windows: it adds as it is.
-    """
-    gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
-    random = math.hypot(settings.model_error, evidence.doubt if evidence.learnt else 0.0)
-    added = 0.0 if evidence.learnt else evidence.doubt
-    below, above = (math.hypot(part, NORMAL_95 * random) + NORMAL_95 * added for part in (gap - low, high - gap))
-    return math.hypot(evidence.std, random) + added, (max(0.0, gap - below), gap + above)
-
-
-def _combined(estimate: GapEstimate, prior: GapEstimate) -> GapEstimate:
-    """Average two estimates, weighted by their total variances."""
-    if not (math.isfinite(prior.gap) and math.isfinite(prior.std_total) and prior.std_total > 0.0):
-        return estimate
-    share = estimate.std_total**2 / (estimate.std_total**2 + prior.std_total**2)
-    gap = estimate.gap + share * (prior.gap - estimate.gap)
-    total = math.sqrt(1.0 - share) * estimate.std_total
-    std = math.hypot((1.0 - share) * estimate.std, share * prior.std)
-    return replace(estimate, gap=gap, std=std, std_total=total, interval=interval_95(gap, total))
 
 
 def _nothing(window: Window, servo: Servo, prior: float | GapEstimate | None) -> GapEstimate:

@@ -87,6 +87,11 @@ class WhitenedFit:
         return np.asarray(self.table[RESIDUAL] - self.shares @ self.table[CONSTANT:])
 
     @property
+    def residual_rms(self) -> float:
+        """Root mean square of the residual, m."""
+        return float(np.sqrt(np.mean(self.residual**2)))
+
+    @property
     def point(self) -> Point:
         """The fit's gap and place."""
         return self.fit.point
