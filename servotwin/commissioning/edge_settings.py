@@ -269,7 +269,10 @@ class Commissioning:
             return None
         model = servo_for(self.servo)
         if model is None:
-            raise InvalidInput("[novelty]: the edge's filter needs an axis that is held in the gap and has two masses")
+            raise InvalidInput(
+                "[novelty]: the edge's filter needs an axis that is held in the gap and has two masses or more, without "
+                "friction of the load"
+            )
         return NoveltySettings(model_of(model, self.recording.sample_rate), rules, self.twin.initial_gap)
 
 

@@ -17,8 +17,14 @@ _LEAST_MASSES = 2
 
 
 def has_servo(axis: Axis) -> bool:
-    """True where a `Servo` can stand for the axis: its driven end is held in the gap and drives two masses or more."""
-    return axis.backlash_kind is not BacklashKind.FREE and axis.n >= _LEAST_MASSES
+    """True where a `Servo` can stand for the axis.
+
+    Its driven end is held in the gap and drives two masses or more, without Coulomb friction; behind an elastic
+    transmission the load hangs on the ground.
+    """
+    held = axis.backlash_kind is not BacklashKind.FREE
+    anchored = axis.rigid or axis.load.k[0] > 0.0
+    return held and anchored and axis.n >= _LEAST_MASSES and not axis.load.friction
 
 
 def servo_for(plant: Plant) -> Servo | None:
@@ -41,20 +47,13 @@ def servo_of(axis: Axis) -> Servo:
         No servo stands for the axis.
     """
     if not has_servo(axis):
-        what = "a shaft that is free in the gap" if axis.backlash_kind is BacklashKind.FREE else "one mass"
         raise InvalidInput(
-            f'axis with {what}: methods "whitened" and "paper" need a transmission that is held in the gap and at '
-            'least 2 masses; leave the method out, or give method = "output_error"'
+            f'{_without_servo(axis)}: methods "whitened" and "paper" need a transmission that is held in the gap, at '
+            'least 2 masses and no Coulomb friction of the load; leave the method out, or give method = "output_error"'
         )
     load, motor = axis.load, axis.actuator
-    if load.friction > 0.0:
-        unit = "N" if load.motion == LINEAR else "N m"
-        raise InvalidInput(
-            f'load {load.key("friction")} = {load.friction!r} {unit}: methods "whitened" and "paper" know no Coulomb '
-            "friction of the load; its transmission must be free in the gap for an estimate"
-        )
     # With a rigid transmission the first spring is inert: a free load may have any.
-    springs = (load.k[0] or load.k[1], *load.k[1:]) if axis.rigid else _grounded(load.k)
+    springs = (load.k[0] or load.k[1], *load.k[1:]) if axis.rigid else load.k
     J, R, k_T, k_B, L = 1.0, 1.0, 1.0, _loop_gain(axis), 1.0
     if isinstance(motor, DcMotor):
         J, R, k_T, k_B, L = motor.J, motor.R, motor.k_T, motor.k_B, motor.L or 1.0
@@ -66,14 +65,15 @@ def servo_of(axis: Axis) -> Servo:
     )  # fmt: skip
 
 
-def _grounded(springs: tuple[float, ...]) -> tuple[float, ...]:
-    """The springs, refused where no ground holds the load behind an elastic screw."""
-    if springs[0] == 0.0:
-        raise InvalidInput(
-            'load k[0] = 0.0: methods "whitened" and "paper" need a load on the ground behind an elastic transmission '
-            "that is held in the gap"
-        )
-    return springs
+def _without_servo(axis: Axis) -> str:
+    """Words for what makes an axis one that no servo stands for."""
+    load = axis.load
+    if axis.backlash_kind is BacklashKind.FREE:
+        return "axis with a shaft that is free in the gap"
+    if load.friction:
+        unit = "N" if load.motion == LINEAR else "N m"
+        return f"load {load.key('friction')} = {load.friction!r} {unit}"
+    return "axis with one mass" if axis.n < _LEAST_MASSES else "load k[0] = 0.0 behind an elastic transmission"
 
 
 def _loop_gain(axis: Axis) -> float:

@@ -61,7 +61,8 @@ def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
     """Knowledge of a machine before its first window; None: it is not learnt, and keeps the numbers of its model.
 
     Of one mass behind a rigid transmission only the ratio shows; it is known better where nothing is stated of it. A
-    shaft that is free in the gap begins with what its own estimate assumes where nothing is learnt.
+    shaft that is free in the gap begins with what its own estimate assumes where nothing is learnt. A load with
+    friction behind a screw that the gap holds is not learnt.
     """
     known, own = stated_machine(settings), output_error.OutputErrorSettings()
     pitch = min(known.pitch[1], own.ratio)
@@ -70,7 +71,9 @@ def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
         return None
     if free:
         return FactorPrior.of_spreads(own.stiffness, own.damping, pitch, own.mass_ratio)
-    return known if servo_for(servo) is not None else known.with_pitch(0.0, pitch)
+    if servo_for(servo) is not None:
+        return known
+    return known.with_pitch(0.0, pitch) if output_error.follows(servo) else None
 
 
 def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
@@ -86,7 +89,7 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     if model is None and stated:
         raise InvalidInput(
             f"[twin] method = {settings.method!r} and its settings: are for axes that are held in the gap and have "
-            "two masses or more; leave them out for this axis"
+            "two masses or more, without friction of the load; leave them out for this axis"
         )
     own = default_method(servo)
     if servo.at_motor:

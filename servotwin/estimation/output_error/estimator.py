@@ -1,4 +1,4 @@
-"""Gap of an axis whose shaft is free in the gap, or of one mass behind a rigid screw, by an output-error fit.
+"""Gap of an axis whose shaft is free in the gap, of a load with friction, or of one mass, by an output-error fit.
 
 The load's motion under the measured motion of the motor is simulated exactly, contacts included, and fitted to the
 measured position with the axis's numbers free within what is known of them. docs/estimator-axes.md explains it.
@@ -13,9 +13,11 @@ import numpy as np
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
+from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
@@ -67,7 +69,8 @@ def estimate(
     ----------
     window : Window
     axis : Axis
-        With a shaft that is free in the gap, or one mass behind a rigid transmission.
+        With a shaft that is free in the gap, or whose load has friction, hangs on nothing but an elastic screw, or is
+        one mass.
     prior : float or GapEstimate, optional
         Total gap, rad: one of the starts.
     settings : OutputErrorSettings, optional
@@ -93,7 +96,7 @@ def estimate(
         words = "position is the motor's angle times the ratio, exactly: there is no gap, or it is not the load's own"
         return replace(blank, reasons=(words,))
     found, noise = _fit(window, theta_m, axis, prior, settings, machine)
-    unit, possible = 2.0 / axis.p, possible_half(found)
+    unit, possible = 2.0 / lever(axis), possible_half(found)
     verdict = judge(found, settings, unit, possible, axis.p * noise)
     if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
@@ -179,15 +182,15 @@ def _fit(
     """The fit of a window, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
     expected = prior.gap if isinstance(prior, GapEstimate) else prior
     problem, noise = _prepared(window, theta_m, axis, settings, machine)
-    return search(problem, 0.5 * axis.p * (expected or 0.0)), noise
+    return search(problem, 0.5 * lever(axis) * (expected or 0.0)), noise
 
 
 def _prepared(
     window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None
 ) -> tuple[Problem, float]:
     """The window with its model, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
-    free = axis.backlash_kind is BacklashKind.FREE
-    motor = MotorAngle(theta_m, 0.0) if free else without_noise(theta_m, _count_of_motor(axis, theta_m))
+    swings = not follows(axis)
+    motor = MotorAngle(theta_m, 0.0) if swings else without_noise(theta_m, _count_of_motor(axis, theta_m))
     learnt = None if machine is None else machine.covariance
     return _problem(window, motor.angle, axis, settings, learnt), motor.noise
 
@@ -203,13 +206,8 @@ def _checked(window: Window, axis: Axis | Servo) -> Array:
         )
     if isinstance(axis, Servo) or has_servo(axis):
         raise InvalidInput(
-            f"method {METHOD!r} is for a shaft that is free in the gap, or one mass behind a rigid transmission: "
+            f"method {METHOD!r} is for a shaft that is free in the gap, a load with friction, or one mass: "
             'give method = "whitened"'
-        )
-    if axis.backlash_kind is BacklashKind.HELD:
-        raise InvalidInput(
-            'transmission in_gap = "held" with a finite stiffness and one mass: no method estimates this gap; describe '
-            'it as "free", or as rigid'
         )
     if window.theta_m is None:
         raise InvalidInput(f"{window.where}the window has no theta_m: method {METHOD!r} needs the motor's angle in rad")
@@ -232,15 +230,33 @@ def _problem(
     measured = theta_m if window.theta_m is None else window.theta_m
     at_motor = _count_of_motor(axis, measured)
     at_load = max(axis.sensors.position_resolution, counted(window.position))
-    free, late = axis.backlash_kind is BacklashKind.FREE, _SAMPLES_LATE * interval
-    if free:
-        own = math.sqrt(axis.transmission.k_d / axis.load.m[0])
+    own, late = _own_rate(axis), _SAMPLES_LATE * interval
+    if own > 0.0:
         late = max(late, _LATE / own)
-        theta_m = _smooth(theta_m, _CUT * own / (2.0 * math.pi), window.sample_rate) if at_motor > 0.0 else theta_m
+        if at_motor > 0.0:
+            theta_m = _smooth(theta_m, _CUT * own / (2.0 * math.pi), window.sample_rate)
     priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
-    model: MotionModel = ShaftModel(axis, priors, learnt) if free else PlayModel(axis, priors)
-    count = math.hypot(axis.p * at_motor, at_load)
-    return Problem(model, axis.p * theta_m, window.position, interval, count)
+    model, travel = _model(axis, priors, learnt), lever(axis)
+    count, drive, position = math.hypot(travel * at_motor, at_load), travel * theta_m, window.position
+    if isinstance(model, HeldChainModel):
+        reduce = decimation(model.decimation(interval, theta_m.size // SHORTEST))
+        drive, position = reduce.rows(np.vstack([drive, position]))
+        interval *= reduce.factor
+    return Problem(model, drive, position, interval, count)
+
+
+def _own_rate(axis: Axis) -> float:
+    """Frequency (rad/s) of the shaft, or of the chain's slowest mode; 0 where the load has no motion of its own."""
+    if axis.backlash_kind is BacklashKind.FREE:
+        return math.sqrt(axis.transmission.k_d / axis.load.m[0])
+    return 0.0 if follows(axis) else float(MovingChain.of(axis).frequencies().min())
+
+
+def _model(axis: Axis, priors: Priors, learnt: Array | None) -> MotionModel:
+    """The model of an axis's load."""
+    if axis.backlash_kind is BacklashKind.FREE:
+        return ShaftModel(axis, priors, learnt)
+    return PlayModel(axis, priors) if follows(axis) else HeldChainModel(axis, priors)
 
 
 def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:

@@ -324,7 +324,12 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
 def _least_parts(axis: Axis, interval: float) -> int:
     """Parts of a sample at the model's own numbers: with more of them elsewhere a fit would not be smooth."""
     flows, _, _ = _flows(axis, _OWN)
-    return max(_PARTS if axis.load.friction > 0.0 else 1, math.ceil(_fastest(flows) * interval / _FINE))
+    return fine_parts(flows, axis.load.friction > 0.0, interval)
+
+
+def fine_parts(flows: Array, friction: bool, interval: float) -> int:
+    """Parts of a sample (s) in which a flow (..., size, size) turns little, and friction may change its sign."""
+    return max(_PARTS if friction else 1, math.ceil(_fastest(flows) * interval / _FINE))
 
 
 def _fastest(flows: Array) -> float:

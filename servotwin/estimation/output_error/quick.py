@@ -16,6 +16,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.output_error.estimator import problem_of
 from servotwin.estimation.output_error.fit import Fit, Search, descend, noise_in
+from servotwin.estimation.output_error.held_chain import lever
 from servotwin.estimation.output_error.models import HALF, Flags
 from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.search import SearchProblem
@@ -72,13 +73,13 @@ def quick_fit(window: Window, axis: Axis, unknowns: Array, machine: FactorPrior 
         What is known of the machine, as for the other window.
     """
     problem, known = problem_of(window, axis, machine)
-    return fit_beside(problem, unknowns, 2.0 / known.p, _SPREAD)
+    return fit_beside(problem, unknowns, 2.0 / lever(known), _SPREAD)
 
 
 def unknowns_at(window: Window, axis: Axis, gap: float, machine: FactorPrior | None = None) -> Array:
     """Unknowns (u,) of a window whose total gap (rad) was estimated; raises InvalidInput as the estimator does."""
     problem, known = problem_of(window, axis, machine)
-    return unknowns_in(problem, 0.5 * known.p * gap)
+    return unknowns_in(problem, 0.5 * lever(known) * gap)
 
 
 def fit_beside(problem: QuickProblem, unknowns: Array, unit: float, spread: SpreadParts) -> QuickFit:

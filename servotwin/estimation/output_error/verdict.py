@@ -11,6 +11,7 @@ import numpy as np
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
+from servotwin.estimation.output_error.held_chain import HeldChainModel
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
@@ -149,7 +150,7 @@ def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tu
     """
     half, std, total = known
     model = found.problem.model
-    friction = model.hidden_friction(found.best.values) if isinstance(model, ShaftModel) else 0.0
+    friction = model.hidden_friction(found.best.values) if isinstance(model, ShaftModel | HeldChainModel) else 0.0
     left, times = unexplained(found), time_jitter(found)
     doubts = (
         _wide(std, allowed, unit),

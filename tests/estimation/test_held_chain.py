@@ -1,0 +1,135 @@
+"""Gaps of loads with friction, and of elastic screws, that the gap holds: the play operator before a chain."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from servotwin.control.controller import Controller
+from servotwin.errors import InvalidInput
+from servotwin.estimation.estimate import GapStatus
+from servotwin.estimation.gap import default_method, estimate_gap
+from servotwin.estimation.output_error.estimator import problem_of
+from servotwin.estimation.output_error.held_chain import MovingChain, lever
+from servotwin.estimation.window import Window
+from servotwin.plant.actuator import DcMotor
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
+from servotwin.plant.servo import Servo
+from servotwin.plant.signals import SquareWave
+from servotwin.plant.transmission import Transmission
+from servotwin.simulation import Run, simulate
+from servotwin.twin.estimating import known_machine
+from servotwin.twin.settings import TwinSettings
+
+PAPER = Servo.preset("paper")
+MOTOR = DcMotor(PAPER.J, PAPER.R, PAPER.k_T, PAPER.k_B, PAPER.L)
+CALM = PAPER.controller.replace(Ki=0.0, Kp=0.7 * PAPER.controller.Kp, Kd=0.7 * PAPER.controller.Kd)
+GAP = math.radians(10.0)
+
+
+def screw_axis(masses: int, friction: float, stiffness: float = math.inf, grounded: bool = True) -> Axis:
+    """The paper's chain of some masses behind a screw, with friction (N) at the last one."""
+    springs = (1e4 if grounded else 0.0, *(masses - 1) * (1e4,))
+    load = Load(masses * (5.2,), springs, masses * (36.9,), friction=friction)
+    return Axis(MOTOR, Transmission(PAPER.p, stiffness), load, PAPER.controller)
+
+
+AXES = {
+    "two masses": screw_axis(2, 0.1),
+    "three masses": screw_axis(3, 0.1),
+    "elastic screw, one mass": screw_axis(1, 0.0, 5e4),
+    "elastic screw, friction": screw_axis(2, 0.2, 1e5),
+    "elastic screw, free load": screw_axis(2, 0.0, 1e5, grounded=False),
+}
+
+
+def worn(axis: Axis, law: Controller = PAPER.controller) -> Run:
+    return simulate(axis, 8.0, controller=law, reference=SquareWave(1e-3, 8.0), gap=GAP)
+
+
+def measured(run: Run, begin: float = 3.5, seconds: float = 3.0, noise: float = 0.0, seed: int = 3) -> Window:
+    window = Window.from_run(run, begin, seconds)
+    return window.replace(
+        position=window.position + np.random.default_rng(seed).normal(0.0, noise, window.position.size)
+    )
+
+
+def error_from_rest(axis: Axis, rate: float) -> float:
+    """Largest error of the model at its own numbers, over the motion of an exact run sampled at a rate (Hz)."""
+    run = simulate(axis, 3.2, reference=SquareWave(1e-3, 8.0), gap=GAP, sample_rate=rate)
+    problem, _ = problem_of(Window.from_run(run, 0.0, 3.0), axis, None)
+    every = dataclasses.replace(problem, drive=lever(axis) * run.theta_m, position=run.position, interval=1.0 / rate)
+    values = problem.model.start(0.5 * lever(axis) * GAP, 0.0, (0.0, 0.0))
+    return float(np.abs(every.misfit(values)).max() / np.ptp(run.position))
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_the_model_moves_as_the_exact_simulation_does(name: str) -> None:
+    """The exact simulation locates contacts, sticks and slips as events."""
+    coarse, fine = (error_from_rest(AXES[name], rate) for rate in (500.0, 2000.0))
+    assert fine < 3e-5
+    assert fine < 0.3 * coarse
+
+
+@pytest.mark.parametrize("name", AXES)
+def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
+    axis = AXES[name]
+    assert default_method(axis) == "output_error"
+    estimate = estimate_gap(measured(worn(axis), noise=1e-6), axis)
+    assert estimate.ok, estimate.reasons
+    assert abs(estimate.gap - GAP) < math.radians(0.05)
+    assert estimate.interval[0] < GAP < estimate.interval[1]
+
+
+def test_friction_of_another_size_is_fitted_and_widens_the_interval() -> None:
+    axis, window = screw_axis(3, 0.1), measured(worn(screw_axis(3, 0.105)), noise=1e-6)
+    right, off = estimate_gap(window, screw_axis(3, 0.105)), estimate_gap(window, axis)
+    assert right.ok and off.ok
+    assert abs(off.gap - GAP) < math.radians(0.05)
+    assert off.std_total > 2.0 * right.std_total
+
+
+def test_friction_that_is_twice_the_stated_one_is_no_gap() -> None:
+    """The wind-up of the springs by the difference is as large as a third of the gap."""
+    window = measured(worn(screw_axis(3, 0.2)), noise=1e-6)
+    estimate = estimate_gap(window, screw_axis(3, 0.1))
+    assert estimate.status is GapStatus.UNIDENTIFIABLE
+    assert "with the stated load friction the gap would be" in estimate.reasons[0]
+
+
+def test_a_loop_that_touches_one_side_gets_a_lower_bound() -> None:
+    run = worn(screw_axis(3, 0.1), CALM)
+    estimate = estimate_gap(measured(run, 3.8, 2.0, noise=1e-6), screw_axis(3, 0.1))
+    assert estimate.status in (GapStatus.LOWER_BOUND, GapStatus.UNIDENTIFIABLE)
+    assert not estimate.gap > GAP
+
+
+def test_the_estimate_does_not_depend_on_units() -> None:
+    """A thousandth of all lengths, with forces as they are."""
+    axis, size = screw_axis(2, 0.1), 1e-3
+    load = dataclasses.replace(axis.load, m=(5.2 / size,) * 2, k=(1e4 / size,) * 2, c=(36.9 / size,) * 2)
+    small = axis.replace(load=load, transmission=Transmission(PAPER.p * size))
+    window = measured(worn(axis), noise=1e-6)
+    plain, scaled = estimate_gap(window, axis), estimate_gap(window.replace(position=size * window.position), small)
+    assert plain.ok and scaled.ok
+    assert scaled.gap == pytest.approx(plain.gap, rel=1e-6)
+    assert scaled.std_total == pytest.approx(plain.std_total, rel=1e-3)
+
+
+def test_the_methods_of_a_servo_refuse_friction_in_a_sentence() -> None:
+    window = Window(np.zeros(500), np.zeros(500), sample_rate=1e3)
+    with pytest.raises(InvalidInput, match=r"load friction_n = 0.1 N: .* no Coulomb friction of the load"):
+        estimate_gap(window, screw_axis(2, 0.1), "whitened")
+
+
+def test_a_twin_keeps_the_numbers_of_such_a_machine() -> None:
+    assert known_machine(screw_axis(2, 0.1), TwinSettings()) is None
+
+
+def test_flexibility_and_static_gain_are_those_at_rest() -> None:
+    chain = MovingChain.of(screw_axis(2, 0.0, 1e5))
+    # 1e5 N/m to the screw and 1e4 N/m to the ground hold the first mass; 1e4 N/m the second at it.
+    assert chain.static_gain() == pytest.approx(1e5 / 1.1e5)
+    assert chain.flexibility() == pytest.approx(1.0 / 1.1e5 + 1e-4)
