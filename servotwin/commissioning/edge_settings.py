@@ -270,7 +270,7 @@ class Commissioning:
         model = servo_for(self.servo)
         if model is None:
             raise InvalidInput(
-                "[novelty]: the edge's filter needs an axis that is held in the gap and has two masses or more, without "
+                "[novelty]: the edge's filter needs an axis that is held in the gap and has two masses or more, and no "
                 "friction of the load"
             )
         return NoveltySettings(model_of(model, self.recording.sample_rate), rules, self.twin.initial_gap)

@@ -86,7 +86,8 @@ def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
 def test_friction_of_another_size_is_fitted_and_widens_the_interval() -> None:
     axis, window = screw_axis(3, 0.1), measured(worn(screw_axis(3, 0.105)), noise=1e-6)
     right, off = estimate_gap(window, screw_axis(3, 0.105)), estimate_gap(window, axis)
-    assert right.ok and off.ok
+    assert right.ok
+    assert off.ok
     assert abs(off.gap - GAP) < math.radians(0.05)
     assert off.std_total > 2.0 * right.std_total
 
@@ -113,7 +114,8 @@ def test_the_estimate_does_not_depend_on_units() -> None:
     small = axis.replace(load=load, transmission=Transmission(PAPER.p * size))
     window = measured(worn(axis), noise=1e-6)
     plain, scaled = estimate_gap(window, axis), estimate_gap(window.replace(position=size * window.position), small)
-    assert plain.ok and scaled.ok
+    assert plain.ok
+    assert scaled.ok
     assert scaled.gap == pytest.approx(plain.gap, rel=1e-6)
     assert scaled.std_total == pytest.approx(plain.std_total, rel=1e-3)
 
@@ -122,6 +124,23 @@ def test_the_methods_of_a_servo_refuse_friction_in_a_sentence() -> None:
     window = Window(np.zeros(500), np.zeros(500), sample_rate=1e3)
     with pytest.raises(InvalidInput, match=r"load friction_n = 0.1 N: .* no Coulomb friction of the load"):
         estimate_gap(window, screw_axis(2, 0.1), "whitened")
+
+
+@pytest.mark.parametrize("friction", [0.01, 0.05])
+def test_a_servo_names_friction_that_nobody_stated(friction: float) -> None:
+    window = measured(worn(screw_axis(3, friction)), noise=1e-6)
+    estimate = estimate_gap(window, PAPER)
+    assert not estimate.ok
+    (words,) = [reason for reason in estimate.reasons if "Coulomb friction of the load" in reason]
+    named = float(words.split("about ")[1].split(" N")[0])
+    assert 0.5 * friction < named < 2.0 * friction
+
+
+def test_other_faults_are_not_called_friction() -> None:
+    run = simulate(PAPER.replace(c=tuple(1.3 * PAPER.dampings)), 8.0, reference=SquareWave(1e-3, 8.0), gap=GAP)
+    estimate = estimate_gap(measured(run, noise=1e-6), PAPER)
+    assert estimate.status is GapStatus.MODEL_MISMATCH
+    assert not any("friction" in reason for reason in estimate.reasons)
 
 
 def test_a_twin_keeps_the_numbers_of_such_a_machine() -> None:

@@ -136,7 +136,7 @@ def _bounded(found: Search, known: _KnownHalf) -> JudgedFit | None:
     rise = (single.cost - best.cost) / best.variance()
     if not (rise < _BELIEVED or any(_alike(found, fit) for fit in singles)):
         return None
-    bound = _BOUND * 2.0 * smallest_half(found, single) - count
+    bound = _BOUND * 2.0 * (smallest_half(found, single) - _hidden_friction(found, single)) - count
     enough = bound > _BOUND_COUNTS * count
     words = "one flank explains the window nearly as well as two"
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
@@ -149,8 +149,7 @@ def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tu
     `allowed` (m or rad at the load) is a standard deviation.
     """
     half, std, total = known
-    model = found.problem.model
-    friction = model.hidden_friction(found.best.values) if isinstance(model, ShaftModel | HeldChainModel) else 0.0
+    friction = _hidden_friction(found, found.best)
     left, times = unexplained(found), time_jitter(found)
     doubts = (
         _wide(std, allowed, unit),
@@ -163,6 +162,12 @@ def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tu
     contact = 0.0 if any(doubts) else moved_by_contact(found)
     explained = math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
     return tuple(filter(None, doubts)), explained
+
+
+def _hidden_friction(found: Search, fit: Fit) -> float:
+    """Change of the half gap (m or rad at the load) of a fit that hides another load friction than the stated one."""
+    model = found.problem.model
+    return model.hidden_friction(fit.values) if isinstance(model, ShaftModel | HeldChainModel) else 0.0
 
 
 def _alike(found: Search, single: Fit) -> bool:

@@ -36,6 +36,7 @@ from servotwin.estimation.whitened.gate import (
     with_free_model,
 )
 from servotwin.estimation.whitened.learning import LearntFit, learn_and_fit
+from servotwin.estimation.whitened.load_friction import friction_hint
 from servotwin.estimation.whitened.profile import profile_interval
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift, fastest, model_shift, observer_shift
@@ -151,6 +152,8 @@ class WindowFit:
             servo = self.servo if self.learnt is None else self.learnt.problem.servo
             fault = likely_fault(self.window, self.angle, servo, evidence.unexplained, self.second)
             reasons = (*fault, *reasons)
+        if status in (GapStatus.MODEL_MISMATCH, GapStatus.UNIDENTIFIABLE):
+            reasons = (*reasons, *filter(None, [friction_hint(self.aligned.whitened, self.servo)]))
         if status is GapStatus.OK:
             evidence = replace(evidence, doubt=self._doubt(evidence), learnt=self.learnt is not None)
         made = stated(self.blank, evidence, status, reasons, self.prior, self.settings)
