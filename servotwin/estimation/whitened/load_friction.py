@@ -1,7 +1,7 @@
 """Coulomb friction of the load that nobody stated, as what a fit leaves: a force on the last mass against its motion.
 
 The fit's own motion tells the direction. Where the load rests the force is not known, so that the sum is a guess: it
-names a cause, and moves no gap.
+names a cause, and moves no gap. What other numbers of the structure would explain is no friction.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ import numpy as np
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.response import Response, Structures
 from servotwin.estimation.whitened.fit import WhitenedFit
+from servotwin.estimation.whitened.free_model import FACTORS
+from servotwin.estimation.whitened.nearby import nearby
 from servotwin.estimation.whitened.reduction import GAP, RESIDUAL
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 _RESTS = 0.02  # of the largest speed: the force turns about there
 # Of what a fit leaves. Of 72 windows with friction that were refused 31 had more, and of 55 with other faults one.
-_EXPLAINS = 0.8
+_EXPLAINS = 0.6
+_HERE = (0.0,) * len(FACTORS)  # logarithms of the factors
 
 
 def friction_hint(fit: WhitenedFit, servo: Servo) -> str:
@@ -38,9 +41,18 @@ def friction_in(fit: WhitenedFit, servo: Servo) -> tuple[float, float]:
     speed = np.gradient(reduction.position - fit.residual, interval)
     against = -speed / np.hypot(speed, _RESTS * float(np.max(np.abs(speed))) or 1.0)
     pushed = _pushed(servo, 1.0 / interval).respond(against[None])
-    without, given = _left(table[GAP:], table[RESIDUAL]), _left(np.vstack([table[GAP:], pushed]), table[RESIDUAL])
+    known = np.vstack([table[GAP:], _by_numbers(fit, servo)])
+    without, given = _left(known, table[RESIDUAL]), _left(np.vstack([known, pushed]), table[RESIDUAL])
     share = 1.0 - given[1] / without[1] if without[1] > 0.0 else 0.0
     return given[0], share
+
+
+def _by_numbers(fit: WhitenedFit, servo: Servo) -> Array:
+    """(4, m) derivatives of the fitted position by the structure's numbers."""
+    reduction = fit.reduction
+    near = nearby(servo, _HERE, 1.0 / reduction.response.interval, reduction.decimation, False)
+    answer, weights = reduction.position - fit.table[RESIDUAL], fit.shares[1 : len(reduction.fixed())]
+    return near.motions(reduction.traced(fit.point)[:1], answer, weights)
 
 
 def _left(columns: Array, target: Array) -> tuple[float, float]:
