@@ -33,6 +33,8 @@ MAX_ENDED_BOOTS = 1000
 """Number of boots that a twin remembers: its state must stay bounded."""
 MAX_SETTINGS = 16
 """Number of versions whose setting is remembered, besides the first one and the one in force."""
+# Windows whose step is remembered.
+_STEPS = 4
 
 
 class Versions(Struct, frozen=True):
@@ -201,6 +203,8 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         V, input biases that the last windows showed, the newest last.
     steps : tuple of float
         m, sizes of the reference's steps in the last windows, the newest last.
+    first_step : float
+        m, size of a step made before the first window, by the way to rest; 0: none is known.
     other_controller : int
         Windows in a row whose voltage is not that of the controller stated for them.
     newest : (str, float) or None
@@ -229,6 +233,7 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
     lookups: LookupState | None = None
     rests: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
+    first_step: float = 0.0
     responses: ResponseState | None = None
     other_controller: int = 0
     newest: tuple[str, float] | None = None
@@ -241,6 +246,22 @@ class TwinState(Struct, frozen=True, tag="twin-state/2"):
         """Note the first sending of an update, with its setting: the receipt may get lost."""
         known = noted_setting(self.known, update.version, update.setting, update.base_version, self.versions.in_force)
         return replace(self, known=known, attempts=Attempts(now, 1))
+
+    def with_step(self, step: float, way_to_rest: float) -> TwinState:
+        """Note the step of the reference that a window shows, or the way to rest of one made before it; both m, 0:
+        none."""
+        if step > 0.0:
+            return replace(self, steps=(*self.steps, step)[-_STEPS:])
+        return self if self.steps or self.first_step else replace(self, first_step=way_to_rest)
+
+    @property
+    def usual_steps(self) -> tuple[float, ...]:
+        """Sizes of the last steps, m.
+
+        The first move of a machine that goes to and fro is half as long as the others: it counts only until one of
+        these is known.
+        """
+        return self.steps or ((self.first_step,) if self.first_step else ())
 
     def is_of_other_boot(self, window: WindowMessage) -> bool:
         """True for a window of a boot that has ended, or was not introduced though the edge introduces each."""

@@ -73,8 +73,6 @@ _STALE = "the window is not newer than what the parameters stand on, or of an ea
 
 # Windows whose input bias is remembered: enough to contain both directions of approach to a rest.
 _RESTS = 3
-# Windows whose step is remembered.
-_STEPS = 4
 
 
 class WindowArrival(NamedTuple):
@@ -218,7 +216,7 @@ def _work_on(
     if not learnt.stale:
         state, taught = _teach(model, state, decoded, arrived, None if learnt.rejection else learnt.estimate)
         others, records = [*taught], [*records, *taught]
-        state = _with_step(state, decoded)
+        state = state.with_step(decoded.step, decoded.way_to_rest)
     evidence = _evidence(model, state, learnt, arrived)
     if why_none := _OVERTAKEN if event.overtaken else event.too_late:
         redesign = Redesign(None, math.nan, why_none)
@@ -255,12 +253,6 @@ def _send_redesign(
     unverified = VerificationRequest.of(versions.pending, redesign, evidence)
     sent = _send(state, versions.pending, now, ())
     return sent if unverified is None else sent._replace(evidence=(*sent.evidence, unverified))
-
-
-def _with_step(state: TwinState, decoded: DecodedWindow) -> TwinState:
-    """The state with the step that a window shows; the first one may have been made when the window began."""
-    size = decoded.step or (0.0 if state.steps else decoded.way_to_rest)
-    return replace(state, steps=(*state.steps, size)[-_STEPS:]) if size > 0.0 else state
 
 
 def _learn(
@@ -315,7 +307,7 @@ def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: floa
         None if wear.machine is None else wear.machine.prior(learning, arrived),
         None if model.motor is None else model.motor.current(wear.motor, arrived),
         state.rests,
-        state.steps,
+        state.usual_steps,
         state.search,
     )
 

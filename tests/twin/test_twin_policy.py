@@ -75,22 +75,24 @@ def test_a_policy_sees_the_evidence():
     assert evidence.gains == gains_of(OWN)
 
 
-def test_a_policy_sees_the_steps_of_the_reference_and_the_one_of_the_start():
-    """A step at the first sample leaves a reference at rest; only what the position does then shows its size."""
+def test_a_policy_sees_the_steps_of_the_reference_and_until_then_the_one_of_the_start():
+    """A step at the first sample leaves a reference at rest; only what the position does then shows its size. Of a
+    machine that goes to and fro it is half as long as all that follow."""
     servo = Servo.preset("paper")
     calm, worn = (
         simulate(servo, 4.0, reference=SquareWave(1e-3, 4.0), controller=servo.controller.replace(Ki=Ki), gap=gap)
         for Ki, gap in ((0.0, 0.1), (servo.controller.Ki, 0.5))
     )
-    for run, start, steps in (
-        (calm, 0.0, (1e-3, 2e-3)),
-        (calm, 1.7, (2e-3, 2e-3)),  # a step within the window
-        (worn, 0.5, (2e-3,)),  # a limit cycle
+    for run, start, first, steps in (
+        (calm, 0.0, (1e-3,), (2e-3,)),
+        (calm, 1.7, (2e-3,), (2e-3, 2e-3)),  # a step within the window
+        (worn, 0.5, (), (2e-3,)),  # a limit cycle
     ):
         rule = eq_21()
         twin, _ = with_policy(rule)
         for sequence, begin in enumerate((start, 1.8), start=1):
             twin.receive(message_of(Window.from_run(run, begin, 1.5), sequence, boot="boot-1"), 10.0 * sequence)
+        assert rule.consulted[0].steps == pytest.approx(first, rel=0.05)
         assert rule.consulted[-1].steps == pytest.approx(steps, rel=0.05)
 
 
