@@ -184,8 +184,42 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
     @event.listens_for(engine, "begin")
     def begin_transaction(connection: sa.Connection) -> None:
         connection.exec_driver_sql(begin)
+        if not reading:
+            _check_files(connection)
 
     return engine
+
+
+def _check_files(connection: sa.Connection) -> None:
+    """Refuse to write to files that are open and no longer in their places: they are gone once this process ends.
+
+    Raises
+    ------
+    StoreDamaged
+        The file, or its log, was deleted, moved or replaced since the connection first wrote.
+    """
+    file = sqlite_file(connection.engine.url)
+    if file is None:
+        return
+    places = file, file.with_name(f"{file.name}-wal")
+    known = connection.info.setdefault("files", {place: one for place in places if (one := _identity(place))})
+    changed = [place.name for place, one in known.items() if _identity(place) not in (one, None)]
+    if changed:
+        raise StoreDamaged(
+            f"store {public_address(connection.engine.url)}: is damaged ({' and '.join(changed)}: deleted, moved or "
+            "replaced while the store was open)"
+        )
+
+
+def _identity(place: Path) -> tuple[int, int] | tuple[()] | None:
+    """Device and inode of the file in a place; (): there is none; None: it cannot be told."""
+    try:
+        status = place.stat()
+    except FileNotFoundError:
+        return ()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _set_pragma(connection: Any, pragma: str) -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import shutil
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -96,6 +97,55 @@ def test_a_store_that_lost_acknowledged_messages_says_so_and_asks_for_them(tmp_p
     serve(path, look)
     (line,) = (record for record in caplog.records if record.message == "the store has lost messages")
     assert (line.had, line.has) == (5, 2)
+
+
+@pytest.mark.parametrize("name", ["twin.db", "twin.db-wal"])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_windows_are_not_acknowledged_into_a_file_that_is_gone(tmp_path, name, replaced):
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        (tmp_path / name).rename(tmp_path / "moved")
+        if replaced:
+            shutil.copy(tmp_path / "moved", tmp_path / name)
+        assert await send(client, 1) == [503]
+        health = await client.get("/healthz")
+        assert health.status_code == 503
+        assert f"({name}: deleted, moved or replaced while the store was open)" in health.json()["damage"]
+
+    serve(twin_file(tmp_path), body)
+
+
+def test_a_file_that_is_gone_is_noticed_without_a_window(tmp_path):
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        system.watch._check_some(0)
+        assert system.watch.fault == ""
+        (tmp_path / "twin.db").unlink()
+        system.watch._check_some(0)
+        assert "twin.db: deleted" in system.watch.fault
+
+    serve(twin_file(tmp_path), body)
+
+
+def test_a_store_that_lost_everything_asks_each_edge_once_it_has_come(tmp_path):
+    path = twin_file(tmp_path)
+
+    async def fill(_system, client):
+        assert await send(client, 0) == [201]
+
+    serve(path, fill)
+    (tmp_path / "twin.db").unlink()
+
+    async def look(system, client):
+        assert system.watch.lost
+        assert await send(client, 7) == [201]
+        system.watch._ask_for_windows()
+        assert posted(system) == []  # its edge has not polled yet, and would not take the serial
+        for _ in range(2):
+            system.watch._ask_for_windows()
+            assert posted(system) == [Resend("ax-1", reason="the twin's store has lost messages")]
+
+    serve(path, look)
 
 
 def test_windows_that_never_came_are_asked_for_once(tmp_path, caplog, monkeypatch):
