@@ -105,6 +105,17 @@ def test_a_store_that_cannot_be_backed_up_is_refused(url: str, tmp_path: Path) -
     store.close()
 
 
+def test_a_backup_replaces_another_one_only_if_told_so(url: str, tmp_path: Path) -> None:
+    to = tmp_path / "backup.db"
+    filled(url).close()
+    counts = backup(url, to)
+    before = to.read_bytes()
+    with pytest.raises(InvalidInput, match=r"backup.db: exists already; give another file, or --replace"):
+        backup(url, to)
+    assert to.read_bytes() == before
+    assert backup(url, to, replace=True) == counts
+
+
 def test_a_restore_overwrites_nothing(url: str, tmp_path: Path) -> None:
     store, saved = filled(url), tmp_path / "backup.db"
     backup(url, saved)
