@@ -229,7 +229,7 @@ class TwinService:
             self._spawn(self._missing.run())
             self._spawn(self.watch.run())
             self._spawn(self.watch.run_mark())
-            self._spawn(self.watch.run_lost(), vital=False)
+            self._spawn(self.watch.run_lost(self.polls.notify), vital=False)
         if not math.isinf(self.config.retention_days):
             self._spawn(self._apply_retention())
         if self._mqtt is not None:

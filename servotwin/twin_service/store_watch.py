@@ -110,12 +110,16 @@ class StoreWatch:
             with suppress(StoreUnavailable):
                 await self._executor.run(self.mark)
 
-    async def run_lost(self) -> None:
-        """Where the store has lost messages, ask the edges of servos too that it has lost: they are new to it."""
+    async def run_lost(self, notify: Callable[[str], None]) -> None:
+        """Where the store has lost messages, ask the edges of servos too that it has lost: they are new to it.
+
+        `notify` is called with each that was asked, so that its poll ends.
+        """
         while self.lost and not self.fault:
             await asyncio.sleep(_NEW_S)
             with suppress(StoreUnavailable):
-                await self._executor.run(self._ask_for_windows)
+                for servo in await self._executor.run(self._ask_for_windows):
+                    notify(servo)
 
     async def tell(self, announce: Callable[[str, str], None]) -> None:
         """Announce that the store has lost messages, if it has, and that it is damaged, once it is."""
@@ -154,12 +158,13 @@ class StoreWatch:
         self._met = self._servos()
         self._ask_for_windows()
 
-    def _ask_for_windows(self) -> None:
-        """Ask those edges for the windows that they still keep that were met before, and not asked yet."""
+    def _ask_for_windows(self) -> set[str]:
+        """Ask those edges for the windows that they still keep that were met before, and not asked yet; return them."""
         new = self._met - self._asked
         self._store.post({servo: encode(Resend(servo, reason=_LOST)) for servo in new}, self._wall())
         self._asked |= new
         self._met = self._servos()
+        return new
 
     def _servos(self) -> set[str]:
         names, after = set[str](), ""

@@ -13,7 +13,7 @@ from service_system import bearer, place, served, twin_file, window
 from servotwin.messages import Resend, decode, encode
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
-from servotwin.twin_service import missing_windows
+from servotwin.twin_service import missing_windows, store_watch
 
 PAGE = 8192
 Body = Callable[..., Awaitable[None]]
@@ -127,7 +127,8 @@ def test_a_file_that_is_gone_is_noticed_without_a_window(tmp_path):
     serve(twin_file(tmp_path), body)
 
 
-def test_a_store_that_lost_everything_asks_each_edge_once_it_has_come(tmp_path):
+@pytest.mark.slow
+def test_a_store_that_lost_everything_asks_each_edge_once_it_has_come(tmp_path, monkeypatch):
     path = twin_file(tmp_path)
 
     async def fill(_system, client):
@@ -135,17 +136,26 @@ def test_a_store_that_lost_everything_asks_each_edge_once_it_has_come(tmp_path):
 
     serve(path, fill)
     (tmp_path / "twin.db").unlink()
+    monkeypatch.setattr(store_watch, "_NEW_S", 0.01)
 
     async def look(system, client):
         assert system.watch.lost
+        waiting = asyncio.create_task(system.polls.messages("ax-1", 0, 30.0))
         assert await send(client, 7) == [201]
-        system.watch._ask_for_windows()
-        assert posted(system) == []  # its edge has not polled yet, and would not take the serial
+        (message,) = await waiting  # its poll ends, whatever the twin sends or does not send for the window
+        assert decode(message.body) == Resend("ax-1", reason="the twin's store has lost messages")
         for _ in range(2):
-            system.watch._ask_for_windows()
-            assert posted(system) == [Resend("ax-1", reason="the twin's store has lost messages")]
+            assert system.watch._ask_for_windows() == set()
 
     serve(path, look)
+
+
+def test_an_edge_is_not_asked_before_it_had_time_to_poll(tmp_path):
+    async def look(system, client):
+        assert await send(client, 7) == [201]
+        assert [system.watch._ask_for_windows() for _ in range(3)] == [set(), {"ax-1"}, set()]
+
+    serve(twin_file(tmp_path), look)
 
 
 def test_windows_that_never_came_are_asked_for_once(tmp_path, caplog, monkeypatch):
