@@ -267,7 +267,8 @@ class TwinService:
         fault = "" if self.tokens is None else self.tokens.fault
         former = [f"the former tokens stay in force: {fault}"] if fault else []
         own = *self._clock.sentences(), *self._certificate.sentences(), *self.wrong_tokens.sentences()
-        degraded = [*self._lagging(backlog), *former, *own]
+        away = [] if self._mqtt is None else self._mqtt.sentences()
+        degraded = [*self._lagging(backlog), *former, *away, *own]
         return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property
@@ -365,8 +366,7 @@ class TwinService:
         damaged = "1: the store is damaged, and is not written any more."
         add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))
         add("servotwin_store_checks", "Times that the whole store was checked.", lambda: self.watch.rounds)
-        mqtt = self._mqtt
-        if mqtt is not None:
+        if (mqtt := self._mqtt) is not None:
             add("servotwin_broker_connected", "1 while the MQTT broker is connected.", lambda: mqtt.connected)
         add(
             "servotwin_store_ok",
