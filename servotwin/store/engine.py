@@ -148,7 +148,17 @@ def is_damage(error: BaseException | None) -> bool:
 
 def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:
     reason = message.strip().splitlines()[0] if message.strip() else "no reason given"
-    return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason})")
+    return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason}{_closed_files(engine)})")
+
+
+def _closed_files(engine: sa.Engine) -> str:
+    """Names of the files that this user may not write: SQLite tells neither that nor which; a log keeps its mode."""
+    file = sqlite_file(engine.url)
+    if file is None:
+        return ""
+    places = [file.parent, *(file.with_name(f"{file.name}{end}") for end in ("", "-wal", "-shm"))]
+    closed = [str(place) for place in places if os.access(place, os.F_OK) and not os.access(place, os.W_OK)]
+    return f"; this user may not write {' and '.join(closed)}" if closed else ""
 
 
 def _postgresql(address: sa.URL) -> sa.Engine:
