@@ -100,7 +100,7 @@ def engines_of(address: sa.URL) -> Engines:
     Raises
     ------
     InvalidInput
-        The driver of PostgreSQL is missing, or an SQLite file cannot be created.
+        The driver of PostgreSQL is missing, or an SQLite file cannot be created, or is missing beside its log.
     """
     if address.get_backend_name() != SQLITE:
         engine = _postgresql(address)
@@ -257,6 +257,12 @@ def _pragmas(reading: bool) -> tuple[str, ...]:
 
 def _make_private(path: Path) -> None:
     """Create the file readable by its owner only; SQLite gives its log the same mode."""
+    log = path.with_name(f"{path.name}-wal")
+    if log.exists() and not path.exists():  # in this order: another process may be creating both
+        raise InvalidInput(
+            f"store {path}: is missing, but its log {log.name} exists, which a new store would delete; move the store "
+            "back beside it, or the log away"
+        )
     try:
         # With its mode from the start: between creation and a chmod others could open it.
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))

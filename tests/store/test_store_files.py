@@ -280,3 +280,14 @@ def test_a_store_that_cannot_be_written_names_the_file_whose_mode_is_in_the_way(
         raise sqlite3.OperationalError("attempt to write a readonly database")
     assert str(refused.value).endswith(f"(attempt to write a readonly database; this user may not write {log})")
     store.close()
+
+
+def test_a_log_whose_store_was_moved_away_is_not_deleted_by_a_new_store(url: str, tmp_path: Path) -> None:
+    store = filled(url)
+    (tmp_path / "store.db").rename(tmp_path / "moved.db")
+    with pytest.raises(InvalidInput, match=r"store.db: is missing, but its log store.db-wal exists"):
+        open_store(url)
+    assert (tmp_path / "store.db-wal").stat().st_size > 0
+    (tmp_path / "moved.db").rename(tmp_path / "store.db")
+    open_store(url).close()
+    store.close()
