@@ -16,6 +16,7 @@ from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
 from servotwin.store.engine import POSTGRESQL, parse_address, public_address, sqlite_file
 from servotwin.store.migrate import VERSIONS
+from servotwin.store.outgoing import fresh_serial
 from servotwin.store.schema import REVISION
 
 PAGES = 2048
@@ -93,7 +94,9 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
             # Serials that edges received after the backup must not be used again.
-            store.execute("UPDATE twins SET posted = posted + ?", (_SERIAL_MARGIN + 1,))
+            # Not by a margin alone: a second restore of one backup would use those of the first.
+            serials = (_SERIAL_MARGIN + 1, fresh_serial(time.time()))
+            store.execute("UPDATE twins SET posted = max(posted + ?, ?)", serials)
             _ask_for_windows(store)
         return counts
 

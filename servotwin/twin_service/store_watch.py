@@ -14,6 +14,7 @@ from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
 from servotwin.store.engine import StoreDamaged, StoreUnavailable, sqlite_file
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_files, check_pages, newest_message
+from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, PutResult, WorkResult
 from servotwin.store.store import Store
 from servotwin.twin_service.store_executor import StoreExecutor
@@ -30,9 +31,8 @@ _BODIES, _SHARE = 32, 0.02
 _MARK_S = 5.0
 """s between two notes of the newest message: as many acknowledged messages may go unnoticed if the log is lost."""
 _TELL_S = 1.0
-_NEW_S = 60.0
-"""s between two looks for servos that are new to a store that has lost messages: an edge polls meanwhile, and what is
-posted after that has a serial above those that it knows."""
+_NEW_S = 10.0
+"""s between two looks for servos that are new to a store that has lost messages."""
 _MARK = "newest"
 _LOST = "the twin's store has lost messages"
 
@@ -69,7 +69,7 @@ class StoreWatch:
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
-        self._met, self._asked = set[str](), set[str]()
+        self._asked = set[str]()
         self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
@@ -155,15 +155,14 @@ class StoreWatch:
             return
         log.error("the store has lost messages", extra={"had": noted, "has": newest})
         self.lost = f"its newest message is number {newest}, and it once had number {noted}"
-        self._met = self._servos()
         self._ask_for_windows()
 
     def _ask_for_windows(self) -> set[str]:
-        """Ask those edges for the windows that they still keep that were met before, and not asked yet; return them."""
-        new = self._met - self._asked
-        self._store.post({servo: encode(Resend(servo, reason=_LOST)) for servo in new}, self._wall())
+        """Ask those edges for the windows that they still keep that were not asked yet; return them."""
+        new, now = self._servos() - self._asked, self._wall()
+        asked = {servo: encode(Resend(servo, reason=_LOST)) for servo in new}
+        self._store.post(asked, now, above=fresh_serial(now))  # edges ignore serials up to the last one that they got
         self._asked |= new
-        self._met = self._servos()
         return new
 
     def _servos(self) -> set[str]:
