@@ -13,10 +13,10 @@ from servotwin.store.backup import RowCounts, backup, restore
 from servotwin.twin_service.twin_file import service_of
 
 
-def backup_store(config: Path, to: Path) -> None:
-    """Copy the store of a twin's file to a new file; raises InvalidInput as `store.backup.backup` does."""
+def backup_store(config: Path, to: Path, replace: bool) -> None:
+    """Copy the store of a twin's file to another file; raises InvalidInput as `store.backup.backup` does."""
     with _progress("copying") as report:
-        counts = backup(service_of(config).store, to, report)
+        counts = backup(service_of(config).store, to, report, replace)
     _print_counts(to, counts)
 
 

@@ -222,11 +222,12 @@ def replay(
 def backup(
     to: Annotated[Path, typer.Argument(help="File to write.")],
     config: Annotated[Path, typer.Option(help="The twin's file.")] = Path("twin.toml"),
+    replace: Annotated[bool, typer.Option("--replace", help="Replace the file if it exists.")] = False,
 ) -> None:
     """Copy the twin's SQLite store as of one moment, while the twin runs on."""
     from servotwin.cli.backup import backup_store
 
-    backup_store(config, to)
+    backup_store(config, to, replace)
 
 
 def restore(

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from servotwin.edge.recorder import Cut
 from servotwin.edge.settings import AgentSettings
-from servotwin.edge.window_filter import WindowFilter
+from servotwin.edge.window_filter import WindowFilter, WindowFilterSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.outbox import MemoryOutbox, Outbox
 from servotwin.messages import (
@@ -115,17 +115,20 @@ class WindowWriter:
         Settings of that boot; its window filter goes on from the state that an earlier boot left in the outbox.
     outbox : Outbox
     faults : Counter, optional
-        Counts the windows whose filter failed, which are then sent; None: such an error is raised.
+        Counts the windows whose filter failed or did not start, which are then sent; None: such an error is raised.
     """
 
     def __init__(self, settings: AgentSettings, outbox: Outbox, faults: Counter[str] | None = None) -> None:
         self._settings, self._outbox, self._faults = settings, outbox, faults
         self._filter: WindowFilter | None = None
+        self._not_started = False
         if settings.window_filter is not None:
             try:
-                self._filter = settings.window_filter.start(outbox.value(_FILTER_STATE))
-            except InvalidInput:
-                self._filter = settings.window_filter.start()
+                self._filter = _started(settings.window_filter, outbox.value(_FILTER_STATE))
+            except Exception:  # its libraries may not run here: without machine code that is made at run time
+                if faults is None:
+                    raise
+                self._not_started = True
 
     def write(self, cut: Cut) -> None:
         """Put a window into the outbox, or count why it is not sent."""
@@ -156,6 +159,8 @@ class WindowWriter:
 
     def _filtered(self, cut: Cut) -> Cut | None:
         if self._filter is None:
+            if self._not_started and self._faults is not None:
+                self._faults[UNFILTERED] += 1
             return cut
         try:
             chosen = self._filter(cut)
@@ -166,6 +171,14 @@ class WindowWriter:
             return cut
         self._outbox.set_value(_FILTER_STATE, self._filter.dumps())
         return chosen
+
+
+def _started(settings: WindowFilterSettings, saved: bytes | None) -> WindowFilter:
+    """Start a filter on what an earlier boot left; anew where that is none of its states."""
+    try:
+        return settings.start(saved)
+    except InvalidInput:
+        return settings.start()
 
 
 class LocalOutlet:

@@ -136,7 +136,8 @@ class Connection:
 
     def __init__(self, broker: Broker, session: MqttSession, events: MqttCallbacks) -> None:
         self._session, self._events = session, events
-        self._number, self._fresh, self._up, self._closing = 0, True, False, False
+        self._number, self._fresh, self._up, self._answered, self._closing = 0, True, False, False, False
+        self._hint = "" if broker.tls else ": where its port is one with TLS, url begins with mqtts://"
         self._client = _client(broker, session)
         self._client.on_socket_open = _no_delay
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
@@ -166,6 +167,7 @@ class Connection:
         timer.join()
 
     def _connected(self, client: Client, _user: Any, flags: Any, reason: Any, _properties: Any) -> None:
+        self._answered = True
         if reason.is_failure:
             self._events.lost(f"the broker refuses the connection ({reason})")
             return
@@ -183,7 +185,9 @@ class Connection:
     def _disconnected(self, _client: Client, _user: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if self._up and not self._closing:
             self._events.lost(f"the connection to the broker broke ({reason})")
-        self._up = False
+        if not (self._answered or self._closing):
+            self._events.lost(f"the broker ended the connection before it answered{self._hint}")
+        self._up = self._answered = False
 
     def _failed(self, _client: Client, _user: Any) -> None:
         # paho calls this while it handles the exception, which it does not pass on.

@@ -16,6 +16,7 @@ from servotwin.messages import Resend, encode
 from servotwin.runtime.files import atomic_output
 from servotwin.store.engine import POSTGRESQL, parse_address, public_address, sqlite_file
 from servotwin.store.migrate import VERSIONS
+from servotwin.store.outgoing import fresh_serial
 from servotwin.store.schema import REVISION
 
 PAGES = 2048
@@ -38,7 +39,7 @@ class RowCounts(NamedTuple):
     outgoing: int
 
 
-def backup(url: str, to: Path, progress: Progress | None = None) -> RowCounts:
+def backup(url: str, to: Path, progress: Progress | None = None, replace: bool = False) -> RowCounts:
     """Copy a store as of one moment into a new file; writers continue meanwhile.
 
     The copy is verified before it gets its name: it is complete or absent. Only its owner may read it.
@@ -48,7 +49,9 @@ def backup(url: str, to: Path, progress: Progress | None = None) -> RowCounts:
     url : str
         Of an SQLite store; for PostgreSQL the error names the command to use.
     to : Path
-        Overwritten if it exists.
+    progress : callable, optional
+    replace : bool
+        Allow `to` to exist: an emptied store must not take the place of its last good backup unasked.
 
     Returns
     -------
@@ -58,13 +61,15 @@ def backup(url: str, to: Path, progress: Progress | None = None) -> RowCounts:
     Raises
     ------
     InvalidInput
-        There is no store, it is in PostgreSQL, or the file cannot be written.
+        There is no store, it is in PostgreSQL, or the file exists or cannot be written.
     """
     source = _source_file(url, "pg_dump --format=custom --file={} DATABASE", to)
     if not source.is_file():
         raise InvalidInput(f"store {source}: there is no such file; give that of a store")
     if to.exists() and to.samefile(source):
         raise InvalidInput(f"backup {to}: is the store itself; give another file")
+    if to.exists() and not replace:
+        raise InvalidInput(f"backup {to}: exists already; give another file, or --replace to replace it")
     with atomic_output(to, PRIVATE) as temporary:
         return _copied(source, temporary, progress)
 
@@ -89,7 +94,9 @@ def restore(backed_up: Path, url: str, progress: Progress | None = None) -> RowC
         counts = _copied(backed_up, temporary, progress)
         with _opened(temporary, "mode=rw") as store:
             # Serials that edges received after the backup must not be used again.
-            store.execute("UPDATE twins SET posted = posted + ?", (_SERIAL_MARGIN + 1,))
+            # Not by a margin alone: a second restore of one backup would use those of the first.
+            serials = (_SERIAL_MARGIN + 1, fresh_serial(time.time()))
+            store.execute("UPDATE twins SET posted = max(posted + ?, ?)", serials)
             _ask_for_windows(store)
         return counts
 

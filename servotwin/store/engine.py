@@ -100,7 +100,7 @@ def engines_of(address: sa.URL) -> Engines:
     Raises
     ------
     InvalidInput
-        The driver of PostgreSQL is missing, or an SQLite file cannot be created.
+        The driver of PostgreSQL is missing, or an SQLite file cannot be created, or is missing beside its log.
     """
     if address.get_backend_name() != SQLITE:
         engine = _postgresql(address)
@@ -148,7 +148,17 @@ def is_damage(error: BaseException | None) -> bool:
 
 def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:
     reason = message.strip().splitlines()[0] if message.strip() else "no reason given"
-    return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason})")
+    return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason}{_closed_files(engine)})")
+
+
+def _closed_files(engine: sa.Engine) -> str:
+    """Names of the files that this user may not write: SQLite tells neither that nor which; a log keeps its mode."""
+    file = sqlite_file(engine.url)
+    if file is None:
+        return ""
+    places = [file.parent, *(file.with_name(f"{file.name}{end}") for end in ("", "-wal", "-shm"))]
+    closed = [str(place) for place in places if os.access(place, os.F_OK) and not os.access(place, os.W_OK)]
+    return f"; this user may not write {' and '.join(closed)}" if closed else ""
 
 
 def _postgresql(address: sa.URL) -> sa.Engine:
@@ -184,8 +194,42 @@ def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:
     @event.listens_for(engine, "begin")
     def begin_transaction(connection: sa.Connection) -> None:
         connection.exec_driver_sql(begin)
+        if not reading:
+            _check_files(connection)
 
     return engine
+
+
+def _check_files(connection: sa.Connection) -> None:
+    """Refuse to write to files that are open and no longer in their places: they are gone once this process ends.
+
+    Raises
+    ------
+    StoreDamaged
+        The file, or its log, was deleted, moved or replaced since the connection first wrote.
+    """
+    file = sqlite_file(connection.engine.url)
+    if file is None:
+        return
+    places = file, file.with_name(f"{file.name}-wal")
+    known = connection.info.setdefault("files", {place: one for place in places if (one := _identity(place))})
+    changed = [place.name for place, one in known.items() if _identity(place) not in (one, None)]
+    if changed:
+        raise StoreDamaged(
+            f"store {public_address(connection.engine.url)}: is damaged ({' and '.join(changed)}: deleted, moved or "
+            "replaced while the store was open)"
+        )
+
+
+def _identity(place: Path) -> tuple[int, int] | tuple[()] | None:
+    """Device and inode of the file in a place; (): there is none; None: it cannot be told."""
+    try:
+        status = place.stat()
+    except FileNotFoundError:
+        return ()
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
 
 
 def _set_pragma(connection: Any, pragma: str) -> None:
@@ -213,6 +257,12 @@ def _pragmas(reading: bool) -> tuple[str, ...]:
 
 def _make_private(path: Path) -> None:
     """Create the file readable by its owner only; SQLite gives its log the same mode."""
+    log = path.with_name(f"{path.name}-wal")
+    if log.exists() and not path.exists():  # in this order: another process may be creating both
+        raise InvalidInput(
+            f"store {path}: is missing, but its log {log.name} exists, which a new store would delete; move the store "
+            "back beside it, or the log away"
+        )
     try:
         # With its mode from the start: between creation and a chmod others could open it.
         os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))

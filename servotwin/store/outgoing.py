@@ -27,9 +27,16 @@ def newest_serials(connection: sa.Connection, servos: Collection[str]) -> dict[s
     return newest
 
 
-def post(connection: sa.Connection, sent: Mapping[str, bytes], now: float) -> None:
-    """Append a message to each edge's, outside of any result; unknown servos are left out."""
+def fresh_serial(now: float) -> int:
+    """Serial above those of all messages before `now` (s since the epoch), also of a store that has lost some: ms."""
+    return int(1000.0 * now)
+
+
+def post(connection: sa.Connection, sent: Mapping[str, bytes], now: float, above: int = 0) -> None:
+    """Append a message to each edge's, outside of any result, its serial above `above`; unknown servos are left out."""
     for servo, body in sorted(sent.items()):
+        if above:
+            skip_to_serial(connection, servo, above)
         newer = sa.update(twins).where(twins.c.servo == servo).values(posted=twins.c.posted + 1)
         serial = connection.execute(newer.returning(twins.c.posted)).scalar()
         if serial is not None:

@@ -179,9 +179,9 @@ class Store:
             self._write(lambda connection: posting.skip_to_serial(connection, servo, after))
         return messages
 
-    def post(self, sent: Mapping[str, bytes], now: float) -> None:
-        """Post a message to each of these edges; unknown servos are left out."""
-        self._write(lambda connection: posting.post(connection, sent, now))
+    def post(self, sent: Mapping[str, bytes], now: float, above: int = 0) -> None:
+        """Post a message to each of these edges, its serial above `above`; unknown servos are left out."""
+        self._write(lambda connection: posting.post(connection, sent, now, above))
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""

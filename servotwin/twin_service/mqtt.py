@@ -161,7 +161,8 @@ class MqttServer:
 
     Attributes
     ----------
-    connected : bool
+    trouble : str
+        Why the broker is not connected; empty: it is.
     """
 
     def __init__(self, broker: Broker, handler: MqttRequestHandler, group: str) -> None:
@@ -169,7 +170,16 @@ class MqttServer:
         self._tasks: set[asyncio.Task[None]] = set()
         self._held_back = 0
         self._connection: Connection | None = None
-        self.connected = False
+        self.trouble = "it has not answered yet"
+
+    @property
+    def connected(self) -> bool:
+        """The broker is connected."""
+        return not self.trouble
+
+    def sentences(self) -> list[str]:
+        """Why the broker is not connected; empty: it is."""
+        return [f"the MQTT broker is not connected: {self.trouble}"] if self.trouble else []
 
     async def start(self) -> None:
         """Connect, and reconnect whenever the connection is lost."""
@@ -242,10 +252,10 @@ class MqttServer:
         return True
 
     def _on_connected(self, _session_lost: bool) -> None:
-        self.connected = True
+        self.trouble = ""
         log.info("broker connected", extra={"broker": self._broker.url, "group": self._group})
 
     def _on_lost(self, why: str) -> None:
-        if self.connected:
+        if why != self.trouble:  # each reason once: it is tried again every few seconds
             log.warning("broker lost", extra={"broker": self._broker.url, "why": why})
-        self.connected = False
+        self.trouble = why

@@ -229,6 +229,7 @@ class TwinService:
             self._spawn(self._missing.run())
             self._spawn(self.watch.run())
             self._spawn(self.watch.run_mark())
+            self._spawn(self.watch.run_lost(self.polls.notify), vital=False)
         if not math.isinf(self.config.retention_days):
             self._spawn(self._apply_retention())
         if self._mqtt is not None:
@@ -266,7 +267,8 @@ class TwinService:
         fault = "" if self.tokens is None else self.tokens.fault
         former = [f"the former tokens stay in force: {fault}"] if fault else []
         own = *self._clock.sentences(), *self._certificate.sentences(), *self.wrong_tokens.sentences()
-        degraded = [*self._lagging(backlog), *former, *own]
+        away = [] if self._mqtt is None else self._mqtt.sentences()
+        degraded = [*self._lagging(backlog), *former, *away, *own]
         return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property
@@ -364,8 +366,7 @@ class TwinService:
         damaged = "1: the store is damaged, and is not written any more."
         add("servotwin_store_damaged", damaged, lambda: bool(self.watch.fault))
         add("servotwin_store_checks", "Times that the whole store was checked.", lambda: self.watch.rounds)
-        mqtt = self._mqtt
-        if mqtt is not None:
+        if (mqtt := self._mqtt) is not None:
             add("servotwin_broker_connected", "1 while the MQTT broker is connected.", lambda: mqtt.connected)
         add(
             "servotwin_store_ok",

@@ -13,7 +13,8 @@ from typing import TypeVar
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
 from servotwin.store.engine import StoreDamaged, StoreUnavailable, sqlite_file
-from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message
+from servotwin.store.integrity import IntegrityReport, check_bodies, check_files, check_pages, newest_message
+from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, PutResult, WorkResult
 from servotwin.store.store import Store
 from servotwin.twin_service.store_executor import StoreExecutor
@@ -30,6 +31,8 @@ _BODIES, _SHARE = 32, 0.02
 _MARK_S = 5.0
 """s between two notes of the newest message: as many acknowledged messages may go unnoticed if the log is lost."""
 _TELL_S = 1.0
+_NEW_S = 10.0
+"""s between two looks for servos that are new to a store that has lost messages."""
 _MARK = "newest"
 _LOST = "the twin's store has lost messages"
 
@@ -66,6 +69,7 @@ class StoreWatch:
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
+        self._asked = set[str]()
         self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
@@ -106,6 +110,17 @@ class StoreWatch:
             with suppress(StoreUnavailable):
                 await self._executor.run(self.mark)
 
+    async def run_lost(self, notify: Callable[[str], None]) -> None:
+        """Where the store has lost messages, ask the edges of servos too that it has lost: they are new to it.
+
+        `notify` is called with each that was asked, so that its poll ends.
+        """
+        while self.lost and not self.fault:
+            await asyncio.sleep(_NEW_S)
+            with suppress(StoreUnavailable):
+                for servo in await self._executor.run(self._ask_for_windows):
+                    notify(servo)
+
     async def tell(self, announce: Callable[[str, str], None]) -> None:
         """Announce that the store has lost messages, if it has, and that it is damaged, once it is."""
         if self.lost:
@@ -140,14 +155,26 @@ class StoreWatch:
             return
         log.error("the store has lost messages", extra={"had": noted, "has": newest})
         self.lost = f"its newest message is number {newest}, and it once had number {noted}"
-        after = ""
+        self._ask_for_windows()
+
+    def _ask_for_windows(self) -> set[str]:
+        """Ask those edges for the windows that they still keep that were not asked yet; return them."""
+        new, now = self._servos() - self._asked, self._wall()
+        asked = {servo: encode(Resend(servo, reason=_LOST)) for servo in new}
+        self._store.post(asked, now, above=fresh_serial(now))  # edges ignore serials up to the last one that they got
+        self._asked |= new
+        return new
+
+    def _servos(self) -> set[str]:
+        names, after = set[str](), ""
         while summaries := self._store.servos(after):
             after = summaries[-1].servo
-            asked = {one.servo: encode(Resend(one.servo, reason=_LOST)) for one in summaries}
-            self._store.post(asked, self._wall())
+            names.update(one.servo for one in summaries)
+        return names
 
     def _check_some(self, after: int) -> int:
         """Check the next bodies, and the pages where a round ends; returns the id of the last one, 0 after a round."""
+        self._found(check_files(self._store))
         result, last = check_bodies(self._store, after, _BODIES)
         self._found(result)
         if not result.complete:

@@ -100,6 +100,20 @@ def test_a_window_whose_filter_fails_is_sent(
     assert handler.faults == {UNFILTERED: 1}
 
 
+def test_windows_whose_filter_cannot_start_are_sent(
+    handler: FrameHandler, outbox: SqliteOutbox, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def start(_filter: FailingFilter, _saved: bytes | None = None) -> FailingFilter:
+        raise PermissionError(13, "cannot allocate executable memory")  # numba's, under MemoryDenyWriteExecute
+
+    monkeypatch.setattr(FailingFilter, "start", start)
+    monkeypatch.setattr(handler, "_config", replace(CONFIG, agent=replace(SETTINGS, window_filter=FailingFilter())))
+    handler.handle(cut(0))
+    handler.handle(cut(1))
+    assert outbox.pending() == [("b1", 0), ("b1", 1)]
+    assert handler.faults == {UNFILTERED: 2}
+
+
 def test_a_response_at_which_the_filter_fails_is_counted(
     handler: FrameHandler, monkeypatch: pytest.MonkeyPatch
 ) -> None:

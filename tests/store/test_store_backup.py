@@ -4,6 +4,7 @@ import os
 import shutil
 import sqlite3
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -103,6 +104,32 @@ def test_a_store_that_cannot_be_backed_up_is_refused(url: str, tmp_path: Path) -
         backup(url, tmp_path / "nowhere" / "backup.db")
     assert not to.exists()
     store.close()
+
+
+def test_a_second_restore_of_a_backup_continues_above_the_serials_of_the_first(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    saved, newest = tmp_path / "backup.db", []
+    filled(url).close()
+    backup(url, saved)
+    for now, name in ((1.8e9, "once.db"), (1.8e9 + 60.0, "again.db")):
+        monkeypatch.setattr(time, "time", lambda now=now: now)
+        restore(saved, str(tmp_path / name))
+        store = open_store(str(tmp_path / name))
+        newest.append(store.posted(["a"])["a"])
+        store.close()
+    assert newest[1] == newest[0] + 60_000  # a message in a millisecond is more than an edge is sent
+
+
+def test_a_backup_replaces_another_one_only_if_told_so(url: str, tmp_path: Path) -> None:
+    to = tmp_path / "backup.db"
+    filled(url).close()
+    counts = backup(url, to)
+    before = to.read_bytes()
+    with pytest.raises(InvalidInput, match=r"backup.db: exists already; give another file, or --replace"):
+        backup(url, to)
+    assert to.read_bytes() == before
+    assert backup(url, to, replace=True) == counts
 
 
 def test_a_restore_overwrites_nothing(url: str, tmp_path: Path) -> None:

@@ -266,3 +266,28 @@ def test_servos_are_locked_in_one_order_whatever_language_the_database_sorts_in(
     store.close()
     assert by_people != sorted(names)
     assert [row.servo for row in held] == sorted(names)
+
+
+def test_a_store_that_cannot_be_written_names_the_file_whose_mode_is_in_the_way(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = filled(url)
+    log = tmp_path / "store.db-shm"
+    assert log.exists()
+    access = os.access
+    monkeypatch.setattr(os, "access", lambda place, mode: (place != log or mode != os.W_OK) and access(place, mode))
+    with pytest.raises(StoreUnavailable) as refused, transaction(store.engines.writer):
+        raise sqlite3.OperationalError("attempt to write a readonly database")
+    assert str(refused.value).endswith(f"(attempt to write a readonly database; this user may not write {log})")
+    store.close()
+
+
+def test_a_log_whose_store_was_moved_away_is_not_deleted_by_a_new_store(url: str, tmp_path: Path) -> None:
+    store = filled(url)
+    (tmp_path / "store.db").rename(tmp_path / "moved.db")
+    with pytest.raises(InvalidInput, match=r"store.db: is missing, but its log store.db-wal exists"):
+        open_store(url)
+    assert (tmp_path / "store.db-wal").stat().st_size > 0
+    (tmp_path / "moved.db").rename(tmp_path / "store.db")
+    open_store(url).close()
+    store.close()

@@ -2,6 +2,7 @@
 
 import asyncio
 import os
+import shutil
 from collections.abc import Awaitable, Callable
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from service_system import bearer, place, served, twin_file, window
 from servotwin.messages import Resend, decode, encode
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
-from servotwin.twin_service import missing_windows
+from servotwin.twin_service import missing_windows, store_watch
 
 PAGE = 8192
 Body = Callable[..., Awaitable[None]]
@@ -96,6 +97,71 @@ def test_a_store_that_lost_acknowledged_messages_says_so_and_asks_for_them(tmp_p
     serve(path, look)
     (line,) = (record for record in caplog.records if record.message == "the store has lost messages")
     assert (line.had, line.has) == (5, 2)
+
+
+@pytest.mark.parametrize("name", ["twin.db", "twin.db-wal"])
+@pytest.mark.parametrize("replaced", [False, True])
+def test_windows_are_not_acknowledged_into_a_file_that_is_gone(tmp_path, name, replaced):
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        (tmp_path / name).rename(tmp_path / "moved")
+        if replaced:
+            shutil.copy(tmp_path / "moved", tmp_path / name)
+        assert await send(client, 1) == [503]
+        health = await client.get("/healthz")
+        assert health.status_code == 503
+        assert f"({name}: deleted, moved or replaced while the store was open)" in health.json()["damage"]
+
+    serve(twin_file(tmp_path), body)
+
+
+def test_a_file_that_is_gone_is_noticed_without_a_window(tmp_path):
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        system.watch._check_some(0)
+        assert system.watch.fault == ""
+        (tmp_path / "twin.db").unlink()
+        system.watch._check_some(0)
+        assert "twin.db: deleted" in system.watch.fault
+
+    serve(twin_file(tmp_path), body)
+
+
+@pytest.mark.slow
+def test_a_store_that_lost_everything_asks_each_edge_once_it_has_come(tmp_path, monkeypatch):
+    path = twin_file(tmp_path)
+
+    async def fill(_system, client):
+        assert await send(client, 0) == [201]
+
+    serve(path, fill)
+    (tmp_path / "twin.db").unlink()
+    monkeypatch.setattr(store_watch, "_NEW_S", 0.01)
+
+    async def look(system, client):
+        assert system.watch.lost
+        waiting = asyncio.create_task(system.polls.messages("ax-1", 0, 30.0))
+        assert await send(client, 7) == [201]
+        (message,) = await waiting  # its poll ends, whatever the twin sends or does not send for the window
+        assert decode(message.body) == Resend("ax-1", reason="the twin's store has lost messages")
+        for _ in range(2):
+            assert system.watch._ask_for_windows() == set()
+
+    serve(path, look)
+
+
+def test_what_a_store_that_lost_messages_asks_has_a_serial_that_no_edge_has_yet(tmp_path):
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        system.store.post({"ax-1": encode(Resend("ax-1"))}, 1.0)
+        (before,) = system.store.outgoing("ax-1", 0)
+        with system.store.engines.writer.begin() as connection:  # as where this message, and its serial, were lost
+            connection.exec_driver_sql("UPDATE twins SET posted = 0")
+            connection.exec_driver_sql("DELETE FROM outgoing")
+        system.watch._ask_for_windows()
+        assert len(system.store.outgoing("ax-1", before.serial)) == 1
+
+    serve(twin_file(tmp_path), body)
 
 
 def test_windows_that_never_came_are_asked_for_once(tmp_path, caplog, monkeypatch):

@@ -1,0 +1,45 @@
+"""A broker that cannot be reached, or does not answer, is said with its reason; no broker is needed."""
+
+import queue
+import socket
+from typing import Any
+
+import pytest
+from mosquitto import free_port
+from mqttparts import PATIENCE
+
+from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
+from servotwin.twin_service.mqtt import MqttServer
+
+
+def test_a_twin_that_never_reached_its_broker_says_why_once(caplog: pytest.LogCaptureFixture) -> None:
+    handler: Any = None
+    server = MqttServer(Broker(f"mqtt://127.0.0.1:{free_port()}"), handler, "twins")
+    assert server.sentences() == ["the MQTT broker is not connected: it has not answered yet"]
+    for why in ("refused", "refused", "not authorized"):
+        server._on_lost(why)
+    assert [record.why for record in caplog.records if record.message == "broker lost"] == ["refused", "not authorized"]
+    assert server.sentences() == ["the MQTT broker is not connected: not authorized"]
+    server._on_connected(False)
+    assert (server.connected, server.sentences()) == (True, [])
+    server._on_lost("refused")
+    assert caplog.messages.count("broker lost") == 3
+
+
+@pytest.mark.slow
+def test_a_broker_that_ends_the_connection_unanswered_is_said_with_the_likely_reason() -> None:
+    """As mosquitto does at a port with TLS, where the client speaks none."""
+    said: queue.Queue[str] = queue.Queue()
+    with socket.create_server(("127.0.0.1", 0)) as port:
+        url = f"mqtt://127.0.0.1:{port.getsockname()[1]}"
+        quiet = MqttCallbacks(lambda *_: None, lambda _: None, said.put)
+        connection = Connection(Broker(url), MqttSession("edge", ("t",), 60), quiet)
+        try:
+            port.accept()[0].close()
+            why = said.get(timeout=PATIENCE)
+        finally:
+            connection.close()
+    assert (
+        why
+        == "the broker ended the connection before it answered: where its port is one with TLS, url begins with mqtts://"
+    )
