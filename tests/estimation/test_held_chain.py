@@ -100,6 +100,17 @@ def test_friction_that_is_twice_the_stated_one_is_no_gap() -> None:
     assert "with the stated load friction the gap would be" in estimate.reasons[0]
 
 
+def test_friction_that_falls_with_the_speed_widens_the_interval() -> None:
+    axis = screw_axis(3, 0.02)
+    falling = axis.replace(load=dataclasses.replace(axis.load, static=0.024, stribeck=1e-3))
+    window = measured(worn(falling), noise=1e-6)
+    plain, stated = estimate_gap(window, axis), estimate_gap(window, falling)
+    assert stated.ok
+    assert abs(stated.gap - GAP) < math.radians(0.05)
+    assert stated.interval[0] < GAP < stated.interval[1]
+    assert stated.std_total > plain.std_total
+
+
 def test_a_loop_that_touches_one_side_gets_a_lower_bound() -> None:
     run = worn(screw_axis(3, 0.1), CALM)
     estimate = estimate_gap(measured(run, 3.8, 2.0, noise=1e-6), screw_axis(3, 0.1))

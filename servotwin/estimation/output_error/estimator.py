@@ -36,7 +36,6 @@ from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
 from servotwin.plant.basis import BacklashKind
-from servotwin.plant.load import LINEAR
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -197,13 +196,6 @@ def _prepared(
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:
     """The motor's angle of a window that can be fitted."""
-    if isinstance(axis, Axis) and axis.guide.stribeck.slope:
-        unit = "N" if axis.load.motion == LINEAR else "N m"
-        where = f"load {axis.load.key('static')} = {axis.load.static!r} {unit}: "
-        raise InvalidInput(
-            f"{where}the estimate of the gap knows no friction of the load that falls with its speed; "
-            "leave static friction and Stribeck speed out of the model for an estimate with Coulomb friction"
-        )
     if isinstance(axis, Servo) or has_servo(axis):
         raise InvalidInput(
             f"method {METHOD!r} is for a shaft that is free in the gap, a load with friction, or one mass: "

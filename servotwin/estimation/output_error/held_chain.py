@@ -10,7 +10,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.estimation.output_error.models import Motion, Priors, Unknown, common, fine_parts, gains, independent
+from servotwin.estimation.output_error.models import (
+    Motion,
+    Priors,
+    Unknown,
+    common,
+    fine_parts,
+    gains,
+    independent,
+    other_friction,
+)
 from servotwin.estimation.output_error.shaft import advance, between, slow_after, slow_before
 from servotwin.hybrid.compiled import bare
 from servotwin.hybrid.exponential import expm1
@@ -156,8 +165,8 @@ class HeldChainModel:
     def hidden_friction(self, values: Array) -> float:
         """Change of the half gap (m or rad at the load) that hides a load friction other than the model's own."""
         named = dict(zip(self._names, values.tolist(), strict=True))
-        wound_up = self.axis.load.friction * self.moving.flexibility() * math.exp(-named[STIFFNESS])
-        return abs(math.expm1(named.get(FRICTION, 0.0))) * wound_up
+        softness = math.exp(-named[STIFFNESS]) * self.moving.flexibility()
+        return softness * other_friction(self.axis, named.get(FRICTION, 0.0))
 
     def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
         """Motion under the motor's motion (N,) at the load, for unknowns (u,).

@@ -115,6 +115,12 @@ def common(priors: Priors) -> tuple[Unknown, ...]:
     )
 
 
+def other_friction(axis: Axis, factor: float) -> float:
+    """Friction of the load (N; rotary: N m) beyond the stated Coulomb friction: by its fitted factor, a logarithm, and
+    where it falls with the speed."""
+    return abs(math.expm1(factor)) * axis.load.friction + axis.guide.stribeck.drop
+
+
 class PreparedShaft(NamedTuple):
     """Numbers of a simulation of `ShaftModel`, as `run_shaft` takes them.
 
@@ -231,11 +237,11 @@ class ShaftModel:
         """Change of the half gap (m or rad at the load) that hides a load friction other than the model's own.
 
         Reversed slowly, the load follows its motor behind half the gap and what friction winds up of the shaft: these
-        two are told apart by quick motion only.
+        two are told apart by quick motion only. Friction that falls with the speed is another one at every speed.
         """
         named = {unknown.name: value for unknown, value in zip(self.unknowns, values.tolist(), strict=True)}
         stiffness = math.exp(named["shaft stiffness"]) * self.axis.transmission.k_d
-        return abs(math.expm1(named.get("load friction", 0.0))) * self.axis.load.friction / stiffness
+        return other_friction(self.axis, named.get("load friction", 0.0)) / stiffness
 
     def prepared(self, drive: Array, interval: float, values: Array) -> PreparedShaft:
         """The numbers of a simulation under the motor's motion (N,) at the load, for unknowns (u,)."""
