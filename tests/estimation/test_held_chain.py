@@ -137,6 +137,13 @@ def test_the_methods_of_a_servo_refuse_friction_in_a_sentence() -> None:
         estimate_gap(window, screw_axis(2, 0.1), "whitened")
 
 
+def test_spikes_of_the_position_are_refused() -> None:
+    window = measured(worn(screw_axis(2, 0.1)), noise=1e-6)
+    spiked = window.position.copy()
+    spiked[[2000, 7000]] += 2e-4
+    assert estimate_gap(window.replace(position=spiked), screw_axis(2, 0.1)).status is GapStatus.MODEL_MISMATCH
+
+
 @pytest.mark.parametrize("friction", [0.01, 0.05])
 def test_a_servo_names_friction_that_nobody_stated(friction: float) -> None:
     window = measured(worn(screw_axis(3, friction)), noise=1e-6)

@@ -112,10 +112,9 @@ def estimate(
 
 
 def _broken(window: Window, axis: Axis) -> tuple[str, ...]:
-    """Faults of the channels; of a rigid transmission dead ones only: it stops its load as abruptly as others do."""
+    """Faults of the channels; of a load that is the screw dead ones only: that stops as abruptly as they do."""
     sentences = faults(window, axis.load.motion)
-    free = axis.backlash_kind is BacklashKind.FREE
-    return sentences if free else tuple(sentence for sentence in sentences if "constant" in sentence)
+    return tuple(sentence for sentence in sentences if "constant" in sentence) if follows(axis) else sentences
 
 
 def _wrong_channel(window: Window, theta_m: Array, axis: Axis) -> tuple[str, ...]:
