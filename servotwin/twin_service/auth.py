@@ -284,6 +284,8 @@ def read_tokens(path: Path) -> Verifiers:
     if not path.exists():
         raise InvalidInput(f"{path}: there is no such file of tokens; `servotwin enroll` makes it")
     _check_private(path)
+    if not path.read_bytes().strip():
+        raise InvalidInput(f"{path}: is empty; copy it again, or remove it, so that `servotwin enroll` makes a new one")
     check_complete(path, "copy it again")
     table = read_toml(path)
     servos, operators, engineers = (_read_verifiers(table.table(name)) for name in ("servos", "operators", "engineers"))

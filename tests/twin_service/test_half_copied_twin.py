@@ -93,7 +93,7 @@ def test_wherever_the_tokens_are_cut_the_file_is_refused_and_the_former_tokens_s
         file.access.check_servo("ax-1", TOKEN.encode())
     at_a_line = text[: text.index("[operators]")]
     for cut, sentence in (
-        ("", "is empty; it must hold"),
+        ("", "is empty; copy it again"),
         (at_a_line, "is cut short: its line '# end' is missing; copy"),
     ):
         path.write_text(cut)
