@@ -132,6 +132,7 @@ def enroll(
         raise InvalidInput("give --noise-um, or --noise-mdeg of a rotary axis")
     if operator is not None and engineer is not None:
         raise InvalidInput("give --operator or --engineer: a name has one role")
+    folders = list[Path]()
     if operator is not None or engineer is not None:
         file = operator or engineer or Path()
         written = enrolment.enroll_operator(config, name or "", file, again, engineer=engineer is not None)
@@ -148,11 +149,15 @@ def enroll(
             ca=ca,
         )
         if csv is not None:
-            written = enroll_all(config, csv, read_enrolments(csv, request))
+            requests = read_enrolments(csv, request)
+            folders, written = [each.folder for each in requests.values()], enroll_all(config, csv, requests)
         else:
-            written = enrolment.enroll(config, request)
+            folders, written = [request.folder], enrolment.enroll(config, request)
     for path in written:
         print(f"written: {path}")
+    for path in (folder / enrolment.CONFIG for folder in folders):
+        if path not in written:
+            print(f"kept: {path}, with the limits and options of its enrolment; for others give --edge a new folder")
 
 
 def revoke(

@@ -59,6 +59,9 @@ class Form(StrEnum):
 ANY = Range()
 
 
+ORDERED = ", the lower one first"
+
+
 @dataclass(frozen=True)
 class Key:
     """The metadata of one attribute; `key` and `value` make it."""
@@ -80,6 +83,7 @@ class Key:
     form: Form | None = None
     in_file: bool = True
     later: bool = False
+    ordered: bool = False
 
 
 def key(
@@ -103,6 +107,7 @@ def key(
     dump: Callable[[Any], dict[str, Any]] | None = None,
     form: Form | None = None,
     later: bool = False,
+    ordered: bool = False,
 ) -> Key:
     """Declare the TOML key of an attribute.
 
@@ -138,12 +143,14 @@ def key(
         Form in a file of what `parse` converts.
     later : bool
         Released versions refuse the key: the default is not written, so that they read a file that does not need it.
+    ordered : bool
+        Of two numbers the first is at most the second.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key(
         names=names, unit=unit, range=allowed, help=help, table=table, choices=choices, prefix=prefix, switch=switch,
         relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump, form=form,
-        later=later,
+        later=later, ordered=ordered,
     )  # fmt: skip
 
 
@@ -273,7 +280,7 @@ def allowed(item: Item) -> str:
         return "True or False"
     words = item.key.range.whole if item.form is Form.INTEGER else str(item.key.range)
     if item.form is Form.PAIR:
-        return f"two numbers, each {words}"
+        return f"two numbers, each {words}{ORDERED if item.key.ordered else ''}"
     return f"{words} or a tuple of such" if item.form is Form.NUMBERS else words
 
 
@@ -353,7 +360,8 @@ def _fits(item: Item, given: object) -> bool:
     if form is Form.BOOLEAN:
         return isinstance(given, bool)
     if form is Form.PAIR:
-        return isinstance(given, tuple | list) and len(given) == 2 and all(_number_fits(item, each) for each in given)
+        pair = isinstance(given, tuple | list) and len(given) == 2 and all(_number_fits(item, each) for each in given)
+        return pair and (not item.key.ordered or given[0] <= given[1])  # type: ignore[index]
     if form is Form.NUMBERS:
         each_of = given if isinstance(given, tuple | list) else (given,)
         return len(each_of) > 0 and all(_number_fits(item, each) for each in each_of)

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from servotwin.config.keys import Form, Item, Maker, items_of
+from servotwin.config.keys import ORDERED, Form, Item, Maker, items_of
 from servotwin.config.own_units import OwnUnits
 from servotwin.config.units import unit_of
 
@@ -171,7 +171,7 @@ def _allowed(item: Item) -> str:
     return {
         Form.NUMBER: str(words),
         Form.INTEGER: words.whole if unit_of(item.names[0]).exact else str(words),
-        Form.PAIR: f"two numbers, each {words}",
+        Form.PAIR: f"two numbers, each {words}{ORDERED if item.key.ordered else ''}",
         Form.NUMBERS: f"{words} or a list of such",
         Form.BOOLEAN: "true or false",
         Form.TEXT: "text",

@@ -32,6 +32,8 @@ REQUIRED = _Required()
 _LARGEST, _LONGEST_S, _LARGEST_INTEGER = 1e30, 1e9, 10**15
 """Largest sizes of a number, of a time in seconds (30 years) and of an integer: products of larger ones overflow."""
 _LONGEST_TEXT = 1000
+_BEGIN, _END = "# complete with the line: # end", "# end"
+"""First and last line of a file of which a half must not be read."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -329,6 +331,29 @@ def parse_toml(text: str, source: str) -> Table:
     if not values:
         raise InvalidInput(f"{source}: is empty; it must hold at least one key")
     return Table(source, values)
+
+
+def with_end(text: str) -> str:
+    """Put the text of a written file between the two lines by which `check_complete` finds that it was cut short."""
+    return f"{_BEGIN}\n{text}{_END}\n"
+
+
+def check_complete(path: Path, remedy: str) -> None:
+    """Check that a file which `with_end` made is whole; one without its first line may be any.
+
+    Half of a file can often be read, and would leave out what protects the machine, or who has a token.
+
+    Raises
+    ------
+    InvalidInput
+        It was cut short; the sentence ends with the remedy.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return  # whoever reads it as TOML says why
+    if _BEGIN in lines and _END not in lines:
+        raise InvalidInput(f"{path}: is cut short: its line {_END!r} is missing; {remedy}")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

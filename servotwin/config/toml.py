@@ -6,12 +6,15 @@ import dataclasses
 import json
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from servotwin.config.keys import Form, Item, Maker, items_of
+from servotwin.config.contradiction import Contradiction
+from servotwin.config.keys import ORDERED, Form, Item, Maker, items_of
 from servotwin.config.table import Table, named
 from servotwin.config.units import unit_of
+from servotwin.errors import InvalidInput
 
 Values = dict[str, Any]
 
@@ -38,8 +41,9 @@ def read(table: Table, maker: Any, folder: Path = Path(), base: Any = None, **gi
     """
     items = [item for item in items_of(maker) if item.key.in_file and item.name not in given]
     values = {**_read_items(table, items, folder, base, complete=base is None), **given}
-    with named(table):
-        return maker(**values) if base is None else dataclasses.replace(base, **values)
+    if base is None:
+        return made(table, maker, maker, values)
+    return made(table, type(base), partial(dataclasses.replace, base), values)
 
 
 def changes(table: Table, maker: Any, only: Collection[str] | None = None, folder: Path = Path()) -> Values:
@@ -120,8 +124,8 @@ def _prefixed(table: Table, item: Item, start: Any) -> Any:
         for name in names:
             if name in table.values:
                 given[each.name] = _value(table, each, name, Path(), None)
-    with named(table):
-        return item.type(**given) if start is MISSING else dataclasses.replace(start, **given)
+    make = item.type if start is MISSING else partial(dataclasses.replace, start)
+    return made(table, item.type, make, given, prefix)
 
 
 def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> Any:
@@ -160,6 +164,8 @@ def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
         numbers = table.numbers_in(name, limits)
         if form is Form.PAIR and (not isinstance(numbers, tuple) or len(numbers) != 2):
             raise table.invalid(name, "two numbers")
+        if item.key.ordered and isinstance(numbers, tuple) and numbers[0] > numbers[1]:
+            raise table.invalid(name, f"two numbers{ORDERED}")
         converted = tuple(map(unit.to_si, numbers)) if isinstance(numbers, tuple) else unit.to_si(numbers)
         return (converted,) if item.type == tuple[float, ...] and not isinstance(converted, tuple) else converted
     if form in (Form.NUMBER, Form.INTEGER):
@@ -199,8 +205,40 @@ def _whole(table: Table, maker: Maker, folder: Path) -> Any:
     items = [item for item in items_of(maker) if item.key.in_file]
     values = _read_items(table, items, folder, None, complete=True)
     table.done()  # before the values meet: a misspelt key explains why they do not fit
+    return made(table, maker, maker, values)
+
+
+def made(table: Table, maker: Any, make: Maker, values: Values, prefix: str = "") -> Any:
+    """Make settings of the values of attributes; an error names the keys of the table, which `maker` declares.
+
+    Raises
+    ------
+    InvalidInput
+        The values are not allowed.
+    """
     with named(table):
-        return maker(**values)
+        try:
+            return make(**values)
+        except Contradiction as error:
+            if not {name.partition(".")[0] for name in error.names} <= {item.name for item in items_of(maker)}:
+                raise  # of something that the maker makes of the values
+            given = zip(error.names, error.values, strict=True)
+            keys = (_key_and_value(table, maker, name, each, prefix) for name, each in given)
+            raise InvalidInput(f"{table.source}: {error.rule.format(*keys)}") from None
+
+
+def _key_and_value(table: Table, maker: Any, path: str, value: Any, prefix: str) -> str:
+    """An attribute as the file has it, or by the key that it would have there."""
+    name, _, inner = path.partition(".")
+    item = next(each for each in items_of(maker) if each.name == name)
+    table = table.table(item.key.table) if item.key.table else table
+    if inner:
+        return _key_and_value(table.table(item.names[0]), item.type, inner, value, prefix)
+    for each in reversed(table.names([prefix + key for key in item.names])):
+        if each in table.values:
+            return f"{table.path(each)} = {table.values[each]!r}"
+    [key] = table.names([prefix + item.exact_name])
+    return f"{table.path(key)} = {unit_of(key).from_si(value)!r} (the default)"
 
 
 def values_of(described: Any, maker: Any = None, only: Collection[str] | None = None) -> Values:

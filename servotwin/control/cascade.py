@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from math import expm1, pi
 from typing import Annotated, Any
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, key, replaced, settings
 from servotwin.control.controller import notch_step
 from servotwin.control.law_keys import RateLimit, ReleaseTime, SampleRate, VoltageLimit
@@ -125,7 +126,7 @@ class Cascade:
             if getattr(self, name) == 0.0:
                 object.__setattr__(self, name, None)
         if self.leave < self.enter:
-            raise InvalidInput(f"cascade leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
+            raise contradiction(self, "{0}: must be at least {1}", "leave", "enter")
         if self.notch_hz is not None and self.sample_rate is not None and not self.notch_hz < 0.5 * self.sample_rate:
             allowed = f"must be below half of sample_rate = {self.sample_rate!r} Hz, or 0 for none"
             raise InvalidInput(f"cascade notch_hz = {self.notch_hz!r} Hz: {allowed}")

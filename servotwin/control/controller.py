@@ -4,6 +4,7 @@ from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, pi, sin, sqrt
 from typing import Annotated, TypedDict, Unpack
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, items_of, key, replaced, settings
 from servotwin.control.law import LawParameters
 from servotwin.control.law_keys import RateLimit, ReleaseTime, SampleRate, VoltageLimit
@@ -142,7 +143,7 @@ class Controller:
     def __post_init__(self) -> None:
         check(self)
         if self.leave < self.enter:
-            raise InvalidInput(f"controller leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
+            raise contradiction(self, "{0}: must be at least {1}", "leave", "enter")
 
     def __repr__(self) -> str:
         """Gains, and whatever is not its default."""

@@ -6,7 +6,7 @@ import msgspec
 
 from servotwin.config.keys import items_of
 from servotwin.config.table import Table
-from servotwin.config.toml import Values, changes, values_of
+from servotwin.config.toml import Values, changes, made, values_of
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
@@ -75,7 +75,8 @@ def holds(controller: AnyController, gains: AnyGains | None) -> bool:
 
 def read_gains(table: Table, running: AnyController) -> AnyGains:
     """The gains that a table gives, with those of the running controller for the others."""
-    return gains_of(running.replace(**_changes(table, type(running))))
+    kind = type(running)
+    return gains_of(made(table, _MAKERS.get(kind, kind), running.replace, _changes(table, kind)))
 
 
 def has_gains(table: Table, kind: type = Controller) -> bool:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields, replace
 from math import expm1, inf, isfinite
 from typing import Any
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import replaced
 from servotwin.control.linear_tick import LinearParameters, LinearState, linear_transfer
 from servotwin.control.matrices import Rows, at_rest, zero_order_held
@@ -91,6 +92,7 @@ class LinearLaw:
     integral_share: float = 1.0
     B_inside: Rows = ()
     D_inside: tuple[float, ...] = ()
+    settings_name = "law"
 
     def __post_init__(self) -> None:
         n = len(self.C)
@@ -122,11 +124,10 @@ class LinearLaw:
             if value is not None and not (isfinite(value) and value > 0.0):
                 raise InvalidInput(f"law {name} = {value!r} {unit}".rstrip() + ": must be finite and positive")
         for name in ("enter", "leave"):
-            value = getattr(self, name)
-            if not (isfinite(value) and value >= 0.0):
+            if not (isfinite(value := getattr(self, name)) and value >= 0.0):
                 raise InvalidInput(f"law {name} = {value!r} tolerances: must be finite and 0 or more")
         if self.leave < self.enter:
-            raise InvalidInput(f"law leave = {self.leave!r} tolerances: must be at least enter = {self.enter!r}")
+            raise contradiction(self, "{0}: must be at least {1}", "leave", "enter")
         if not (isfinite(self.ratio) and self.ratio > 0.0):
             raise InvalidInput(f"law ratio = {self.ratio!r} m/rad: must be finite and greater than 0")
         if not (isfinite(self.integral_share) and self.integral_share >= 0.0):
@@ -393,8 +394,7 @@ def _matrices(system: Any) -> tuple[list[Any], list[Any], list[Any], list[Any], 
         system = require("control", "a python-control system").ss(system)
     if not all(hasattr(system, name) for name in "ABCD"):
         raise InvalidInput(f"law system = {system!r}: must be a system of scipy.signal or python-control")
-    step = getattr(system, "dt", None)
-    if step is True:
+    if (step := getattr(system, "dt", None)) is True:
         raise InvalidInput("law system dt = True: a sampled system needs its sample time in s")
     A, B, C, D = (getattr(system, name).tolist() for name in "ABCD")
     return A, B, C, D, float(step) if step else None

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.config.keys import Maker, key, name_of
 from servotwin.config.table import Table, named, read_inner
-from servotwin.config.toml import changes, part, read
+from servotwin.config.toml import changes, made, part, read
 from servotwin.control.controller import Controller
 from servotwin.control.gains import read_gains
 from servotwin.control.laws import AnyController
@@ -162,7 +162,7 @@ def _changed(table: Table, controller: AnyController) -> AnyController | None:
     if isinstance(controller, LinearLaw):
         return None
     changed = changes(table, type(controller))
-    return controller.replace(**changed) if changed else None
+    return made(table, type(controller), controller.replace, changed) if changed else None
 
 
 def _supervision(edge: Table, controller: AnyController) -> Supervision | None:

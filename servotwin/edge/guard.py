@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from math import inf, nextafter
 from typing import Annotated, NamedTuple, TypeAlias
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import Key, check, key, settings
 from servotwin.edge.parameters import Parameters
-from servotwin.errors import InvalidInput
 from servotwin.messages import KNOWN_FIELDS, AnyGains, CascadeGains, Gains, LinearGains, Reason, Receipt, Update
 
 # Gains that are scaled, and written to a file in other units, are those of the box's corners but for rounding.
@@ -42,7 +42,7 @@ class Bounded(NamedTuple):
 def _range_key(name: str, of: str) -> Key:
     """Key of the range of a gain."""
     words = f"Lowest and highest {of}, on the own one's side of zero; where absent within gain_factor of the own one."
-    return key(name, infinite=True, help=words)
+    return key(name, infinite=True, ordered=True, help=words)
 
 
 @settings("limits")
@@ -170,14 +170,9 @@ class Limits:
     def __post_init__(self) -> None:
         check(self)
         if not self.minimum <= self.maximum:
-            raise InvalidInput(f"limits on the tolerance {self.minimum!r} m to {self.maximum!r} m: must be in order")
+            raise contradiction(self, "{0}: must be at most {1}", "minimum", "maximum")
         if self.notch_max_hz and not self.notch_min_hz <= self.notch_max_hz:
-            raise InvalidInput(
-                f"limits on a notch {self.notch_min_hz!r} Hz to {self.notch_max_hz!r} Hz: must be in order"
-            )
-        for name, (lowest, highest) in self.ranges.items():
-            if not lowest <= highest:
-                raise InvalidInput(f"limits {name} = {lowest!r} to {highest!r}: must be in order")
+            raise contradiction(self, "{0}: must be at most {1}", "notch_min_hz", "notch_max_hz")
 
     @property
     def ranges(self) -> dict[str, Range]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from math import inf, isfinite
 from typing import Annotated
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, key, settings
 from servotwin.config.own_units import VOLTS_METRES, OwnUnits
 from servotwin.control.cascade import Cascade
@@ -140,8 +141,7 @@ class AgentSettings:
         if self.window_samples < 1:
             raise InvalidInput(f"agent window_s = {self.window_s!r} s: must be at least one sample")
         if not self.pre_trigger_samples < self.window_samples:
-            allowed = f"must be below window_s = {self.window_s!r} s"
-            raise InvalidInput(f"agent pre_trigger_s = {self.pre_trigger_s!r} s: {allowed}")
+            raise contradiction(self, "{0}: must be below {1}", "pre_trigger_s", "window_s")
         self._check_longest()
         self._check_memory()
         self._check_notch()
@@ -158,22 +158,22 @@ class AgentSettings:
         if not isinstance(law, Cascade) or law.sample_rate is None:
             return
         if not self.limits.notch_max_hz < 0.5 * law.sample_rate:
-            allowed = f"must be below half of the controller's {law.sample_rate!r} Hz"
-            raise InvalidInput(f"limits notch_max_hz = {self.limits.notch_max_hz!r} Hz: {allowed}")
+            rule = f"{{0}}: must be below half of the controller's {law.sample_rate!r} Hz"
+            raise contradiction(self, rule, "limits.notch_max_hz")
 
     def _check_ranges(self) -> None:
         """Check that the ranges of gains are for numbers of the controller, and leave each of them some room."""
         if self.controller is None:
             return
         own = self.own or gains_of(self.controller)
-        for name, given in self.limits.ranges.items():
+        for name in self.limits.ranges:
             if name not in own.scaled:
-                allowed = f"the controller has no {name}; give {', '.join(own.scaled)}"
-                raise InvalidInput(f"limits {name} = {given!r}: {allowed}")
+                rule = f"{{0}}: the controller has no {name}; give ranges of {', '.join(own.scaled)}"
+                raise contradiction(self, rule, f"limits.{name}")
             lowest, highest = self.limits.range_of(name, own)
             if lowest > highest:
-                allowed = f"must reach to the side of zero of the servo's own {getattr(own, name)!r}"
-                raise InvalidInput(f"limits {name} = {given!r}: {allowed}")
+                rule = f"{{0}}: must reach to the side of zero of the servo's own {getattr(own, name)!r}"
+                raise contradiction(self, rule, f"limits.{name}")
 
     def _check_longest(self) -> None:
         """Check that the longest window and pre-trigger are at least the configured ones, and fit together."""
@@ -183,8 +183,7 @@ class AgentSettings:
                 continue
             _check_whole(f"longest_{name}", longest, self.sample_rate)
             if longest < configured:
-                allowed = f"must be at least {name} = {configured!r} s"
-                raise InvalidInput(f"agent longest_{name} = {longest!r} s: {allowed}")
+                raise contradiction(self, "{0}: must be at least {1}", f"longest_{name}", name)
         if not self.longest_pre_trigger_samples < self.longest_samples:
             allowed = f"must be below the longest window, {self.longest_samples / self.sample_rate!r} s"
             raise InvalidInput(f"agent longest_pre_trigger_s = {self.longest_pre_trigger_s!r} s: {allowed}")

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from servotwin.config.keys import Maker, key
 from servotwin.config.own_units import VOLTS_METRES, OwnUnits
-from servotwin.config.table import Table, named, read_toml
+from servotwin.config.table import Table, check_complete, named, read_toml, with_end
 from servotwin.config.toml import Values, attribute, dumps, kind_of, part, read, values_of
 from servotwin.control.controller import Controller
 from servotwin.control.gains import has_gains, read_gains, written_gains
@@ -32,8 +32,6 @@ from servotwin.novelty.settings import NoveltySettings
 
 LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: matrices_law}
 """Controllers of an edge's file, by their key `kind`."""
-_BEGIN, _END = "# complete with the line: # end", "# end"
-"""First and last line of a written file: half of one could be read, and would leave out what protects the machine."""
 
 
 def load(path: str | os.PathLike[str]) -> EdgeConfig:
@@ -44,19 +42,9 @@ def load(path: str | os.PathLike[str]) -> EdgeConfig:
     InvalidInput
         The file is missing or not TOML, a key is unknown or missing, or its value is not allowed.
     """
-    _check_complete(Path(path))
+    check_complete(Path(path), "copy the edge's folder again")
     config = read_config(read_toml(path))
     return replace(config, folder=Path(path).resolve().parent)
-
-
-def _check_complete(path: Path) -> None:
-    """Refuse a written file that was cut short: its last tables would have their defaults; raises InvalidInput."""
-    try:
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return  # whoever reads it as TOML says why
-    if _BEGIN in lines and _END not in lines:
-        raise InvalidInput(f"{path}: is cut short: its line {_END!r} is missing; copy the edge's folder again")
 
 
 def read_config(table: Table) -> EdgeConfig:
@@ -165,4 +153,4 @@ def edge_toml(config: EdgeConfig) -> str:
         values["novelty"] = values_of(agent.window_filter)
     # The keys of a drive are its own.
     shown = config.units.named(values) | {"drive": dict(config.drive)}
-    return f"{_BEGIN}\n{dumps(shown)}{_END}\n"
+    return with_end(dumps(shown))

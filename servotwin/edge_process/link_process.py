@@ -33,6 +33,7 @@ from servotwin.edge_process.monitoring import (
     TroubleLog,
     former_trouble,
     log,
+    log_outbox,
     overwrite_status,
     read_status,
     summarise,
@@ -74,6 +75,8 @@ class LinkProcess:
     def __init__(self, config: EdgeConfig, end: socket.socket, run: str, samples: SampleReader | None = None) -> None:
         self._config, self._end, self._pipe = config, end, FrameSocket(end)
         last = read_status(config.path(config.files.status)) or {}
+        if last.get("servo", config.agent.servo) != config.agent.servo:
+            last = {}  # what another servo's outbox held is not lost
         self._run, self.outbox = run, _outbox(config, last)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
@@ -199,12 +202,7 @@ class LinkProcess:
         if self._stopping.is_set():
             return
         self._troubles.update("disk", self._disk_trouble)
-        if self.outbox.missing:
-            log("outbox incomplete", lost=self.outbox.missing)
-            self.outbox.missing = 0
-        while self.outbox.salvages:
-            found = self.outbox.salvages.pop(0)
-            log("outbox broken", file=found.file.name, rescued=found.rescued, lost=found.lost)
+        log_outbox(self.outbox)
         if self._receiver is not None:
             self._troubles.update("to the twin", self._session.trouble)
             self._troubles.update("from the twin", self._receiver.trouble)

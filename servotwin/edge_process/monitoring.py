@@ -14,6 +14,7 @@ from typing import Any, TextIO
 
 import msgspec
 
+from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.runtime.files import replace_file
 
 _STATUS_SCHEMA = "servotwin-edge-status/1"
@@ -60,6 +61,19 @@ def log(event: str, **values: Any) -> None:
             stream.flush()
     except (OSError, ValueError):
         return
+
+
+def log_outbox(outbox: SqliteOutbox) -> None:
+    """Log, once, what an outbox found in place of its file: an incomplete one, another servo's, a corrupt one."""
+    if outbox.missing:
+        log("outbox incomplete", lost=outbox.missing)
+        outbox.missing = 0
+    while outbox.others:
+        other = outbox.others.pop(0)
+        log("outbox of another servo", file=other.file.name, of=other.servo, windows=other.waiting)
+    while outbox.salvages:
+        found = outbox.salvages.pop(0)
+        log("outbox broken", file=found.file.name, rescued=found.rescued, lost=found.lost)
 
 
 def _is_writable(stream: TextIO) -> bool:

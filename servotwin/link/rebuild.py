@@ -72,7 +72,7 @@ class Rebuild:
         ------
         OSError
         """
-        aside = put_aside(self._path)
+        aside = put_aside(self._path, "broken")
         adopt(self._path)
         return aside
 

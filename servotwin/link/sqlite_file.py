@@ -8,6 +8,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from servotwin.messages import InvalidMessage, WindowMessage, decode
+from servotwin.messages.codec import DEFLATE, MAX_BYTES, decompress
+
 # FULL: a commit is on the disk before its frame is confirmed, so that a power failure loses nothing confirmed.
 # AUTOINCREMENT: places rise for ever, also after deletions, so they give the order of age.
 _SCHEMA = """
@@ -36,6 +39,11 @@ POST = "INSERT OR IGNORE INTO letters (digest, body) VALUES (?, ?)"
 TAKE = "DELETE FROM letters WHERE digest = ?"
 COUNT = "INSERT INTO counts (what, number) VALUES (?, ?) ON CONFLICT (what) DO UPDATE SET number = excluded.number"
 NOTE = "INSERT INTO notes (name, value) VALUES (?, ?) ON CONFLICT (name) DO UPDATE SET value = excluded.value"
+SERVO = "servo"
+"""Name of the value that says whose outbox the file is; older files lack it."""
+_WAITING = (
+    f"SELECT count(*) FROM windows LEFT JOIN acknowledged USING (boot, sequence) WHERE ifnull(at, {AGAIN}) = {AGAIN}"
+)
 STORED = "SELECT seq FROM sqlite_sequence WHERE name = 'windows'"
 _BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
 BESIDE = ("-wal", "-shm")
@@ -46,6 +54,23 @@ class Statement(NamedTuple):
 
     text: str
     values: tuple[Any, ...]
+
+
+class OtherOutbox(NamedTuple):
+    """A file of another servo, which was put aside with all that it holds.
+
+    Attributes
+    ----------
+    file : path
+        Its new name.
+    servo : str
+    waiting : int
+        Windows that wait in it.
+    """
+
+    file: Path
+    servo: str
+    waiting: int
 
 
 def is_broken(error: sqlite3.Error) -> bool:
@@ -82,6 +107,40 @@ def connect(path: Path, check: bool = True) -> sqlite3.Connection:
     return connection
 
 
+def connect_own(path: Path, servo: str) -> tuple[sqlite3.Connection, OtherOutbox | None]:
+    """Open an outbox's file; one of another servo, whose windows a twin would refuse, is put aside before.
+
+    Raises
+    ------
+    sqlite3.Error
+        The file cannot be opened, or is corrupt (`is_broken`).
+    OSError
+        It is of another servo, and cannot be renamed.
+    """
+    connection = connect(path)
+    try:
+        owner, [waiting] = _owner_of(connection), connection.execute(_WAITING).fetchone()
+    except sqlite3.Error:
+        connection.close()
+        raise
+    if owner in ("", servo):
+        return connection, None
+    connection.close()
+    other = OtherOutbox(put_aside(path, "another"), owner, waiting)
+    return connect(path), other
+
+
+def _owner_of(connection: sqlite3.Connection) -> str:
+    """Servo whose outbox a file is; where it does not say so, that of its newest window; empty: it tells none."""
+    for (value,) in connection.execute("SELECT value FROM notes WHERE name = ?", (SERVO,)):
+        return bytes(value).decode("utf-8", errors="replace")
+    for encoding, body in connection.execute("SELECT encoding, body FROM windows ORDER BY place DESC LIMIT 1"):
+        with suppress(InvalidMessage):
+            message = decode(decompress(body, encoding, MAX_BYTES) if encoding == DEFLATE else body)
+            return message.servo if isinstance(message, WindowMessage) else ""
+    return ""
+
+
 def _make_private(path: Path) -> None:
     """Make the file where there is none, and let its owner alone open it; SQLite gives its log the same mode."""
     with suppress(OSError):
@@ -91,10 +150,10 @@ def _make_private(path: Path) -> None:
             path.chmod(0o600)
 
 
-def put_aside(path: Path) -> Path:
-    """Rename a corrupt file, so that it can be examined; return its new path."""
+def put_aside(path: Path, why: str) -> Path:
+    """Rename a file that is "broken", or of "another" servo, so that nothing of it is lost; return its new path."""
     number = 1
-    while (aside := path.with_name(f"{path.name}.broken-{number}")).exists():
+    while (aside := path.with_name(f"{path.name}.{why}-{number}")).exists():
         number += 1
     path.rename(aside)
     # With its write-ahead log: SQLite would apply that to the new file of the same name.

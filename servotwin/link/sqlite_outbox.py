@@ -23,12 +23,22 @@ from servotwin.link.outbox_contents import DROPPED, OutboxContents
 from servotwin.link.outbox_index import AcknowledgedLimits, AcknowledgedWindows, LastStatus
 from servotwin.link.rebuild import Rebuild, adopt
 from servotwin.link.salvage import Salvage
-from servotwin.link.sqlite_file import STORED, connect, is_broken, was_read_only
+from servotwin.link.sqlite_file import (
+    NOTE,
+    SERVO,
+    STORED,
+    OtherOutbox,
+    Statement,
+    connect,
+    connect_own,
+    is_broken,
+    was_read_only,
+)
 from servotwin.link.transport import Parcel
 from servotwin.messages import WindowMessage, decode, encode
 from servotwin.messages.codec import DEFLATE, deflated
 
-BROKEN, INCOMPLETE = "outbox broken", "outbox incomplete"
+BROKEN, INCOMPLETE, ANOTHER = "outbox broken", "outbox incomplete", "outbox of another servo"
 UNWRITABLE, LETTERS = "disk not writable", "letters full"
 MOST_UNWRITTEN = 16_000_000
 """Bytes of windows held in memory while the disk cannot be written."""
@@ -60,6 +70,8 @@ class SqliteOutbox:
     ----------
     salvages : list of Salvage
         Corrupt files of this process.
+    others : list of OtherOutbox
+        Files of other servos that were in this one's place.
     missing : int
         Windows that waited at the last status, and are not in the file: it is an older one, or without its log.
     """
@@ -81,6 +93,7 @@ class SqliteOutbox:
         self._last: LastStatus | None = last
         self._stored = self.missing = 0
         self.salvages: list[Salvage] = []
+        self.others: list[OtherOutbox] = []
         self._lock = RLock()
         self._connection: sqlite3.Connection | None = None
         self._read_only = False
@@ -269,7 +282,10 @@ class SqliteOutbox:
     def _write(self) -> None:
         if self._connection is None:
             adopt(self._path)  # of a process that was killed between two renames
-            self._connection = connect(self._path)
+            self._connection, other = connect_own(self._path, self._servo)
+            if other is not None:
+                self.faults[ANOTHER] += 1
+                self.others.append(other)
             self._load(self._connection)
         if self._read_only:
             self.close()  # before connecting again: connections of one process to one file share its state
@@ -286,6 +302,8 @@ class SqliteOutbox:
     def _load(self, connection: sqlite3.Connection) -> None:
         """Load the file's contents, and count the windows that it lacks."""
         self._contents.load(connection)
+        if SERVO not in self._contents.notes:
+            self._contents.set_value(SERVO, self._servo.encode())
         if self._last is not None:
             lacks = self._last.stored - sum(number for (number,) in connection.execute(STORED))
             self.missing = max(0, min(lacks, self._last.waiting))
@@ -334,6 +352,11 @@ class SqliteOutbox:
         in_memory = {key for kind, key in contents.unwritten if kind == "window"}
         rebuild = Rebuild(self._path, in_memory, MOST_UNWRITTEN)
         found, known = rebuild.found, rebuild.found.windows | rebuild.dropped | in_memory
+        owner = found.notes.get(SERVO, self._servo.encode())
+        if owner != self._servo.encode():
+            rebuild.complete([Statement(NOTE, (SERVO, owner))])  # it is put aside, too, when it is opened
+            self._rebuild = rebuild, len(found.lost)
+            return
         # Known by name: from memory where the file was open before, and from what is left of the file.
         lost = (contents.index.keys() | found.lost) - known
         # The number of the last status is old by up to a second: it counts only where the names are not known.

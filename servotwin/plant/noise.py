@@ -38,6 +38,7 @@ class Noise:
         key(
             "band_hz",
             above=0.0,
+            ordered=True,
             help="Stop and pass edge of the high-pass: at least 40 dB down below the first, at most 1 dB above the "
             "second (erratum E18); not used by white noise.",
         ),
@@ -48,7 +49,7 @@ class Noise:
         check(self)
         stop, passed = self.band
         if not stop < passed:
-            raise InvalidInput(f"noise band = {self.band} Hz: must be 0 < stop < pass, finite")
+            raise InvalidInput(f"noise band = {self.band} Hz: must be stop < pass")
 
     def filter(self, rate: float) -> Array:
         """(sections, 6) second-order sections of unit noise gain at a sample rate (Hz)."""

@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, key, settings
-from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus, UnknownRatio
 from servotwin.messages import Ask, LongerWindow, Probe, RequestOutcome
 from servotwin.plant.display_units import MILLIMETRES, DisplayUnit
@@ -83,10 +83,14 @@ class ExcitationSettings:
 
     def __post_init__(self) -> None:
         check(self)
-        times = self.times
-        if not times.pre_trigger < times.window:
-            allowed = f"must be below window = {times.window!r} s"
-            raise InvalidInput(f"excitation pre_trigger = {times.pre_trigger!r} s: {allowed}")
+        if self.times.pre_trigger < self.times.window:
+            return
+        if self.pre_trigger is None:
+            rule = f"{{0}}: must be above {_PRE_TRIGGER!r} s, the pre-trigger of the paper's servo"
+            raise contradiction(self, rule, "window")
+        if self.window is None:
+            raise contradiction(self, f"{{0}}: must be below {_WINDOW!r} s, the paper's servo's window", "pre_trigger")
+        raise contradiction(self, "{0}: must be below {1}", "pre_trigger", "window")
 
     @property
     def times(self) -> ExcitationTimes:

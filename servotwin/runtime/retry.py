@@ -3,8 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Annotated
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, key, settings
-from servotwin.errors import InvalidInput
 
 
 @settings("retry")
@@ -22,7 +22,7 @@ class Retry:
     def __post_init__(self) -> None:
         check(self)
         if not self.first_s <= self.longest_s:
-            raise InvalidInput(f"retry from {self.first_s!r} s to {self.longest_s!r} s: must be in order")
+            raise contradiction(self, "{0}: must be at most {1}", "first_s", "longest_s")
 
 
 @dataclass(slots=True)

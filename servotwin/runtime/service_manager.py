@@ -11,6 +11,9 @@ from math import inf
 class ServiceManager:
     """Datagrams to the socket that `NOTIFY_SOCKET` names; a call never blocks, and never raises.
 
+    What the service manager does not take, because its queue is full or it is starting anew, is sent again at the next
+    `alive`.
+
     Parameters
     ----------
     environment : mapping
@@ -27,18 +30,19 @@ class ServiceManager:
         # "@" stands for the null byte with which Linux's abstract addresses begin.
         self._address = "\0" + name[1:] if name.startswith("@") else name
         self._socket: socket.socket | None = None
-        self._due = -inf
+        self._due, self._ready_unsent = -inf, False
         self.watchdog_s = _watchdog(environment) / 2.0 if self._address else inf
 
     def ready(self) -> None:
         """The service has started."""
-        self._send("READY=1")
+        self._ready_unsent = not self._send("READY=1")
 
     def alive(self, now: float) -> None:
-        """Tell that the service works, where that is due at `now` (s, monotonic)."""
-        if now >= self._due and self.watchdog_s < inf:
+        """Tell that the service works, where that is due at `now` (s, monotonic); call it often."""
+        if self._ready_unsent:
+            self.ready()
+        if now >= self._due and self.watchdog_s < inf and self._send("WATCHDOG=1"):
             self._due = now + self.watchdog_s
-            self._send("WATCHDOG=1")
 
     def stopping(self) -> None:
         """The service ends."""
@@ -47,16 +51,18 @@ class ServiceManager:
             self._socket.close()
             self._socket = None
 
-    def _send(self, state: str) -> None:
+    def _send(self, state: str) -> bool:
+        """Send a state; False where the service manager did not take it: the machine's control goes on."""
         if not self._address:
-            return
+            return True
         try:
             if self._socket is None:
                 self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
                 self._socket.setblocking(False)
             self._socket.sendto(state.encode(), self._address)
         except OSError:
-            return  # a service manager that does not listen: the machine's control goes on
+            return False
+        return True
 
 
 def _watchdog(environment: Mapping[str, str]) -> float:

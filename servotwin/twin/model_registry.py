@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Annotated
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_inner
-from servotwin.config.toml import changes, read
+from servotwin.config.toml import changes, made, read
 from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
@@ -191,7 +191,11 @@ def servo_table(servo: Annotated[Plant, PLANT_KEY]) -> Plant:
 
 def _changed(table: Table, controller: AnyController) -> AnyController:
     """The controller with the changes of a table; a linear law has no keys."""
-    return controller if isinstance(controller, LinearLaw) else controller.replace(**changes(table, type(controller)))
+    if isinstance(controller, LinearLaw):
+        return controller
+    kind = type(controller)
+    changed: AnyController = made(table, kind, controller.replace, changes(table, kind))
+    return changed
 
 
 def _start(servo: Plant, law: AnyController, settings: TwinSettings, own: bool) -> Setting | None:

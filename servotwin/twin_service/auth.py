@@ -16,7 +16,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from servotwin.config.table import Table, read_toml
+from servotwin.config.table import Table, check_complete, read_toml, with_end
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import NAME_PATTERN, Refusal
@@ -278,14 +278,15 @@ def read_tokens(path: Path) -> Verifiers:
     Raises
     ------
     InvalidInput
-        The file cannot be read, is readable by others, or holds something that is not a name or not a verifier. The
-        message does not repeat its content.
+        The file cannot be read, is readable by others, is empty or cut short, or holds something that is not a name or
+        not a verifier. The message does not repeat its content.
     """
     if not path.exists():
         raise InvalidInput(f"{path}: there is no such file of tokens; `servotwin enroll` makes it")
     _check_private(path)
     if not path.read_bytes().strip():
-        return Verifiers()
+        raise InvalidInput(f"{path}: is empty; copy it again, or remove it, so that `servotwin enroll` makes a new one")
+    check_complete(path, "copy it again")
     table = read_toml(path)
     servos, operators, engineers = (_read_verifiers(table.table(name)) for name in ("servos", "operators", "engineers"))
     verifiers = Verifiers(servos, operators, engineers, _read_fleet(table))
@@ -310,7 +311,7 @@ def write_tokens(path: Path, verifiers: Verifiers) -> None:
         for name, entries in tables.items()
     ]
     fleet = f'fleet = "{verifiers.fleet or secrets.token_hex(8)}"\n'
-    write_private(path, "\n".join([_HEAD + fleet, *parts]))
+    write_private(path, with_end("\n".join([_HEAD + fleet, *parts])))
 
 
 @contextmanager

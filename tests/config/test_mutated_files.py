@@ -137,3 +137,135 @@ def test_a_wrong_value_of_any_key_is_refused_in_one_sentence(
     assert faults == []
     assert refused > 2000
     assert sorted(tmp_path.iterdir()) == before
+
+
+def with_values(text: str, table: str, values: dict[str, Any]) -> str:
+    """Text of a file with values in a table."""
+    base = tomllib.loads(text)
+    inner: Any = base
+    for name in table.split(".") if table else ():
+        inner = inner.setdefault(name, {})
+    inner.update(values)
+    return dumps(base)
+
+
+def refusal(path: Path, start: Callable[[Path], None], text: str) -> str:
+    path.write_text(text)
+    with pytest.raises(InvalidInput) as refused:
+        start(path)
+    return str(refused.value)
+
+
+UNORDERED = {"models.axis.twin.estimator.offset_deg"}
+"""Two numbers that are no range."""
+
+
+@pytest.mark.parametrize(("kind", "text", "start"), [("edge", EDGE, load), ("twin", TWIN, read_twin)])
+def test_a_range_that_is_reversed_is_refused_by_its_key(
+    tmp_path: Path, kind: str, text: str, start: Callable[[Path], None]
+) -> None:
+    path, named, of_other_machines = tmp_path / f"{kind}.toml", 0, 0
+    schema = json.loads((SCHEMAS / f"{kind}.json").read_text())
+    for place in paths(schema):
+        declared = schema_of(schema, place)
+        if declared.get("maxItems") != 2 or ".".join(place) in UNORDERED:
+            continue
+        said = refusal(path, start, with_values(text, ".".join(place[:-1]), {place[-1]: [0.2, 0.1]}))
+        if said.startswith(f"{path}: unknown key '{'.'.join(place)}'"):
+            of_other_machines += 1
+            continue
+        assert said == f"{path}: {'.'.join(place)} = [0.2, 0.1] is not allowed; give two numbers, the lower one first"
+        named += 1
+    assert named >= 4
+    assert of_other_machines > 0
+
+
+def schema_of(schema: dict[str, Any], place: tuple[str, ...]) -> dict[str, Any]:
+    """What a schema says of a key."""
+    if not place:
+        return schema
+    for part in (schema, *schema.get("oneOf", ()), *schema.get("anyOf", ())):
+        inner = dict(part.get("properties", {}))
+        if isinstance(part.get("additionalProperties"), dict):
+            inner.setdefault("axis", part["additionalProperties"])
+        if place[0] in inner and (found := schema_of(inner[place[0]], place[1:])):
+            return found
+    return {}
+
+
+CASCADE = EDGE.replace(EDGE[EDGE.index("[controller]") : EDGE.index("[twin]")], '[controller]\nkind = "cascade"\n'
+    "travel_m_per_rad = 0.001\nposition_gain_per_s = 10.0\n"
+    "velocity_gain_v_s_per_rad = 0.1\nintegral_time_s = 0.1\n")  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("text", "table", "values", "expected"),
+    [
+        (EDGE, "limits", {"minimum_mm": 2.0, "maximum_mm": 1},
+         "limits.minimum_mm = 2.0: must be at most limits.maximum_mm = 1"),
+        (EDGE, "limits", {"notch_min_hz": 9.0, "notch_max_hz": 8.0},
+         "limits.notch_min_hz = 9.0: must be at most limits.notch_max_hz = 8.0"),
+        (CASCADE, "limits", {"notch_max_hz": 600.0},
+         "limits.notch_max_hz = 600.0: must be below half of the controller's 1000.0 Hz"),
+        (EDGE, "limits", {"kd_v_s_per_m": [1.0, 2.0]},
+         "limits.kd_v_s_per_m = [1.0, 2.0]: must reach to the side of zero of the servo's own -135.1"),
+        (EDGE, "limits", {"speed_filter_s": [1.0, 2.0]},
+         "limits.speed_filter_s = [1.0, 2.0]: the controller has no speed_filter; give ranges of Kp, Kd, Tf"),
+        (EDGE, "retry", {"first_s": 3, "longest_s": 2.0}, "retry.first_s = 3: must be at most retry.longest_s = 2.0"),
+        (EDGE, "retry", {"first_s": 61.0},
+         "retry.first_s = 61.0: must be at most retry.longest_s = 60.0 (the default)"),
+        (EDGE, "window", {"window_s": 0.5, "pre_trigger_s": 1.0},
+         "window.pre_trigger_s = 1.0: must be below window.window_s = 0.5"),
+        (EDGE, "window", {"window_s": 2.0, "longest_window_s": 1.0},
+         "window.longest_window_s = 1.0: must be at least window.window_s = 2.0"),
+        (EDGE, "controller", {"enter_tolerances": 2.0, "leave_tolerances": 1.0},
+         "controller.leave_tolerances = 1.0: must be at least controller.enter_tolerances = 2.0"),
+        (EDGE, "own", {"enter_tolerances": 2.0},
+         "own.leave_tolerances = 1.0 (the default): must be at least own.enter_tolerances = 2.0"),
+        (CASCADE, "controller", {"enter_tolerances": 2.0, "leave_tolerances": 1.0},
+         "controller.leave_tolerances = 1.0: must be at least controller.enter_tolerances = 2.0"),
+        (EDGE, "start", {"enter_tolerances": 2.0, "leave_tolerances": 1.0},
+         "start.leave_tolerances = 1.0: must be at least start.enter_tolerances = 2.0"),
+    ],
+)  # fmt: skip
+def test_values_that_contradict_each_other_are_named_by_their_keys(
+    tmp_path: Path, text: str, table: str, values: dict[str, Any], expected: str
+) -> None:
+    path = tmp_path / "edge.toml"
+    assert refusal(path, load, with_values(text, table, values)) == f"{path}: {expected}"
+
+
+@pytest.mark.parametrize(
+    ("table", "values", "expected"),
+    [
+        ("twin.excitation", {"window_s": 1.0, "pre_trigger_s": 2.0},
+         "twin.excitation.pre_trigger_s = 2.0: must be below models.axis.twin.excitation.window_s = 1.0"),
+        ("twin.excitation", {"window_s": 0.25},
+         "twin.excitation.window_s = 0.25: must be above 0.3 s, the pre-trigger of the paper's servo"),
+        ("twin.excitation", {"pre_trigger_s": 60.0},
+         "twin.excitation.pre_trigger_s = 60.0: must be below 2.0 s, the paper's servo's window"),
+        ("twin.estimator", {"offset_deg": [1.0, -1.0]},
+         "twin.estimator.offset_deg = [1.0, -1.0]: must be (mean, standard deviation), the latter above 0"),
+        ("controller", {"enter_tolerances": 2.0, "leave_tolerances": 1.0},
+         "controller.leave_tolerances = 1.0: must be at least models.axis.controller.enter_tolerances = 2.0"),
+    ],
+)  # fmt: skip
+def test_values_of_a_model_that_contradict_each_other_are_named_by_their_keys(
+    tmp_path: Path, table: str, values: dict[str, Any], expected: str
+) -> None:
+    path = tmp_path / "twin.toml"
+    said = refusal(path, read_twin, with_values(TWIN, f"models.axis.{table}", values))
+    assert said == f"{path}: models.axis.{expected}"
+
+
+def test_a_contradiction_is_named_in_the_units_of_the_machine(tmp_path: Path) -> None:
+    path = tmp_path / "edge.toml"
+    units = 'command_unit = "N m"\nposition_unit = "rad"\n'
+    text = (
+        CASCADE.replace("velocity_gain_v_s", "velocity_gain_n_m_s")
+        .replace("travel_m", "travel_rad")
+        .replace("_mm", "_deg")
+    )
+    text = text.replace("_v =", "_n_m =").replace("[drive]", f"{units}[drive]", 1)
+    said = refusal(path, load, with_values(text, "limits", {"minimum_deg": 2.0, "maximum_deg": 1.0}))
+    assert said == f"{path}: limits.minimum_deg = 2.0: must be at most limits.maximum_deg = 1.0"

@@ -218,7 +218,7 @@ GOOD = LinearLaw([[0.5]], [[1.0, 0.0, 0.0]], [1.0], [0.0, 0.0, 0.0], 100.0, disc
         (lambda: GOOD.replace(holds=("integral",)), "law holds = 'integral': the law has no such state; it has x1"),
         (lambda: GOOD.replace(on="screw"), 'law on = \'screw\': must be "load" or "motor"'),
         (lambda: GOOD.replace(ratio=-0.1), "law ratio = -0.1 m/rad: must be finite and greater than 0"),
-        (lambda: GOOD.replace(leave=0.5), "law leave = 0.5 tolerances: must be at least enter = 1.0"),
+        (lambda: GOOD.replace(leave=0.5), "law leave = 0.5: must be at least enter = 1.0"),
         (lambda: GOOD.replace(voltage_limit=0.0), "law voltage_limit = 0.0: must be finite and positive"),
         (lambda: GOOD.replace(sample_rate=None), "law sample_rate = None: discrete matrices need their rate in Hz"),
         (lambda: GOOD.replace(sample_rate=None, discrete=False).parameters(), "the tick needs a rate in Hz"),

@@ -191,9 +191,13 @@ def test_steps_of_1_mm_are_a_replacement_away():
             "5000.0 Hz: it and",
         ),
         ("[gap]", "[controller]\nsample_rate = 5000\n[gap]", "unknown key 'controller.sample_rate'"),
-        ("[gap]", "[controller]\nleave_tolerances = 0.1\n[gap]", "[controller]: controller leave = 0.1"),
+        ("[gap]", "[controller]\nleave_tolerances = 0.1\n[gap]", "controller.leave_tolerances = 0.1: must be at least"),
         ("[gap]", "[noise]\nstd_mm = 0.2\n[gap]", "noise needs a sampled controller"),
-        ("[gap]", "[noise]\nstd_mm = 0.2\nband_hz = [50, 10]\n[gap]", "[noise]: noise band = (50.0, 10.0) Hz"),
+        (
+            "[gap]",
+            "[noise]\nstd_mm = 0.2\nband_hz = [50, 10]\n[gap]",
+            "noise.band_hz = [50, 10] is not allowed; give two numbers, the lower",
+        ),
         ("[gap]", "[noise]\nstd_mm = 0.2\nband_hz = 50\n[gap]", "noise.band_hz = 50 is not allowed; give two numbers"),
         (
             "[gap]",

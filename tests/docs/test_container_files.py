@@ -6,6 +6,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,28 @@ def test_what_is_copied_and_installed_exists() -> None:
     project = (ROOT / "pyproject.toml").read_text()
     for extras in re.findall(r"/source\[([\w,]+)\]", CONTAINERFILE):
         assert all(re.search(rf"^{each} = \[", project, re.MULTILINE) for each in extras.split(","))
+
+
+def ignored(path: str) -> bool:
+    """True for a path that is not sent to the builder; each rule of .dockerignore is for names, the last one counts."""
+    found = False
+    for line in (ROOT / ".dockerignore").read_text().splitlines():
+        if not line or line.startswith("#"):
+            continue
+        pattern, parts = line.removeprefix("!"), path.split("/")
+        anywhere = pattern.startswith("**/")
+        if any(fnmatchcase(part, pattern.removeprefix("**/")) for part in (parts if anywhere else parts[:1])):
+            found = not line.startswith("!")
+    return found
+
+
+def test_only_what_the_images_are_made_of_is_sent_to_the_builder() -> None:
+    copied = {each for names in stage("source")["COPY"] for each in names.split()[:-1]}
+    here = {each.name for each in ROOT.iterdir()} | {".git", ".venv", ".mypy_cache", "twin.db"}
+    assert {name for name in here if not ignored(name)} == copied
+    package = [path.relative_to(ROOT) for path in (ROOT / "servotwin").rglob("*") if path.is_file()]
+    for path in [*package, Path("servotwin/cli/__pycache__/app.cpython-312.pyc")]:
+        assert ignored(str(path)) == ("__pycache__" in path.parts)
 
 
 def test_the_services_run_the_images_with_little_rights_and_their_folders() -> None:

@@ -144,7 +144,11 @@ def test_each_gain_of_a_law_may_have_a_range() -> None:
 @pytest.mark.parametrize(
     ("law", "limits", "words"),
     [
-        (CASCADE, Limits(Kp=(1.0, 2.0)), r"limits Kp = \(1.0, 2.0\): the controller has no Kp; give position_gain, "),
+        (
+            CASCADE,
+            Limits(Kp=(1.0, 2.0)),
+            r"limits Kp = \(1.0, 2.0\) V/m: the controller has no Kp; give ranges of position_gain, ",
+        ),
         (PID, Limits(Kd=(-9.0, -1.0)), "limits Kd = .*: must reach to the side of zero of the servo's own 90.0"),
     ],
 )

@@ -75,7 +75,7 @@ def test_a_notch_is_no_wider_than_the_limits_allow_it() -> None:
 
 
 def test_limits_on_a_notch_are_in_order() -> None:
-    with pytest.raises(InvalidInput, match=r"notch 9.0 Hz to 8.0 Hz: must be in order"):
+    with pytest.raises(InvalidInput, match=r"limits notch_min_hz = 9.0 Hz: must be at most notch_max_hz = 8.0 Hz"):
         Limits(notch_min_hz=9.0, notch_max_hz=8.0)
 
 

@@ -1,11 +1,14 @@
 """A folder of an edge that was copied in part: what is missing is said and counted, and nothing is sent wrongly."""
 
+import json
 import shutil
 import socket
+import sqlite3
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
 from edge_process_parts import EDGE
 from outbox_cases import window
@@ -15,6 +18,7 @@ from servotwin.edge_process.link_process import LinkProcess
 from servotwin.edge_process.monitoring import read_status
 from servotwin.edge_process.startup import check
 from servotwin.errors import InvalidInput
+from servotwin.link.sqlite_outbox import SqliteOutbox
 
 WINDOWS, OF_LOG = 24, 8
 
@@ -38,7 +42,9 @@ def folder(tmp_path: Path) -> Path:
     """The folder of an edge whose newest windows are in the log of its outbox only."""
     here, copy = tmp_path / "edge", tmp_path / "copy"
     here.mkdir()
-    (here / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9"))
+    (here / "edge.toml").write_text(
+        EDGE.format(url="http://127.0.0.1:9").replace("ax-1", "axis-1")
+    )  # as in its windows
     (here / "token").touch(0o600)
     (here / "token").write_text("first")
     with link(here) as process:
@@ -86,6 +92,37 @@ def test_every_window_of_an_outbox_that_was_cut_is_read_or_counted(folder: Path,
         assert set(status["windows"]["dropped"]) <= {"outbox broken", "outbox incomplete"}
         for key in process.outbox.pending():
             assert process.outbox.get(key) == window(key[1])
+
+
+@pytest.mark.parametrize("version", ["this", "before"], ids=["the file names its servo", "only its windows do"])
+@pytest.mark.parametrize("renamed", [False, True], ids=["another file", "another name in edge.toml"])
+def test_an_outbox_of_another_servo_is_put_aside_with_all_its_windows_and_the_edge_runs_on(
+    tmp_path: Path, version: str, renamed: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9").replace("ax-1", "axis-1"))
+    (here / "token").touch(0o600)
+    (here / "token").write_text("first")
+    with link(here) as process:
+        for k in range(3):
+            process.outbox.put(window(k))
+    if version == "before":
+        with closing(sqlite3.connect(here / "outbox.sqlite")) as database, database:
+            database.execute("DELETE FROM notes WHERE name = 'servo'")
+    (here / "edge.toml").write_text(EDGE.format(url="http://127.0.0.1:9"))
+    if not renamed:
+        (here / "status.json").unlink()
+    own = msgspec.structs.replace(window(7), servo="ax-1")
+    with link(here) as process:
+        assert (process.outbox.pending(), process.outbox.dropped) == ([], {})
+        process.outbox.put(own)
+    with link(here) as process:
+        assert process.outbox.get(("b0", 7)) == own
+    [line] = [json.loads(line) for line in capfd.readouterr().err.splitlines() if "another servo" in line]
+    assert (line["file"], line["of"], line["windows"]) == ("outbox.sqlite.another-1", "axis-1", 3)
+    with closing(SqliteOutbox(here / line["file"], "axis-1")) as aside:
+        assert [aside.get(key) for key in aside.pending()] == [window(k) for k in range(3)]
 
 
 def test_a_folder_without_its_token_is_refused_in_one_sentence(folder: Path) -> None:

@@ -363,3 +363,16 @@ def test_only_its_owner_may_open_an_outbox(tmp_path: Path) -> None:
     path.chmod(0o644)
     reopened(path).close()
     assert path.stat().st_mode & 0o777 == 0o600
+
+
+def test_a_corrupt_file_of_another_servo_is_put_aside_with_what_can_be_read_of_it(tmp_path: Path) -> None:
+    path = filled(tmp_path, WINDOWS)
+    overwrite(path, leaves(path)[3:6])
+    box = SqliteOutbox(path, "axis-2")
+    assert (box.flushed, box.pending(), box.letters(), box.dropped) == (True, [], [], {})
+    assert box.number("cursor") == 0
+    box.close()
+    [broken], [other] = box.salvages, box.others
+    assert (other.servo, other.waiting, broken.rescued + broken.lost) == ("axis-1", broken.rescued, WINDOWS)
+    with closing(SqliteOutbox(other.file, "axis-1")) as aside:
+        assert [aside.get(key) for key in aside.pending()] == [window(key[1]) for key in aside.pending()]

@@ -187,7 +187,8 @@ def test_a_read_only_file_is_counted_and_survived(
     outbox.put(window(0))
     outbox.close()
     with monkeypatch.context() as patch:
-        patch.setattr("servotwin.link.sqlite_outbox.connect", read_only)
+        for module in ("sqlite_file", "sqlite_outbox"):
+            patch.setattr(f"servotwin.link.{module}.connect", read_only)
         outbox.flush()
         outbox.put(window(1))
         outbox.put_letter(b"letter")

@@ -139,7 +139,7 @@ def test_values_out_of_range_are_refused(changes: dict[str, object], message: st
         (
             "enter_tolerances = 1.0",
             "enter_tolerances = 2",
-            "[controller]: controller leave = 1.0 tolerances: must be at least",
+            "controller.leave_tolerances = 1.0: must be at least",
         ),
         ("kp_v_per_m", "kp_v_per_mm", "key 'controller.kp_v_per_m' is missing (found 'controller.kp_v_per_mm'"),
         ("[sensors]", "[sensor]", "unknown key 'sensor' (did you mean 'sensors'?); the top level allows"),

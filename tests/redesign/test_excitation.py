@@ -178,7 +178,7 @@ def test_a_window_is_long_enough_with_the_requested_length_and_pre_trigger() -> 
         ({"after": 0}, "after = 0: must be an integer, at least 1"),
         ({"strokes": 0}, "strokes = 0"),
         ({"window": math.inf}, "window = inf s"),
-        ({"pre_trigger": 2.0}, "pre_trigger = 2.0 s: must be below window = 2.0 s"),
+        ({"pre_trigger": 2.0}, "pre_trigger = 2.0 s: must be below 2.0 s, "),
         ({"probe": -1e-4}, "probe = -0.0001 m"),
         ({"interval": 0.0}, "interval = 0.0 s"),
         ({"hold": math.nan}, "hold = nan s"),

@@ -2,6 +2,7 @@
 
 import os
 import socket
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -36,6 +37,37 @@ def test_an_abstract_socket_is_reached() -> None:
         manager = ServiceManager({"NOTIFY_SOCKET": f"@{name}"})
         manager.ready()
         assert end.recv(100) == b"READY=1"
+        manager.stopping()
+
+
+def test_what_a_service_manager_with_a_full_queue_did_not_take_is_said_at_the_next_turn() -> None:
+    with listening() as heard:
+        manager = ServiceManager({"NOTIFY_SOCKET": str(heard.path), "WATCHDOG_USEC": "2000000"})
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as others:
+            others.setblocking(False)
+            with suppress(BlockingIOError):  # its queue is full
+                while True:
+                    others.sendto(b"of others", str(heard.path))
+        manager.ready()
+        manager.alive(100.0)
+        assert set(heard.received()) == {"of others"}
+        heard.states.clear()
+        for tenth in range(1, 5):  # the next sign of life would be due at 101 s
+            manager.alive(100.0 + tenth / 10.0)
+        assert heard.received() == ["READY=1", "WATCHDOG=1"]
+        manager.stopping()
+
+
+def test_a_service_that_nothing_watches_says_again_that_it_is_ready() -> None:
+    """Its service manager was starting anew at the first time."""
+    with listening() as heard:
+        away = heard.path.rename(heard.path.with_name("away"))
+        manager = ServiceManager({"NOTIFY_SOCKET": str(heard.path)})
+        manager.ready()
+        away.rename(heard.path)
+        manager.alive(0.0)
+        manager.alive(1.0)
+        assert heard.received() == ["READY=1"]
         manager.stopping()
 
 

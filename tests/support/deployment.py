@@ -24,6 +24,7 @@ from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.edge_process.monitoring import read_status
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.runtime.retry import Retry
+from servotwin.twin_service.auth import Verifiers, write_tokens
 from servotwin.up.enrolment import Enrolment, enroll
 
 RATE, WINDOW_S = 500.0, 0.8
@@ -126,7 +127,7 @@ class Fleet:
     ) -> None:
         self.folder, self.port, self._edit = folder, free_port(), edit
         self.roles = {f"ax-{k}": role for k, role in enumerate(roles)}
-        (folder / "tokens.toml").touch(0o600)
+        write_tokens(folder / "tokens.toml", Verifiers())
         self.database = folder / store
         keys = f'store = "sqlite:///{store}"\nspeed = 2.0\n{service}'
         text = TWIN_TOML.format(port=self.port, service=keys, rate=RATE, validity=1000.0)

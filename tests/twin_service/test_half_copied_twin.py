@@ -10,7 +10,7 @@ from service_system import OTHER, TOKEN, bearer, place, served, twin_file, windo
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
 from servotwin.messages import encode
-from servotwin.twin_service.auth import Verifiers, read_tokens, write_tokens
+from servotwin.twin_service.auth import TokenFile, Verifiers, read_tokens, write_tokens
 from servotwin.twin_service.twin_file import read_twin
 
 WINDOWS = 40
@@ -77,6 +77,37 @@ def test_wherever_a_file_is_cut_nobody_gets_in_who_had_no_token(whole: Path, tmp
             assert found.readers.items() <= tokens.readers.items()
     assert len(refusals) > 0.9 * len(text)
     assert all(name in refusal for refusal in refusals)
+
+
+def test_wherever_the_tokens_are_cut_the_file_is_refused_and_the_former_tokens_stay(
+    whole: Path, tmp_path: Path
+) -> None:
+    """Each servo whose token is missing would be refused as if its token were wrong."""
+    path = tmp_path / "tokens.toml"
+    shutil.copy(whole / "tokens.toml", path)
+    text, file = path.read_text(), TokenFile(path)
+    for end in range(len(text.rstrip())):
+        path.write_text(text[:end])
+        assert not file.refresh()
+        assert file.fault.startswith(f"{path}: is ")
+        file.access.check_servo("ax-1", TOKEN.encode())
+    at_a_line = text[: text.index("[operators]")]
+    for cut, sentence in (
+        ("", "is empty; copy it again"),
+        (at_a_line, "is cut short: its line '# end' is missing; copy"),
+    ):
+        path.write_text(cut)
+        with pytest.raises(InvalidInput, match=sentence):
+            read_tokens(path)
+
+
+def test_tokens_that_an_earlier_version_wrote_are_read(whole: Path, tmp_path: Path) -> None:
+    path = tmp_path / "tokens.toml"
+    shutil.copy(whole / "tokens.toml", path)
+    known, lines = read_tokens(path), path.read_text().splitlines()
+    assert known.servos
+    path.write_text("\n".join(lines[1:-1]))
+    assert read_tokens(path) == known
 
 
 def test_two_names_with_one_token_change_nothing_and_are_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -18,6 +18,7 @@ from servotwin.cosim import cosimulate
 from servotwin.cosim.scenario import Scenario
 from servotwin.drives.simulated.machine_state import write_speed
 from servotwin.plant.signals import as_pieces
+from servotwin.twin_service.auth import Verifiers, write_tokens
 from servotwin.up.enrolment import Enrolment, enroll
 
 RATE, DURATION, PERIOD, SPEED = 1000.0, 40.0, 4.0, 5.0
@@ -99,7 +100,7 @@ def free_running(folder: Path) -> dict[float, dict]:
     """Estimates by the start of their windows, s of machine time, of a twin, an edge and a machine on their own."""
     (folder / "machine.toml").write_text(MACHINE)
     (folder / "twin.toml").write_text(TWIN)
-    (folder / "tokens.toml").touch(0o600)
+    write_tokens(folder / "tokens.toml", Verifiers())
     write_speed(folder / "speed", 5e-3)  # the edge comes to the first sample, or to one soon after it
     with machine(folder / "machine.toml") as (address, _), service(folder / "twin.toml") as url:
         drive = {"kind": "simulated", "address": address, "silence_s": 0.0}

@@ -59,14 +59,18 @@ def test_a_servo_is_enrolled_and_its_edge_can_begin(tmp_path):
 def test_a_second_token_replaces_the_first_only_on_request_and_leaves_the_edge_s_file(tmp_path):
     twin, edge = fresh(tmp_path), tmp_path / "edge"
     options = ("enroll", "ax-7", "--twin", twin, "--edge", edge, "--url", "http://127.0.0.1:1")
-    assert run(*options).exit_code == 0
+    first = run(*options)
+    assert (first.exit_code, "kept" in first.stdout) == (0, False)
     (edge / "edge.toml").write_text((edge / "edge.toml").read_text() + "# mine\n")
     before = read_tokens(tmp_path / "tokens.toml"), (edge / "token").read_text()
     refused = run(*options)
     assert refused.exit_code == 2
     assert "--again" in refused.stderr
     assert (read_tokens(tmp_path / "tokens.toml"), (edge / "token").read_text()) == before
-    assert run(*options, "--again").exit_code == 0
+    again = run(*options, "--again")
+    assert again.exit_code == 0
+    [said] = [line for line in again.stdout.splitlines() if line.startswith("kept: ")]
+    assert said.startswith(f"kept: {edge / 'edge.toml'}, with the limits and options of its enrolment; ")
     token = (edge / "token").read_text().strip()
     assert token != before[1].strip()
     assert read_tokens(tmp_path / "tokens.toml").servos == {"ax-7": verifier_of(token)}

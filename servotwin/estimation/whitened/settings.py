@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, replace
 from typing import Annotated
 
+from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, key, settings, value
-from servotwin.errors import InvalidInput
 
 _LARGEST_SKEW = 5e-3  # s of the paper's servo
 
@@ -132,6 +132,4 @@ class WhitenedSettings:
     def __post_init__(self) -> None:
         check(self)
         if self.offset is not None and not self.offset[1] > 0.0:
-            raise InvalidInput(
-                f"estimator offset = {self.offset!r} rad: must be (mean, standard deviation), the latter above 0"
-            )
+            raise contradiction(self, "{0}: must be (mean, standard deviation), the latter above 0", "offset")

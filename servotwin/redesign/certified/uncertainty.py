@@ -23,7 +23,6 @@ PARAMETERS = ("k", "c", "k_B", "m", "k_T", "p")
 """Numbers of the plant that are uncertain, in the order of the drawn factors."""
 # Standard deviations beyond which a learnt factor is not drawn.
 _TAILS = 3.0
-_UNITS = {"gap": "rad", "step": "m", "input_bias": "V", "friction": "N m"}
 
 
 @dataclass(frozen=True)
@@ -125,13 +124,17 @@ class Uncertainty:
     m: Annotated[
         float, key("m_percent", minimum=0.0, below=1.0, help="Half-width of the mass, relative to the model's.")
     ] = 0.1
-    gap: Annotated[Range, key("gap_deg", minimum=0.0, help="Range of the total gap.")] = (0.0, math.radians(60.0))
+    gap: Annotated[Range, key("gap_deg", minimum=0.0, ordered=True, help="Range of the total gap.")] = (
+        0.0,
+        math.radians(60.0),
+    )
     step: Annotated[
         Range,
         key(
             "step_mm",
             "step_deg",
             above=0.0,
+            ordered=True,
             help="Range of the steps that the reference makes; one size is as likely as another on a logarithmic "
             "scale.",
         ),
@@ -140,12 +143,14 @@ class Uncertainty:
         Range,
         key(
             *INPUT_BIAS_KEYS,
+            ordered=True,
             help="Range of the command that is added behind the controller; where a twin's file leaves it out, up to "
             "0.1 V either way, and of an axis as much in its own units, at most 1 % of its command's limit.",
         ),
     ] = (0.0, 0.0)
     friction: Annotated[
-        Range, key("friction_n_m", minimum=0.0, help="Range of the Coulomb friction on the motor's shaft.")
+        Range,
+        key("friction_n_m", minimum=0.0, ordered=True, help="Range of the Coulomb friction on the motor's shaft."),
     ] = (0.0, 0.0)
     k_T: Annotated[
         float,
@@ -180,10 +185,6 @@ class Uncertainty:
 
     def __post_init__(self) -> None:
         check(self)
-        for name, unit in _UNITS.items():
-            low, high = getattr(self, name)
-            if not low <= high:
-                raise InvalidInput(f"uncertainty {name} = ({low!r}, {high!r}) {unit}: must be in order")
         check_gap(self.gap[1], "uncertainty gap")
 
     def own_friction_of(self, plant: Plant) -> Range:
