@@ -74,15 +74,6 @@ def cascade(**changes: object) -> st.Cascade:
             lambda: st.TorqueDrive(0.4, coulomb=0.2, static=0.1, stribeck=0.1),
             "static_friction_n_m = 0.1 N m: must be at least coulomb_friction_n_m = 0.2 N m",
         ),
-        (
-            lambda: st.estimate_gap(
-                st.Window(np.zeros(500), theta_m=np.zeros(500), sample_rate=100.0),
-                TWO_MASS.replace(
-                    load=st.Load((5.6,), (0.0,), (0.3,), "rotary", friction=0.1, static=0.2, stribeck=0.1)
-                ),
-            ),
-            "load static_friction_n_m = 0.2 N m: the estimate of the gap knows no friction of the load that falls",
-        ),
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_refused_in_a_sentence(make: object, words: str) -> None:
