@@ -73,6 +73,21 @@ def test_the_model_moves_as_the_exact_simulation_does(name: str) -> None:
     assert fine < 0.3 * coarse
 
 
+def test_a_factor_on_the_force_moves_the_load_as_another_force_does() -> None:
+    def moved(force: float, factor: float) -> np.ndarray:
+        axis = screw_axis(2, 0.1)
+        axis = axis.replace(load=dataclasses.replace(axis.load, force=force))
+        problem, _ = problem_of(window, axis, None)
+        values = problem.model.start(0.5 * lever(axis) * GAP, 0.0, (0.0, 0.0))
+        at = [unknown.name for unknown in problem.model.unknowns].index("load force")
+        values[at] = math.log(factor)
+        return problem.motion(values).position
+
+    window = measured(worn(screw_axis(2, 0.1)))
+    assert np.ptp(moved(1.0, 2.0) - moved(1.0, 1.0)) > 0.01 * np.ptp(window.position)
+    np.testing.assert_allclose(moved(1.0, 2.0), moved(2.0, 1.0), rtol=0.0, atol=1e-9 * np.ptp(window.position))
+
+
 @pytest.mark.parametrize("name", AXES)
 def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
     axis = AXES[name]
