@@ -69,7 +69,7 @@ class ServoFits:
 
 @dataclass(frozen=True)
 class AxisFits:
-    """Output-error fits of the windows of a shaft that is free in the gap, or of one mass behind a rigid screw."""
+    """Output-error fits of the windows of the axes whose gap `output_error` estimates."""
 
     axis: Axis
 

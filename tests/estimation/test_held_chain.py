@@ -12,6 +12,7 @@ from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import default_method, estimate_gap
 from servotwin.estimation.output_error.estimator import problem_of
 from servotwin.estimation.output_error.held_chain import MovingChain, lever
+from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis
@@ -73,6 +74,21 @@ def test_the_model_moves_as_the_exact_simulation_does(name: str) -> None:
     assert fine < 0.3 * coarse
 
 
+def test_a_factor_on_the_force_moves_the_load_as_another_force_does() -> None:
+    def moved(force: float, factor: float) -> np.ndarray:
+        axis = screw_axis(2, 0.1)
+        axis = axis.replace(load=dataclasses.replace(axis.load, force=force))
+        problem, _ = problem_of(window, axis, None)
+        values = problem.model.start(0.5 * lever(axis) * GAP, 0.0, (0.0, 0.0))
+        at = [unknown.name for unknown in problem.model.unknowns].index("load force")
+        values[at] = math.log(factor)
+        return problem.motion(values).position
+
+    window = measured(worn(screw_axis(2, 0.1)))
+    assert np.ptp(moved(1.0, 2.0) - moved(1.0, 1.0)) > 0.01 * np.ptp(window.position)
+    np.testing.assert_allclose(moved(1.0, 2.0), moved(2.0, 1.0), rtol=0.0, atol=1e-9 * np.ptp(window.position))
+
+
 @pytest.mark.parametrize("name", AXES)
 def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
     axis = AXES[name]
@@ -116,6 +132,20 @@ def test_a_loop_that_touches_one_side_gets_a_lower_bound() -> None:
     estimate = estimate_gap(measured(run, 3.8, 2.0, noise=1e-6), screw_axis(3, 0.1))
     assert estimate.status in (GapStatus.LOWER_BOUND, GapStatus.UNIDENTIFIABLE)
     assert not estimate.gap > GAP
+
+
+def test_an_interval_with_gaps_that_the_motor_does_not_cross_has_no_upper_end() -> None:
+    """The motor's way is 15 % wider than the gap; a load that swings on its own hides how little it is pushed."""
+    axis, time = screw_axis(2, 0.01), np.arange(1000) / 200.0
+    theta_m = 0.575 * GAP * np.cos(3.0 * math.pi * time / time[-1])
+    still = Window(np.zeros(1000), theta_m, sample_rate=200.0)
+    problem, _ = problem_of(still, axis, None)
+    position = problem.motion(problem.model.start(0.5 * lever(axis) * GAP, 0.0, (0.0, 0.0))).position
+    window = still.replace(position=position + np.random.default_rng(3).normal(0.0, 1e-8, position.size))
+    assert estimate_gap(window, axis).ok
+    unsure = estimate_gap(window, axis, settings=OutputErrorSettings(model_share=0.1))
+    assert unsure.status is GapStatus.LOWER_BOUND
+    assert 0.5 * GAP < unsure.gap < GAP
 
 
 def test_the_estimate_does_not_depend_on_units() -> None:

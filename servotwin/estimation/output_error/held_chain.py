@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +15,14 @@ from servotwin.estimation.output_error.models import (
     Priors,
     Unknown,
     common,
+    fastest,
     fine_parts,
     gains,
     independent,
     other_friction,
 )
-from servotwin.estimation.output_error.shaft import advance, between, slow_after, slow_before
-from servotwin.hybrid.compiled import bare
+from servotwin.estimation.output_error.shaft import between, slow_after, slow_before
+from servotwin.hybrid.compiled import bare, inlined
 from servotwin.hybrid.exponential import expm1
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
@@ -32,7 +33,8 @@ from servotwin.plant.structure import Chain, chain, tridiagonal
 STIFFNESS, DAMPING, FRICTION, FORCE, MASS_RATIO = "stiffness", "damping", "load friction", "load force", "mass ratio"
 _OBSERVED = 0.25  # of the chain's slowest frequency: a faster observer hides which way friction pushes
 _SAMPLES_A_RADIAN = 6.0  # of the chain's fastest frequency
-_OWN = (1.0, 1.0, 1.0, 1.0)  # factors of the model's own numbers
+_OWN = (1.0, 1.0, 1.0)  # factors of the model's own numbers
+_REMEMBERED = 8  # matrices
 
 
 class MovingChain(NamedTuple):
@@ -151,6 +153,46 @@ class HeldChainModel:
         """(u, u), diagonal."""
         return independent(self.unknowns)
 
+    def _step(self, factors: tuple[float, ...], interval: float) -> Array:
+        """(size, size) exponential over a part of a sample, of (q (n), v (n), screw, its rate, share of the force)."""
+        known, numbers = self._steps, (interval, *factors)
+        if numbers not in known:
+            if len(known) == _REMEMBERED:
+                known.pop(next(iter(known)))
+            flow = self._flow(factors)
+            known[numbers] = np.eye(len(flow)) + expm1(flow, interval / self._parts(interval))
+        return known[numbers]
+
+    @cached_property
+    def _steps(self) -> dict[tuple[float, ...], Array]:
+        """The last few: most derivatives move another unknown than the chain's numbers."""
+        return {}
+
+    def _parts(self, interval: float) -> int:
+        """Parts of a sample at the model's own numbers: with more of them elsewhere a fit would not be smooth."""
+        return fine_parts(self._rate, self.axis.load.friction > 0.0, interval)
+
+    @cached_property
+    def _rate(self) -> float:
+        """Largest of the flow at the model's own numbers, 1/s."""
+        return fastest(self._flow(_OWN))
+
+    def _flow(self, factors: tuple[float, ...]) -> Array:
+        """(size, size) flow; the screw's position is counted as that of the last mass at rest."""
+        moving = self.moving.scaled(*factors)
+        links, n = moving.links(), moving.m.size
+        flow, kept, unit = np.zeros((2 * n + 3, 2 * n + 3)), 2 * n, self._unit
+        flow[:kept, :kept] = links.A
+        flow[:kept, kept], flow[:kept, kept + 1] = unit * links.B_position, unit * links.B_velocity
+        flow[kept, kept + 1] = 1.0
+        flow[kept - 1, kept + 2] = self.axis.load.force / moving.m[-1]
+        return flow
+
+    @cached_property
+    def _unit(self) -> float:
+        """Position of the screw over that of the last mass at rest."""
+        return 1.0 / self.moving.static_gain()
+
     @cached_property
     def _names(self) -> tuple[str, ...]:
         return tuple(unknown.name for unknown in self.unknowns)
@@ -175,10 +217,10 @@ class HeldChainModel:
         """
         named = dict(zip(self._names, values.tolist(), strict=True))
         n, ratio = self.moving.m.size, math.exp(named["ratio"])
-        factors = tuple(math.exp(named.get(name, 0.0)) for name in (STIFFNESS, DAMPING, MASS_RATIO, FORCE))
-        step, parts = _step(self.axis, factors, interval)
+        factors = tuple(math.exp(named.get(name, 0.0)) for name in (STIFFNESS, DAMPING, MASS_RATIO))
+        step, parts = self._step(factors, interval), self._parts(interval)
         friction = math.exp(named.get(FRICTION, 0.0)) * self.axis.load.friction / self.moving.m[-1]
-        state = np.concatenate([values[-2 * n :], [named["first place"], 0.0, 1.0]])
+        state = np.concatenate([values[-2 * n :], [named["first place"], 0.0, math.exp(named.get(FORCE, 0.0))]])
         out, sides = np.empty((3, drive.size)), np.empty(drive.size, dtype=np.int8)
         part = interval / parts
         run_held_chain(
@@ -207,32 +249,20 @@ def _numbered(name: str, count: int) -> list[str]:
     return [f"{name}{i + 1}" for i in range(count)]
 
 
-@lru_cache(maxsize=64)
-def _step(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[Array, int]:
-    """Exponential over a part of a sample, of (q (n), v (n), screw, its rate, 1), and the parts that are needed."""
-    parts = _parts(axis, interval)
-    flow = _flow(axis, factors)
-    return np.eye(len(flow)) + expm1(flow, interval / parts), parts
-
-
-@lru_cache(maxsize=64)
-def _parts(axis: Axis, interval: float) -> int:
-    """Parts of a sample at the model's own numbers: with more of them elsewhere a fit would not be smooth."""
-    return fine_parts(_flow(axis, _OWN), axis.load.friction > 0.0, interval)
-
-
-def _flow(axis: Axis, factors: tuple[float, ...]) -> Array:
-    """(size, size) flow; the screw's position is counted as that of the last mass at rest."""
-    k, c, last, force = factors
-    own = MovingChain.of(axis)
-    moving = own.scaled(k, c, last)
-    links, n = moving.links(), moving.m.size
-    flow, kept, unit = np.zeros((2 * n + 3, 2 * n + 3)), 2 * n, 1.0 / own.static_gain()
-    flow[:kept, :kept] = links.A
-    flow[:kept, kept], flow[:kept, kept + 1] = unit * links.B_position, unit * links.B_velocity
-    flow[kept, kept + 1] = 1.0
-    flow[kept - 1, kept + 2] = force * axis.load.force / moving.m[-1]
-    return flow
+@inlined
+def pulled(step: Array, state: Array, screw: float, rate: float, after: Array) -> None:
+    """Advance positions and speeds of a `state` by a `step`, under a screw at a place with a rate; two sums side by
+    side."""
+    n, kept = (state.size - 3) // 2, state.size - 3
+    for i in range(kept):
+        place = step[i, kept] * screw + step[i, kept + 1] * rate + step[i, kept + 2] * state[kept + 2]
+        speed = 0.0
+        for j in range(n):
+            place += step[i, j] * state[j]
+            speed += step[i, n + j] * state[n + j]
+        after[i] = place + speed
+    for i in range(kept):
+        state[i] = after[i]
 
 
 @bare
@@ -257,7 +287,7 @@ def run_held_chain(
     drive, parts, interval, half, measured, gains, friction, motion, sides
         As of `run_shaft`; the driven end is the screw.
     step : (size, size) array
-        Exponential over a part, of (q (n), v (n), screw, its rate, 1); size = 2 n + 3.
+        Exponential over a part, of (q (n), v (n), screw, its rate, share of the force); size = 2 n + 3.
     after : (size,) array
         Scratch.
     state : (size,) array
@@ -277,10 +307,7 @@ def run_held_chain(
         for k in range(parts):
             motor = between(drive, i, (k + 1.0) / parts)
             end = min(max(screw, motor - half), motor + half)
-            state[kept], state[kept + 1] = screw, (end - screw) / interval
             place, unused = state[n - 1], slow_before(state, friction)
-            advance(step, state, after)
-            for j in range(state.size):
-                state[j] = after[j]
+            pulled(step, state, screw, (end - screw) / interval, after)
             slow_after(state, place, unused, friction)
             screw = end

@@ -318,7 +318,7 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
     parts of a sample that are needed."""
     flows, push, fading = _flows(axis, factors)
     kept = len(push) - 3
-    parts = max(_least_parts(axis, interval), math.ceil(_fastest(flows) * interval / _CONVERGES))
+    parts = max(_least_parts(axis, interval), math.ceil(fastest(flows) * interval / _CONVERGES))
     steps = np.eye(flows.shape[-1]) + np.array([expm1(flow, interval / parts) for flow in flows])
     left = math.exp(-fading * interval / parts)
     steps[0, kept] = steps[0, 0]
@@ -330,15 +330,16 @@ def _matrices(axis: Axis, factors: tuple[float, ...], interval: float) -> tuple[
 def _least_parts(axis: Axis, interval: float) -> int:
     """Parts of a sample at the model's own numbers: with more of them elsewhere a fit would not be smooth."""
     flows, _, _ = _flows(axis, _OWN)
-    return fine_parts(flows, axis.load.friction > 0.0, interval)
+    return fine_parts(fastest(flows), axis.load.friction > 0.0, interval)
 
 
-def fine_parts(flows: Array, friction: bool, interval: float) -> int:
-    """Parts of a sample (s) in which a flow (..., size, size) turns little, and friction may change its sign."""
-    return max(_PARTS if friction else 1, math.ceil(_fastest(flows) * interval / _FINE))
+def fine_parts(rate: float, friction: bool, interval: float) -> int:
+    """Parts of a sample (s) in which a flow of a largest rate (1/s) turns little, and friction may change its sign."""
+    return max(_PARTS if friction else 1, math.ceil(rate * interval / _FINE))
 
 
-def _fastest(flows: Array) -> float:
+def fastest(flows: Array) -> float:
+    """Largest rate (1/s) of flows (..., size, size)."""
     return float(np.max(np.abs(np.linalg.eigvals(flows))))
 
 

@@ -91,11 +91,13 @@ def judge(
     mismatches = _mismatches(found, likely, settings.gap_rate / unit, settings.model_share * known.half)
     if mismatches:
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
-    bounded = _bounded(found, known)
-    if bounded is not None:
-        return bounded
+    single, likely_single = _single(found, known)
+    if likely_single:
+        return _bounded(found, single, "one flank explains the window nearly as well as two")
     allowed = _allowed(found, known.half, settings)
     doubts, explained = _doubts(found, known, allowed, unit)
+    if not doubts and _out_of_reach(found, known.half + NORMAL_95 * explained):
+        return _bounded(found, single, "the interval contains gaps that the motor does not cross in the window")
     if not doubts:
         return JudgedFit(GapStatus.OK, known.half, known.std, explained)
     ratio = None
@@ -126,21 +128,32 @@ def _known_half(
     return _KnownHalf(half, std, total)
 
 
-def _bounded(found: Search, known: _KnownHalf) -> JudgedFit | None:
-    """Decide on a window that one flank explains nearly as well as two; None: it does not."""
-    best, count = found.best, found.problem.count
+def _single(found: Search, known: _KnownHalf) -> tuple[Fit, bool]:
+    """The best fit with one flank, and whether it explains the window nearly as well as two."""
+    best = found.best
     singles = [one_flank(found)]
     if known.half <= NORMAL_95 * known.total:
         singles += one_flank_without_a_gap(found)
     single = min(singles, key=lambda fit: fit.cost)
     rise = (single.cost - best.cost) / best.variance()
-    if not (rise < _BELIEVED or any(_alike(found, fit) for fit in singles)):
-        return None
+    return single, rise < _BELIEVED or any(_alike(found, fit) for fit in singles)
+
+
+def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
+    """Decide on a window that shows one flank, for a reason in words."""
+    count = found.problem.count
     bound = _BOUND * 2.0 * (smallest_half(found, single) - _hidden_friction(found, single)) - count
     enough = bound > _BOUND_COUNTS * count
-    words = "one flank explains the window nearly as well as two"
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
     return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
+
+
+def _out_of_reach(found: Search, half: float) -> bool:
+    """Tell whether a half gap (m or rad at the load) that holds the driven end is wider than the motor's way.
+
+    A load that swings on its own hides how little the motor pushes it: the gap is then the motor's way.
+    """
+    return isinstance(found.problem.model, HeldChainModel) and 2.0 * half >= float(np.ptp(found.problem.drive))
 
 
 def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tuple[tuple[str, ...], float]:
