@@ -95,6 +95,18 @@ def test_rests_that_are_alike_speak_of_a_bias(bias: float, count: int) -> None:
     assert least < bias < most
 
 
+def test_rests_of_a_motor_at_which_an_elastic_screw_pulls_speak_of_no_friction() -> None:
+    """Its friction could not be simulated: the policy had no setting for such a machine."""
+    policy = CertifiedPolicy(SERVO.replace(k_d=1e6), Uncertainty(input_bias=(-0.1, 0.1)))
+    forth, back = (Disturbance(bias, 1e-5, 0.0, 0.3, 0.0) for bias in (-0.02, 0.03))
+    seen = evidence([forth, back])
+    assert policy.ranges.friction(seen) == (0.0, 0.0)
+    fed, (least, most) = policy.ranges.input_bias(seen)
+    assert fed == 0.0  # their middle is within what the range contains anyway
+    assert least <= -0.02
+    assert most >= 0.03
+
+
 def test_a_first_rest_tells_neither() -> None:
     fed, (least, most) = POLICY.ranges.input_bias(evidence(rests(0.0, 0.05)[:1]))
     assert fed == 0.0

@@ -169,7 +169,11 @@ class EvidenceRanges:
         half = 0.5 * (max(rests) - min(rests))
         if half <= 0.5 * _BIAS_MOVED * self.smallest_answer:
             return _Rest(bias, NORMAL_95 * std, 0.0)
-        return _Rest(0.5 * (max(rests) + min(rests)), max(NORMAL_95 * std, 0.5 * half), _HOLDS * half)
+        middle = 0.5 * (max(rests) + min(rests))
+        if self.servo.backlash_kind is BacklashKind.HELD:
+            # A load on a spring pulls at this motor, which has no friction: the rests are those of the load's places.
+            return _Rest(middle, max(NORMAL_95 * std, half), 0.0)
+        return _Rest(middle, max(NORMAL_95 * std, 0.5 * half), _HOLDS * half)
 
     def _beside_own_friction(self, rests: tuple[float, ...], std: float) -> _Rest:
         """The same where the model states friction, that may hold the motor at either end of `_held`.
