@@ -114,6 +114,8 @@ def test_friction_that_is_twice_the_stated_one_is_no_gap() -> None:
     estimate = estimate_gap(window, screw_axis(3, 0.1))
     assert estimate.status is GapStatus.UNIDENTIFIABLE
     assert "with the stated load friction the gap would be" in estimate.reasons[0]
+    off = float(estimate.reasons[0].rpartition(" best is ")[2].removesuffix(" % off"))
+    assert off == pytest.approx(100.0, abs=5.0)
 
 
 def test_friction_that_falls_with_the_speed_widens_the_interval() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
-from servotwin.estimation.output_error.held_chain import HeldChainModel
+from servotwin.estimation.output_error.held_chain import FRICTION, HeldChainModel
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
@@ -168,7 +168,7 @@ def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tu
         _wide(std, allowed, unit),
         _rival(found, half, total, unit),
         _hidden(found, half),
-        _of_friction(friction, allowed, unit),
+        _of_friction(found, friction, allowed, unit),
         _of_slow_motion(left, half, allowed, unit),
         _of_jitter(times, allowed, unit),
     )
@@ -205,13 +205,16 @@ def _wide(std: float, allowed: float, unit: float) -> str:
     return f"the gap is known to {_deg(unit * std)} only, and {_deg(unit * allowed)} are allowed"
 
 
-def _of_friction(friction: float, allowed: float, unit: float) -> str:
+def _of_friction(found: Search, friction: float, allowed: float, unit: float) -> str:
     """Sentence for a half gap (m or rad at the load) that would be another with the stated friction."""
     if friction <= allowed:
         return ""
+    names = (unknown.name for unknown in found.problem.model.unknowns)
+    fitted = dict(zip(names, found.best.values.tolist(), strict=True)).get(FRICTION)
+    best = "" if fitted is None else f"; the friction that fits best is {100.0 * math.expm1(fitted):+.2g} % off"
     return (
         f"with the stated load friction the gap would be {_deg(unit * friction)} off, and {_deg(unit * allowed)} are "
-        "allowed: slow motion does not tell friction from a gap"
+        f"allowed: slow motion does not tell friction from a gap{best}"
     )
 
 
