@@ -102,7 +102,7 @@ def test_ranges_and_demands_carry_their_units():
         ("[twin]\npolicy = 'margin'\nsmoothing = 0.1", "smoothing = 0.1: belongs to policy 'paper'"),
         ("[twin]\npolicy = 'paper'\nk_noise = 2.0", "k_noise = 2.0: belongs to policy 'margin'"),
         ("[twin.uncertainty]\ngap_deg = 60", "gap_deg = 60 is not allowed; give two numbers"),
-        ("[twin.uncertainty]\ngap_deg = [60, 0]", "uncertainty gap"),
+        ("[twin.uncertainty]\ngap_deg = [60, 0]", "uncertainty.gap_deg = [60, 0] is not allowed"),
         (
             "[twin.uncertainty]\nk_percent = 100",
             "k_percent = 100 is not allowed; give a number, at least 0, below 100",
