@@ -178,7 +178,7 @@ class MqttServer:
         return not self.trouble
 
     def sentences(self) -> list[str]:
-        """Why the broker is not connected; empty: it is."""
+        """A sentence that says why the broker is not connected; none: it is."""
         return [f"the MQTT broker is not connected: {self.trouble}"] if self.trouble else []
 
     async def start(self) -> None:

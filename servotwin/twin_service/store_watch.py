@@ -111,7 +111,7 @@ class StoreWatch:
                 await self._executor.run(self.mark)
 
     async def run_lost(self, notify: Callable[[str], None]) -> None:
-        """Where the store has lost messages, ask the edges of servos too that it has lost: they are new to it.
+        """Ask edges that are new to a store which has lost messages: it may have lost their servos too.
 
         `notify` is called with each that was asked, so that its poll ends.
         """
