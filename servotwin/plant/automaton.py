@@ -24,6 +24,7 @@ from servotwin.plant.backlash import (
     contact_guards,
     contact_modes,
     contact_reset,
+    flank,
     screw_force,
     screw_rate,
 )
@@ -38,18 +39,19 @@ from servotwin.plant.basis import (
 )
 from servotwin.plant.flow import mechanical_flow
 from servotwin.plant.friction import (
-    FRICTIONLESS,
     SMOOTH,
+    FrictionState,
     StickSlipMode,
-    stick_slip_guards,
+    load_guards,
+    motor_guards,
     stick_slip_modes,
-    stopping_speed,
 )
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.zones import Driven, Piece, Zone, controller_zones, driven_pieces
 
 INPUTS = ("reference", "gap", "tolerance")
+_APART = ContactMode("", 0)
 
 
 @dataclass(frozen=True)
@@ -327,33 +329,44 @@ class LoopModes(Generic[Piece]):
     def _guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]) -> tuple[Guard, ...]:
         ends = [(guard, (contact.name, stick_slip.name, guard.target)) for guard in zone.guards]
         # Friction first: where the motor stops on a flank, the screw stays in contact.
+        for guard in self._motor_guards(contact, stick_slip, zone):
+            pushes = contact.resting and stick_slip.motor.stuck and guard.side == contact.side
+            ends.append((guard, (flank(contact.side) if pushes else contact.name, guard.target, zone.name)))
         ends += [
-            (guard, (contact.name, guard.target, zone.name))
-            for guard in self._stick_slip_guards(contact, stick_slip, zone)
+            (guard, (contact.name, guard.target, zone.name)) for guard in self._load_guards(contact, stick_slip, zone)
         ]
-        stopping = stopping_speed(self.servo, self.basis, stick_slip)
-        sides = (0, contact.side) if contact.resting else ()
-        accelerations = [self._acceleration(side, zone) for side in sides]
         ends += [
             (guard, (guard.target, stick_slip.name, zone.name))
-            for guard in contact_guards(self.servo, self.basis, contact, stopping, accelerations, self._resets)
+            for guard in self._contact_guards(contact, stick_slip, zone)
         ]
         return tuple(
             Guard(guard.row, self.names.index(target), guard.reset, guard.label, guard.side) for guard, target in ends
         )
 
-    def _stick_slip_guards(
-        self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]
-    ) -> list[GuardRow]:
-        if stick_slip == FRICTIONLESS:
+    def _contact_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]) -> list[GuardRow]:
+        accelerations: list[Array] = []
+        if contact.resting and not stick_slip.motor.stuck:
+            accelerations = [self._acceleration(side, stick_slip.motor, zone) for side in (0, contact.side)]
+        return contact_guards(self.servo, self.basis, contact, stick_slip, accelerations, self._resets)
+
+    def _motor_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]) -> list[GuardRow]:
+        if stick_slip.motor is SMOOTH:
+            return []
+        torques = dict.fromkeys((1, -1), self._torque(contact, zone))
+        if contact.resting:
+            # It goes on against all of the load, and leaves its flank without it.
+            torques[-contact.side] = self._torque(_APART, zone)
+        return motor_guards(self.servo, self.basis, stick_slip, torques)
+
+    def _load_guards(self, contact: ContactMode, stick_slip: StickSlipMode, zone: Driven[Piece]) -> list[GuardRow]:
+        if stick_slip.load is SMOOTH:
             return []
         force = np.zeros(len(self.basis.names))
         if stick_slip.load.stuck:
             sliding = replace(stick_slip, load=SMOOTH)
             flow = mechanical_flow(self.servo, self.basis, contact, sliding, zone.command)
             force = self.servo.guide.mass * flow[..., self.basis.last_speed(self.servo), :]
-        torque = self._torque(contact, zone)
-        return stick_slip_guards(self.servo, self.basis, stick_slip, torque, force)
+        return load_guards(self.servo, self.basis, stick_slip, force)
 
     def _torque(self, contact: ContactMode, zone: Driven[Piece]) -> Array:
         """Row of the torque that drives the motor's shaft against its friction, N m."""
@@ -363,13 +376,15 @@ class LoopModes(Generic[Piece]):
         torque[..., : shaft.torque.shape[-1]] = shaft.torque
         if np.any(shaft.direct):
             torque = torque + shaft.direct * zone.command
-        if self.servo.backlash_kind is BacklashKind.FREE and contact.side:
+        if self.servo.backlash_kind is not BacklashKind.RIGID and contact.side:
             torque = torque - self.servo.p * screw_force(self.servo, basis, screw_rate(self.servo, basis, contact))
         return np.asarray(torque)
 
-    def _acceleration(self, side: int, zone: Driven[Piece]) -> Array:
-        """The motor's acceleration in contact with a flank, or without contact (side 0), where nothing is stuck."""
-        flow = mechanical_flow(self.servo, self.basis, ContactMode("", side), FRICTIONLESS, zone.command)
+    def _acceleration(self, side: int, motor: FrictionState, zone: Driven[Piece]) -> Array:
+        """The motor's acceleration in contact with a flank, or without contact (side 0), its load not stuck."""
+        flow = mechanical_flow(
+            self.servo, self.basis, ContactMode("", side), StickSlipMode(motor, SMOOTH), zone.command
+        )
         return np.asarray(flow[..., self.basis["speed"], :])
 
     def _outputs(self) -> dict[str, Array]:

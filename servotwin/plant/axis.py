@@ -324,7 +324,7 @@ class Axis:
     @property
     def takes_friction(self) -> bool:
         """True where Coulomb friction on the motor can be simulated."""
-        return self.backlash_kind is not BacklashKind.HELD and bool(np.any(self.shaft().E))
+        return bool(np.any(self.shaft().E))
 
     def with_position_resolution(self, resolution: float) -> Axis:
         """A copy whose measured position has another resolution, m (rotary: rad)."""

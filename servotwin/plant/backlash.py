@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.compiled import compiled
 from servotwin.plant.basis import BacklashKind, Basis, GuardRow, PlantNumbers, outer, rows_times, scaled
+from servotwin.plant.friction import StickSlipMode, stillness, stopping_speed
 from servotwin.plant.signals import Array
 
 
@@ -76,6 +77,9 @@ def play(theta_m: ArrayLike, gap: ArrayLike, theta_d0: float = 0.0) -> Array:
         first = int(np.argmax(half < 0.0))
         raise InvalidInput(f"gap = {2.0 * half[first]:.6g} rad at sample {first} is negative; it must be 0 rad or more")
     return play_samples(angles, half, float(theta_d0))
+
+
+_PUSHES = 2.0  # speeds below which a motor is at rest: faster, the flank of a stuck one pushes
 
 
 @dataclass(frozen=True)
@@ -156,11 +160,16 @@ def screw_force(servo: PlantNumbers, basis: Basis, rate: Array) -> Array:
     return force + chain.reaction_velocity * servo.p * rate if np.any(chain.reaction_velocity) else force
 
 
+def flank(side: int, resting: bool = False) -> str:
+    """Name of the mode on the flank of a side."""
+    return next(mode.name for mode in _ELASTIC if mode.side == side and mode.resting == resting)
+
+
 def contact_guards(
     servo: PlantNumbers,
     basis: Basis,
     contact: ContactMode,
-    stopping: Array | float,
+    stick_slip: StickSlipMode,
     accelerations: Sequence[Array],
     resets: Mapping[int, Array],
 ) -> list[GuardRow]:
@@ -168,10 +177,10 @@ def contact_guards(
 
     Parameters
     ----------
-    stopping : (N,) row or 0.0
-        Speed at which a sliding motor has stopped.
+    stick_slip : StickSlipMode
     accelerations : sequence of (N,) rows
-        Acceleration of the motor free of the load, and under all of it; used only where the motor rests on a flank.
+        Acceleration of the motor free of the load, and under all of it; used only where the motor rests on a flank and
+        does not stick.
     resets : mapping of int to (..., N, N) array
         `contact_reset` of either side.
     """
@@ -182,22 +191,41 @@ def contact_guards(
             GuardRow(s * apart - 0.5 * basis.row("gap"), "+" if s > 0 else "-", resets[s], "contact", s)
             for s in (1, -1)
         ]
-    flank = "+" if side > 0 else "-"
+    motor = stick_slip.motor
+    if motor.stuck and servo.backlash_kind is BacklashKind.HELD:
+        return _stuck_on_flank(basis, contact, stillness(servo, basis), resets[side])
     if contact.resting:
         # Relative to the flank, which accelerates with the half gap.
         free, pressed = (side * row - 0.5 * basis.row("gap''") for row in accelerations)
-        return [GuardRow(pressed, flank, None, "contact", side), GuardRow(-free, "open", None, "release", side)]
+        ends = [
+            GuardRow(pressed, flank(side), None, "contact", side),
+            GuardRow(-free, "open", None, "release", side),
+        ]
+        # What slips off its flank does so although the load may pull it on.
+        return ends[::-1] if motor.side == -side else ends
     rate = screw_rate(servo, basis, contact)
     if servo.backlash_kind is BacklashKind.FREE:
         # A flank pushes and never pulls.
         return [GuardRow(-side * screw_force(servo, basis, rate), "open", None, "release", side)]
-    release = -side * rate - stopping
+    release = -side * rate - stopping_speed(servo, basis, stick_slip)
     if servo.backlash_kind is BacklashKind.RIGID:
         return [GuardRow(release, "open", resets[side], "release", side)]
     reset = resets[side].copy()
     # The motor stands on the flank and moves with it, at the rate of the half gap.
     reset[..., basis["speed"], :] = 0.5 * side * basis.row("gap'")
-    return [GuardRow(release, f"held {flank}", reset, "hold", side)]
+    return [GuardRow(release, flank(side, resting=True), reset, "hold", side)]
+
+
+def _stuck_on_flank(basis: Basis, contact: ContactMode, still: Array, reset: Array) -> list[GuardRow]:
+    """Guards of a motor that sticks on the flank of a screw that is held: the flank pushes the screw while the gap
+    shrinks, rests while it is constant, and goes away while it grows."""
+    side, apart = contact.side, 0.5 * basis.row("gap'")
+    if not contact.resting:
+        return [GuardRow(apart + still, flank(side, resting=True), None, "hold", side)]
+    return [
+        GuardRow(apart - still, "open", reset, "release", side),
+        GuardRow(-apart - _PUSHES * still, flank(side), None, "contact", side),
+    ]
 
 
 def contact_reset(servo: PlantNumbers, basis: Basis, side: int) -> Array:

@@ -82,12 +82,6 @@ def check_fit(actuator: Actuator, transmission: Transmission, load: Load, contro
             "axis load friction and force: one mass behind a rigid transmission does not act back, so they act on "
             "nothing; give a finite stiffness, or the friction at the motor"
         )
-    coulomb = getattr(actuator, "coulomb", 0.0)
-    if coulomb and transmission.backlash_kind is BacklashKind.HELD:
-        raise InvalidInput(
-            f"actuator coulomb_friction_n_m = {coulomb!r} N m: an elastic transmission that is held in the gap is "
-            'simulated without friction of the motor; describe it as "free" in the gap, or as rigid'
-        )
     _check_holding(actuator, transmission, load)
 
 

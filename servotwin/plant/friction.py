@@ -6,12 +6,13 @@ The drop is linear in the speed, so that every mode is affine and nothing but th
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import BacklashKind, Basis, GuardRow, PlantNumbers, Stribeck
+from servotwin.plant.basis import Basis, GuardRow, PlantNumbers, Stribeck
 from servotwin.plant.signals import Array
 
 # A motor has stopped at this part of the speed that its friction takes off (at which a DC motor's back EMF takes as
@@ -57,11 +58,9 @@ def stick_slip_modes(servo: PlantNumbers, friction: bool) -> tuple[StickSlipMode
     Raises
     ------
     InvalidInput
-        There is friction on an elastic screw that is held in the gap, on the motor of a drive that follows its command
-        whatever the load, or on a single mass that follows a rigid transmission.
+        There is friction on the motor of a drive that follows its command whatever the load, or on a single mass that
+        follows a rigid transmission.
     """
-    if friction and servo.backlash_kind is BacklashKind.HELD:
-        raise InvalidInput("friction with an elastic screw that is held in the gap: needs a rigid screw (k_d = inf)")
     if friction and not np.any(servo.shaft().E):
         raise InvalidInput("friction on the motor of a drive that follows its command whatever the load: must be 0 N m")
     if servo.guide.friction and servo.chain().D[-1]:
@@ -98,26 +97,28 @@ def resistance(basis: Basis, state: FrictionState, friction: str, speed: int, st
     )
 
 
-def stick_slip_guards(
-    servo: PlantNumbers, basis: Basis, mode: StickSlipMode, torque: Array, force: Array
+def motor_guards(
+    servo: PlantNumbers, basis: Basis, mode: StickSlipMode, torques: Mapping[int, Array]
 ) -> list[GuardRow]:
-    """Guards that end a mode: something stops, or what drives it exceeds its friction.
+    """Guards that end a mode of the motor: it stops, or what drives it exceeds its friction.
 
     Parameters
     ----------
-    torque, force : (..., N) arrays
-        Rows of what drives the motor (N m) and the last mass (N) without friction.
+    torques : mapping of int to (..., N) array
+        Rows of what drives a stuck motor (N m) forwards (1) and backwards (-1) without friction.
     """
-    motor, load = mode.motor, mode.load
     shaft = _sliding(basis, basis["speed"], "friction", stopping_speed(servo, basis, mode))
-    motors = _states(_COULOMB, _SLOW, servo.motor_stribeck)
-    ends = [_ended(mode, "motor", guard) for guard in _guards(basis, motor, motors, shaft, torque)]
-    if load is SMOOTH:
-        return ends
+    states = _states(_COULOMB, _SLOW, servo.motor_stribeck)
+    return [_ended(mode, "motor", guard) for guard in _guards(basis, mode.motor, states, shaft, torques)]
+
+
+def load_guards(servo: PlantNumbers, basis: Basis, mode: StickSlipMode, force: Array) -> list[GuardRow]:
+    """The same for the last mass; `force` (..., N) is the row of what drives it without friction, N."""
     threshold = _STOPPED * servo.guide.yielding * basis.row("load friction")
     mass = _sliding(basis, basis.last_speed(servo), "load friction", threshold)
-    loads = _states(_LOAD, _LOAD_SLOW, servo.guide.stribeck)
-    return ends + [_ended(mode, "load", guard) for guard in _guards(basis, load, loads, mass, force)]
+    states = _states(_LOAD, _LOAD_SLOW, servo.guide.stribeck)
+    guards = _guards(basis, mode.load, states, mass, {1: force, -1: force})
+    return [_ended(mode, "load", guard) for guard in guards]
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,7 @@ def _sliding(basis: Basis, speed: int, friction: str, stopping: Array | float) -
 
 
 def _guards(
-    basis: Basis, state: FrictionState, states: tuple[FrictionState, ...], body: _Sliding, drive: Array
+    basis: Basis, state: FrictionState, states: tuple[FrictionState, ...], body: _Sliding, drives: Mapping[int, Array]
 ) -> list[GuardRow]:
     stick = states[0]
     # What begins to slide is slow at first; without a drop there is one state of each side.
@@ -145,7 +146,7 @@ def _guards(
     if state.stuck:
         return [
             GuardRow(s * drive - body.friction, (forwards if s > 0 else backwards).name, None, "slip", s)
-            for s in (1, -1)
+            for s, drive in drives.items()
         ]
     if state.side == 0:
         return []
@@ -171,4 +172,9 @@ def _ended(mode: StickSlipMode, body: str, guard: GuardRow) -> GuardRow:
 
 def stopping_speed(servo: PlantNumbers, basis: Basis, mode: StickSlipMode) -> Array | float:
     """Speed (row) beyond zero at which a sliding motor has stopped; 0 in the other modes."""
-    return _STOPPED * servo.shaft().yielding * basis.row("friction") if mode.motor.side else 0.0
+    return stillness(servo, basis) if mode.motor.side else 0.0
+
+
+def stillness(servo: PlantNumbers, basis: Basis) -> Array:
+    """Speed (row) below which a motor with friction is at rest."""
+    return np.asarray(_STOPPED * servo.shaft().yielding * basis.row("friction"))

@@ -251,7 +251,7 @@ class Servo:
     @property
     def takes_friction(self) -> bool:
         """True where Coulomb friction on the motor can be simulated."""
-        return self.rigid
+        return True
 
     def with_position_resolution(self, resolution: float) -> Servo:
         """A copy whose position sensor has another resolution, m."""

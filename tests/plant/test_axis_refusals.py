@@ -33,13 +33,6 @@ def cascade(**changes: object) -> st.Cascade:
         (lambda: TWO_MASS.replace(controller=cascade(ratio=5.0)), "ratio = 5.0: the transmission's travel"),
         (lambda: STEPPER.replace(controller=cascade(ratio=STEPPER.p)), "a stepper goes to its commanded angle"),
         (
-            lambda: BALL_SCREW.replace(
-                transmission=st.Transmission(BALL_SCREW.p, 5e7, 0.0, "held"),
-                actuator=st.TorqueDrive(J=1e-4, coulomb=0.1),
-            ),
-            "coulomb_friction_n_m = 0.1 N m: an elastic transmission that is held in the gap",
-        ),
-        (
             lambda: TWO_MASS.replace(
                 controller=st.LinearLaw.from_system(TransferFunction([1.0], [1.0, 1.0])),
                 sensors=st.Sensors(feedback="motor"),

@@ -96,7 +96,7 @@ def test_rests_that_are_alike_speak_of_a_bias(bias: float, count: int) -> None:
 
 
 def test_rests_of_a_motor_at_which_an_elastic_screw_pulls_speak_of_no_friction() -> None:
-    """Its friction could not be simulated: the policy had no setting for such a machine."""
+    """They differ with the load's place: taken for friction, they would be fed forward, and few settings bear both."""
     policy = CertifiedPolicy(SERVO.replace(k_d=1e6), Uncertainty(input_bias=(-0.1, 0.1)))
     forth, back = (Disturbance(bias, 1e-5, 0.0, 0.3, 0.0) for bias in (-0.02, 0.03))
     seen = evidence([forth, back])

@@ -4,13 +4,14 @@ import itertools
 import math
 
 import numpy as np
+import pytest
 from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
-from servotwin.simulation import Run, Simulation
+from servotwin.simulation import Run, Simulation, simulate
 
 PAPER = Servo.preset("paper")
 
@@ -50,13 +51,65 @@ def test_at_rest_on_a_flank_the_motor_carries_part_of_the_load() -> None:
     assert found > 100
 
 
-@examples(15)
-@given(st.floats(4.5, 7.0), st.sampled_from([2, 3, 5]), st.floats(0.0, 20.0), st.booleans(), st.booleans())
-def test_no_elastic_screw_chatters(stiffness: float, masses: int, degrees: float, wearing: bool, zone: bool) -> None:
+@examples(25)
+@given(
+    st.floats(4.5, 7.0),
+    st.sampled_from([2, 3, 5]),
+    st.floats(0.0, 20.0),
+    st.booleans(),
+    st.booleans(),
+    st.sampled_from([0.0, 1e-4, 0.003, 0.05]),
+)
+def test_no_elastic_screw_chatters(
+    stiffness: float, masses: int, degrees: float, wearing: bool, zone: bool, volts: float
+) -> None:
     servo = PAPER.replace(k_d=10.0**stiffness, n=masses)
     gap = math.radians(degrees)
     run, _ = run_of(
-        servo, SCurve(0.0, gap, duration=10.0) if wearing else gap, tolerance=servo.tolerance_for(gap) if zone else None
+        servo,
+        SCurve(0.0, gap, duration=10.0) if wearing else gap,
+        tolerance=servo.tolerance_for(gap) if zone else None,
+        friction=volts * servo.torque_of(1.0),
     )
     slack = 1e-12 * (1.0 + np.max(np.abs(run.theta_m)))
     assert np.all(np.abs(run.theta_m - run.theta_d) <= 0.5 * run.gap + slack)
+
+
+@pytest.mark.parametrize("rate", [None, 1000.0])
+@pytest.mark.parametrize("widths", [(5.0, 5.0), (0.0, 8.0), (8.0, 1.0)])
+def test_friction_that_vanishes_changes_nothing(widths: tuple[float, float], rate: float | None) -> None:
+    """Stuck on a flank under part of the load, or held there by the screw alone: the difference goes with friction."""
+    servo = PAPER.replace(k_d=1e6)
+    first, last = np.radians(widths)
+    options = {
+        "controller": servo.controller.replace(Ki=200.0, sample_rate=rate),
+        "reference": SquareWave(1e-3, 4.0),
+        "gap": SCurve(first, last, duration=5.0) if first != last else first,
+        "sample_rate": 1000.0,
+    }
+    without = simulate(servo, 6.0, **options)
+    moved = []
+    for volts in (1e-7, 1e-5):
+        run = simulate(servo, 6.0, friction=volts * servo.torque_of(1.0), **options)
+        assert {"stick", "slip"} < set(run.events.kind.tolist())
+        moved.append(np.abs(run.position - without.position)[:3000].max())
+    assert moved[0] < 1e-6 * np.abs(without.position).max()
+    assert moved[1] == pytest.approx(100.0 * moved[0], rel=1e-2)
+
+
+def test_a_motor_stuck_on_its_flank_carries_what_its_friction_can() -> None:
+    """It goes on where its torque exceeds load and friction together, and off the flank where friction alone."""
+    servo = PAPER.replace(k_d=2e5)
+    friction = 0.02 * servo.torque_of(1.0)
+    run, states = run_of(servo, math.radians(5.0), friction=friction)
+    load = servo.p * servo.k_d * (servo.p * run.theta_d - run.q[:, 0])
+    torque = servo.k_T * states["current"]
+    slack, found = 1e-9 * friction, 0
+    for side in (1, -1):
+        inside = held_samples(run, side) & (states["speed"] == 0.0)
+        found += int(inside.sum())
+        assert np.all(side * torque[inside] >= -friction - slack)
+        assert np.all(side * (torque - load)[inside] <= friction + slack)
+        assert np.allclose(run.theta_m[inside] - run.theta_d[inside], side * 0.5 * run.gap[inside], atol=1e-12)
+    assert found > 100
+    assert np.any(np.abs(torque - load)[states["speed"] == 0.0] > 3.0 * friction)

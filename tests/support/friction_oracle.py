@@ -20,7 +20,10 @@ CURRENT, SPEED, MOTOR, SCREW, CHAIN = 0, 1, 2, 3, 4
 
 @dataclass
 class FrictionOracle:
-    """Modes: flank (-1, 0 open, 1), motion (-1, 0 stuck, 1), zone (-1, 0 inside, 1); the gap's rate is constant."""
+    """Modes: flank (-1, 0 open, 1), motion (-1, 0 stuck, 1), zone (-1, 0 inside, 1); the gap's rate is constant.
+
+    With an elastic screw also `resting`: on a flank under part of the load, which the screw's own friction holds.
+    """
 
     servo: Servo
     reference: float
@@ -30,15 +33,16 @@ class FrictionOracle:
     friction: float
     bias: float = 0.0
     flank: int = 0
+    resting: bool = False
     motion: int = 0
     zone: int = 1
     events: list[tuple[float, str]] = field(default_factory=list)
 
     def run(self, times: Array) -> Array:
-        """States at increasing times, the first of them 0: columns current, speed, motor, screw, positions 2 .. n,
-        their velocities, integral of the error, its filtered value."""
-        n = self.servo.n
-        y, time, rows = np.zeros(CHAIN + 2 * (n - 1) + 2), 0.0, [np.zeros(CHAIN + 2 * (n - 1) + 2)]
+        """States at increasing times, the first of them 0: columns current, speed, motor, screw, positions of the
+        masses that do not follow the screw, their velocities, integral of the error, its filtered value."""
+        size = CHAIN + 2 * self.free + 2
+        y, time, rows = np.zeros(size), 0.0, [np.zeros(size)]
         if self.tolerance is not None:
             self.zone = 0 if abs(self.reference) <= self.tolerance else int(np.sign(self.reference))
         self._lose_contact_if_stuck()
@@ -70,11 +74,20 @@ class FrictionOracle:
                 act(time, y)
         return np.array(rows)
 
+    @property
+    def elastic(self) -> bool:
+        return bool(np.isfinite(self.servo.k_d))
+
+    @property
+    def free(self) -> int:
+        """Masses that do not follow the screw."""
+        return self.servo.n if self.elastic else self.servo.n - 1
+
     def gap(self, time: float) -> float:
         return self.first_gap + self.gap_rate * time
 
     def error(self, y: Array) -> float:
-        return self.reference - float(y[CHAIN + self.servo.n - 2])
+        return self.reference - float(y[CHAIN + self.free - 1])
 
     def voltage(self, y: Array) -> float:
         law = self.servo.controller
@@ -83,21 +96,36 @@ class FrictionOracle:
         return (law.Kp * error + law.Ki * y[-2] + law.Kd * (error - y[-1]) / law.Tf) if active else 0.0
 
     def screw_rate(self, y: Array) -> float:
-        return float(y[SPEED] - 0.5 * self.flank * self.gap_rate) if self.flank else 0.0
+        moves = self.flank and not self.resting
+        return float(y[SPEED] - 0.5 * self.flank * self.gap_rate) if moves else 0.0
+
+    def load(self, y: Array) -> float:
+        """Torque of the screw's spring against the motor, N m, were it in contact."""
+        s = self.servo
+        return s.p * s.k_d * (s.p * float(y[SCREW]) - float(y[CHAIN])) if self.elastic else 0.0
+
+    def torque(self, y: Array, pressed: bool) -> float:
+        """Torque on the motor without friction, with or without the load, N m."""
+        return self.servo.k_T * float(y[CURRENT]) - (self.load(y) if pressed else 0.0)
 
     def _rate(self, _time: float, y: Array) -> Array:
-        s, law, free = self.servo, self.servo.controller, self.servo.n - 1
+        s, law, free = self.servo, self.servo.controller, self.free
         rate = np.zeros_like(y)
         rate[CURRENT] = (self.voltage(y) + self.bias - s.R * y[CURRENT] - s.k_B * y[SPEED]) / s.L
-        if self.motion:
-            rate[SPEED] = (s.k_T * y[CURRENT] - self.motion * self.friction) / s.J
+        if self.motion and not self.resting:
+            rate[SPEED] = (self.torque(y, pressed=self.flank != 0) - self.motion * self.friction) / s.J
         rate[MOTOR] = y[SPEED]
         rate[SCREW] = self.screw_rate(y)
-        q = np.concatenate([[s.p * y[SCREW]], y[CHAIN : CHAIN + free]])
-        v = np.concatenate([[s.p * rate[SCREW]], y[CHAIN + free : CHAIN + 2 * free]])
-        pulls = s.stiffnesses[1:] * -np.diff(q) + s.dampings[1:] * -np.diff(v)
-        rate[CHAIN : CHAIN + free] = v[1:]
-        rate[CHAIN + free : CHAIN + 2 * free] = (pulls - np.append(pulls[1:], 0.0)) / s.masses[1:]
+        own, speeds = y[CHAIN : CHAIN + free], y[CHAIN + free : CHAIN + 2 * free]
+        # The first place is the screw's end, or the ground that the first mass hangs on beside the screw's spring.
+        first = (0.0, 0.0) if self.elastic else (s.p * y[SCREW], s.p * rate[SCREW])
+        q, v, k = np.append(first[0], own), np.append(first[1], speeds), slice(0 if self.elastic else 1, None)
+        pulls = s.stiffnesses[k] * -np.diff(q) + s.dampings[k] * -np.diff(v)
+        forces = pulls - np.append(pulls[1:], 0.0)
+        if self.elastic:
+            forces[0] += self.load(y) / s.p
+        rate[CHAIN : CHAIN + free] = speeds
+        rate[CHAIN + free : CHAIN + 2 * free] = forces / s.masses[k]
         driven = self.error(y) if self.tolerance is None or self.zone != 0 else 0.0
         rate[-2], rate[-1] = driven, (driven - y[-1]) / law.Tf
         return rate
@@ -112,41 +140,50 @@ class FrictionOracle:
         return [*self._of_motion(), *self._of_flank(), *self._of_zone()]
 
     def _of_motion(self) -> list:
-        torque = self.servo.k_T
         if self.motion:
-            return [("stick", lambda _t, y: -self.motion * y[SPEED], self._stop)]
+            return [] if self.resting else [("stick", lambda _t, y: -self.motion * y[SPEED], self._stop)]
         return [
-            ("slip", lambda _t, y, s=s: s * torque * y[CURRENT] - self.friction, lambda _t, _y, s=s: self._start(s))
+            ("slip", lambda _t, y, s=s: s * self._driving(y, s) - self.friction, lambda _t, _y, s=s: self._start(s))
             for s in (1, -1)
         ]
 
+    def _driving(self, y: Array, side: int) -> float:
+        """Torque that drives a stuck motor to a side: from a flank at rest it goes off without the load."""
+        return self.torque(y, pressed=self.flank != 0 and not (self.resting and side != self.flank))
+
     def _stop(self, time: float, y: Array) -> None:
         y[SPEED] = 0.0
-        torque = self.servo.k_T * y[CURRENT]
-        self.motion = 0 if abs(torque) <= self.friction else int(np.sign(torque))
-        if self.motion:
-            self.events.append((time, "slip"))
-            self._leave_flank_with_motion()
-        else:
-            self._lose_contact_if_stuck()
+        self.motion = 0
+        self._lose_contact_if_stuck()
+        for side in (1, -1):
+            if side * self._driving(y, side) > self.friction:
+                self.events.append((time, "slip"))
+                self._start(side)
+                return
 
     def _start(self, side: int) -> None:
         self.motion = side
-        self._leave_flank_with_motion()
-
-    def _leave_flank_with_motion(self) -> None:
-        if self.flank == -self.motion and self.gap_rate == 0.0:
+        if self.elastic and self.resting:
+            self.flank, self.resting = (self.flank if side == self.flank else 0), False
+        elif not self.elastic and self.flank == -side and self.gap_rate == 0.0:
             self.flank = 0
 
     def _lose_contact_if_stuck(self) -> None:
         if self.flank and self.gap_rate > 0.0:
             self.flank = 0
+        self.resting = self.elastic and self.flank != 0 and self.gap_rate == 0.0
 
     def _of_flank(self) -> list:
         if self.flank and not self.motion:
             return []  # the screw's rate is the gap's alone: see _lose_contact_if_stuck
+        if self.resting:
+            return [
+                ("pressed", lambda _t, y: self.flank * self._net(y, pressed=True), self._press),
+                ("release", lambda _t, y: -self.flank * self._net(y, pressed=False), self._release),
+            ]
         if self.flank:
-            return [("release", lambda _t, y: -self.flank * self.screw_rate(y), self._release)]
+            end = self._hold if self.elastic else self._release
+            return [("release", lambda _t, y: -self.flank * self.screw_rate(y), end)]
         return [
             (
                 "contact",
@@ -156,8 +193,21 @@ class FrictionOracle:
             for s in (1, -1)
         ]
 
+    def _net(self, y: Array, pressed: bool) -> float:
+        return self.torque(y, pressed) - self.motion * self.friction
+
+    def _hold(self, _time: float, y: Array) -> None:
+        self.resting, y[SPEED] = True, 0.5 * self.flank * self.gap_rate
+        if self.flank * self._net(y, pressed=True) > 0.0:
+            self.resting = False
+        elif self.flank * self._net(y, pressed=False) < 0.0:
+            self.flank, self.resting = 0, False
+
+    def _press(self, _time: float, _y: Array) -> None:
+        self.resting = False
+
     def _release(self, _time: float, _y: Array) -> None:
-        self.flank = 0
+        self.flank, self.resting = 0, False
 
     def _touch(self, side: int, time: float, y: Array) -> None:
         self.flank = side

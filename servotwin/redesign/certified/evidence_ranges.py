@@ -171,7 +171,7 @@ class EvidenceRanges:
             return _Rest(bias, NORMAL_95 * std, 0.0)
         middle = 0.5 * (max(rests) + min(rests))
         if self.servo.backlash_kind is BacklashKind.HELD:
-            # A load on a spring pulls at this motor, which has no friction: the rests are those of the load's places.
+            # A load on a spring pulls at this motor, so that its rests differ with the load's place, without friction.
             return _Rest(middle, max(NORMAL_95 * std, half), 0.0)
         return _Rest(middle, max(NORMAL_95 * std, 0.5 * half), _HOLDS * half)
 
