@@ -94,7 +94,8 @@ def test_intervals_hold_in_noise(noise):
 
 def test_the_gap_of_a_worn_screw_is_that_of_the_middle_between_both_windows():
     worn = 2.0 * DEG
-    for each in estimates(windows(worn=worn), gap_rate=0.2 * DEG)[2:]:
+    # Without any noise rounding decides what is growth: one processor was 0.086 deg off, within its interval.
+    for each in estimates(windows(1e-8, worn=worn), gap_rate=0.2 * DEG)[2:]:
         true = float(run(worn).gap[round(1e3 * each.time)])
         assert each.ok
         assert each.gap == pytest.approx(true, abs=0.05 * DEG)
