@@ -67,7 +67,7 @@ def known_machine(servo: Plant, settings: TwinSettings) -> FactorPrior | None:
     known, own = stated_machine(settings), output_error.OutputErrorSettings()
     pitch = min(known.pitch[1], own.ratio)
     free = servo.backlash_kind is BacklashKind.FREE
-    if not settings.learning.learn or servo.at_motor or not (servo.rigid or free):
+    if not settings.learning.learn or servo.at_motor:
         return None
     if free:
         return FactorPrior.of_spreads(own.stiffness, own.damping, pitch, own.mass_ratio)

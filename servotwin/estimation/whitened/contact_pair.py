@@ -29,7 +29,8 @@ from servotwin.estimation.whitened.estimator import WindowFit
 from servotwin.estimation.whitened.fit import WhitenedFit
 from servotwin.estimation.whitened.free_model import PITCH, FactorPrior, FreeFit
 from servotwin.estimation.whitened.gate import misfits, sure_of_contact, with_free_model
-from servotwin.estimation.whitened.learning import LearntFit, as_known
+from servotwin.estimation.whitened.learning import SCREW_SPREAD, LearntFit, as_known
+from servotwin.estimation.whitened.nearby import own_softness
 from servotwin.estimation.whitened.reduction import CONSTANT, PLACE, RESIDUAL, Point
 from servotwin.estimation.whitened.shift import fastest
 from servotwin.plant.servo import Servo
@@ -247,7 +248,9 @@ def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
 
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
-    pitch = max(_PITCH, math.sqrt(here.learnt.problem.prior.covariance[PITCH, PITCH]))
+    problem = here.learnt.problem
+    # A softer screw takes more of the travel.
+    pitch = max(_PITCH, math.sqrt(problem.prior.covariance[PITCH, PITCH]), SCREW_SPREAD * own_softness(problem.servo))
     way, level = here.way_std, here.begin.std / here.gain
     unsure = max(0.0, here.apart - NORMAL_95 * way)
     return math.hypot(way + level, unsure, before.std, here.rounded, pitch * moved)

@@ -16,7 +16,7 @@ import numpy as np
 
 from servotwin.estimation.core.contacts import travel
 from servotwin.estimation.whitened.free_model import BELIEVED, HOPELESS, FreeFit, FreeProblem
-from servotwin.estimation.whitened.nearby import PITCH
+from servotwin.estimation.whitened.nearby import PITCH, own_softness
 
 # Structure's stiffness over the screw's, beyond that of the model. Below the first the lead moves by little, and a
 # screw softer than the last is no drive.
@@ -57,7 +57,7 @@ def _softer(problem: FreeProblem, single: FreeFit, allowed: float) -> Iterator[F
     """Fits with softer and softer screws, each from the one before, until the cost has risen by what is allowed."""
     servo, least = problem.servo, math.inf
     stiffness = float(servo.stiffnesses.max())
-    own = 0.0 if servo.rigid else stiffness / servo.k_d
+    own = own_softness(servo)
     # The structure is held at its other end too: a soft screw takes its share of the travel.
     before, here, moved = 0.0, np.array([*single.point, *single.factors]), np.eye(6)[2 + PITCH]
     for more in _SOFTER:

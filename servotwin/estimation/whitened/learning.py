@@ -25,11 +25,13 @@ from servotwin.estimation.whitened.free_model import (
     FACTORS,
     FREEDOM,
     LARGEST,
+    PITCH,
     FactorPrior,
     FreeFit,
     FreeProblem,
     adapted,
 )
+from servotwin.estimation.whitened.nearby import own_softness
 from servotwin.estimation.whitened.reduction import Point
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
@@ -42,6 +44,7 @@ _GAP_ROW, _PLACE_ROW = 0, 1  # of the derivatives
 _AT_END = 1e-3  # of the range of a factor
 _SHOWN = 1.0  # information on the softness beyond what is usual of it: below, the window says nothing
 _MOST_KNOWN = 1e7  # of the softness: no number of windows tells it better than to 0.0003
+SCREW_SPREAD = 0.2  # relative, of an elastic screw's stiffness: shaft, nut and bearings in series are known roughly
 _VAGUE = 1e-5  # of the position's variation: white noise that small leaves all to the window, nothing to the prior
 
 
@@ -126,7 +129,28 @@ class LearntFit:
         variance = max(1.0, self.aligned.whitened.variance)
         at = np.array([*self.free.point, *self.free.factors])
         moved = self._softness.moved(self.problem.prior.softness, self.scale(calibration))
-        return math.hypot(gap_doubt(self.problem, at, variance, self.aligned.delay, ramp, learnt=True), moved)
+        others = gap_doubt(self.problem, at, variance, self.aligned.delay, ramp, learnt=True)
+        return math.hypot(others, moved, self._moved_by_screw(at, (True, True)).gap)
+
+    def _moved_by_screw(self, at: Array, free: tuple[bool, bool]) -> Point:
+        """Root mean square of what an elastic screw that is not quite the model's does to gap (rad) and place.
+
+        A stiffer and a softer screw count as far as the window makes them likely beside the model's. What many windows
+        told does not: the factors took up there what the screw was off by.
+        """
+        servo, prior = self.problem.servo, self.problem.prior
+        if servo.rigid:
+            return Point(0.0, 0.0)
+        problem, fits = replace(self.problem, prior=prior if prior.wide else FactorPrior.of_spreads(*FREEDOM)), []
+        for share in (1.0, 1.0 / (1.0 + SCREW_SPREAD), 1.0 + SCREW_SPREAD):
+            start = at.copy()
+            # The structure is held at its other end too: a soft screw takes its share of the travel.
+            start[2 + PITCH] += (1.0 / share - 1.0) * own_softness(servo)
+            fits.append(replace(problem, servo=servo.replace(k_d=share * servo.k_d)).descend(start, free))
+        worse = np.array([fit.cost for fit in fits]) - min(fit.cost for fit in fits)
+        likely = np.exp(-0.5 * worse / max(1.0, self.aligned.whitened.variance))
+        moved = np.array([fit.point for fit in fits]) - np.array(fits[0].point)
+        return Point(*np.sqrt(likely @ np.square(moved) / likely.sum()).tolist())
 
     def reading(self, calibration: float) -> MachineReading:
         """Factors after this window, what was known of them before included."""
@@ -145,7 +169,10 @@ class LearntFit:
         `at` (6,) is a point in so wide a gap that the window has no other contact.
         """
         soft, scale = self._softness_at(at, _PLACE_ROW), self.scale(calibration)
-        return 0.5 * float(at[0]) * soft.moved(self.problem.prior.softness, scale)
+        moved = math.hypot(
+            soft.moved(self.problem.prior.softness, scale), self._moved_by_screw(at, (False, True)).place
+        )
+        return 0.5 * float(at[0]) * moved
 
     def _softness_at(self, at: Array, first: int) -> WindowSoftness:
         """The screw's softness as this window alone shows it, and its effect on gap or place (`first` row).

@@ -58,6 +58,11 @@ class Neighbour:
         return cls(ReducedResponse(other, model.decimation), other.poles, step, row)
 
 
+def own_softness(servo: Servo) -> float:
+    """A servo's stiffness of the structure over that of its screw; 0: the screw is rigid."""
+    return 0.0 if servo.rigid else float(servo.stiffnesses.max()) / servo.k_d
+
+
 def with_modes_at_rest(model: Response, modes: Indices) -> Response:
     """Return a response with some of its modes only; the others have always come to rest.
 
@@ -134,7 +139,7 @@ def nearby(servo: Servo, factors: tuple[float, ...], rate: float, reduce: Decima
     if soft:
         stiff = nearby(servo, factors, rate, reduce, False)  # by place, as others call it: a name makes another key
         stiffness = math.exp(here[0]) * float(servo.stiffnesses.max())
-        compliance = SOFT + (0.0 if servo.rigid else stiffness / servo.k_d)
+        compliance = SOFT + own_softness(servo) * math.exp(here[0])
         softened = variants(servo, [here], rate, [stiffness / compliance])[0]
         softer = Neighbour.of(stiff.model, softened, SOFT, here.size)
         return Nearby(stiff.model, (*stiff.others, softer), here.size + 1)

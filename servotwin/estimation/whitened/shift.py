@@ -20,7 +20,7 @@ from servotwin.estimation.core.variants import variants
 from servotwin.estimation.core.whitening import Autoregression, burg
 from servotwin.estimation.paper.observer import LagFilter, observer
 from servotwin.estimation.whitened.fit import WhitenedFit
-from servotwin.estimation.whitened.nearby import Neighbour, motions
+from servotwin.estimation.whitened.nearby import Neighbour, motions, own_softness
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, PLACE, RESIDUAL, Reduction
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -104,7 +104,7 @@ def _words(shares: Array, deviations: Array, ramp: float) -> str:
 def _neighbours(servo: Servo, model: ReducedResponse) -> tuple[Neighbour, ...]:
     """Neighbours of a servo's response in stiffness, damping and the screw's compliance (of the structure's)."""
     rate, stiffness = 1.0 / model.response.interval, float(servo.stiffnesses.max())
-    own = 0.0 if servo.rigid else stiffness / servo.k_d
+    own = own_softness(servo)
     soft = 1.0 / _STIFF if servo.rigid else own * (1.0 + _STEP)
     stiffer, damped = variants(servo, list(math.log1p(_STEP) * np.eye(4)[:2]), rate)
     (softer,) = variants(servo, [np.zeros(4)], rate, [stiffness / soft])

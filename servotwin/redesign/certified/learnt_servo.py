@@ -28,11 +28,12 @@ def counts_learnt(servo: Plant, machine: FactorPrior | None, known: Uncertainty)
 
     Of a free shaft its stiffness over the load's mass does, once it is known to half of what is stated. Of its load
     nothing is learnt: one with springs of its own, which the verification draws with the shaft's, does not count, nor
-    does one that floats in the gap, whose mass and damping decide how it comes to rest.
+    does one that floats in the gap, whose mass and damping decide how it comes to rest. An elastic screw that is held
+    in the gap brings the load's mass to the motor, and neither is learnt.
     """
-    if machine is None:
+    if machine is None or servo.backlash_kind is BacklashKind.HELD:
         return False
-    if servo.backlash_kind is not BacklashKind.FREE:
+    if servo.backlash_kind is BacklashKind.RIGID:
         return True
     alone = isinstance(servo, Axis) and len(servo.load.m) == 1 and not any(servo.load.k) and not floats_in_gap(servo)
     return alone and math.sqrt(3.0 * machine.covariance[0, 0]) < _WELL_KNOWN * known.k
