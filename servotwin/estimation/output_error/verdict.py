@@ -238,8 +238,8 @@ def _of_friction(found: Search, friction: _FrictionDoubt, allowed: float, unit: 
     fitted = dict(zip(names, found.best.values.tolist(), strict=True)).get(FRICTION)
     best = "" if fitted is None else f"; the friction that fits best is {100.0 * math.expm1(fitted):+.2g} % off"
     return (
-        f"with the stated load friction the gap would be {_deg(unit * friction.hidden)} off, and {_deg(unit * allowed)} are "
-        f"allowed: slow motion does not tell friction from a gap{best}"
+        f"with the stated load friction the gap would be {_deg(unit * friction.hidden)} off, and "
+        f"{_deg(unit * allowed)} are allowed: slow motion does not tell friction from a gap{best}"
     )
 
 
