@@ -9,9 +9,18 @@ from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
+from time import monotonic
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    ProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from servotwin.cli.own_options import option_of, own_option
 from servotwin.config.table import Table, did_you_mean, read_toml
@@ -27,6 +36,8 @@ from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.registry import certified_policy
 from servotwin.twin.model_registry import models_of
 from servotwin.twin.settings import TwinSettings
+
+_LINE_EVERY = 30.0  # s between two lines where no bar can be shown
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,7 @@ def certify(
     grid : Grid or GridOptions, optional
         For all models; `Grid.of` each by default.
     console : Console, optional
-        Where progress and summary are shown.
+        Where progress and summary are shown; progress as lines where it is no terminal.
 
     Raises
     ------
@@ -69,10 +80,21 @@ def certify(
     """
     console = console or Console()
     given = grid or GridOptions()
-    pairs = [
-        (job, given if isinstance(given, Grid) else given.grid(job.name, job.policy)) for job in _jobs(file, model, out)
-    ]
+    with _progress(console, TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn()) as progress:
+        text = "looking for a verified fallback set"
+        progress.add_task(text, total=None)
+        if not console.is_terminal:
+            console.print(text)
+        pairs = [
+            (job, given if isinstance(given, Grid) else given.grid(job.name, job.policy))
+            for job in _jobs(file, model, out)
+        ]
     return tuple(_verify(job, grid, console) for job, grid in pairs)
+
+
+def _progress(console: Console, *columns: ProgressColumn) -> Progress:
+    """Bars that disappear in the end; none where the console is no terminal."""
+    return Progress(*columns, console=console, transient=True, disable=not console.is_terminal)
 
 
 @dataclass(frozen=True)
@@ -160,23 +182,19 @@ def _table_job(name: str, servo: Plant, settings: TwinSettings, out: Path | None
 
 def _verify(job: _TableJob, grid: Grid, console: Console) -> CertifiedTable:
     """Verify one table, under a progress bar."""
-    done = total = 0
+    done, total, line = 0, 0, monotonic()
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     try:
         with (
-            Progress(
-                TextColumn("{task.description}"),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeElapsedColumn(),
-                TimeRemainingColumn(),
-                console=console,
-                transient=True,
-            ) as progress,
+            _progress(console, TextColumn("{task.description}"), *columns) as progress,
             closing(build(job.path, job.policy, grid)) as steps,
         ):
             bar = progress.add_task(f"verifying {job.name}", total=None)
             for done, total in steps:
                 progress.update(bar, completed=done, total=total)
+                if not console.is_terminal and monotonic() - line >= _LINE_EVERY:
+                    console.print(f"verifying {job.name}: {done} of {total} cells", highlight=False)
+                    line = monotonic()
     except KeyboardInterrupt:
         raise KeyboardInterrupt(
             f"interrupted: {done} of {total} cells are in {job.path}; the same command goes on from there"

@@ -173,7 +173,7 @@ def _worn(
     rate = expected.gap_rate(settings.trend)
     if method == motor_side.METHOD:
         return motor_side.MotorSideSettings(gap_rate=rate)
-    return output_error.OutputErrorSettings(gap_rate=rate)
+    return output_error.OutputErrorSettings(friction=settings.uncertainty.own_friction, gap_rate=rate)
 
 
 def motor_learning_of(servo: Plant, settings: TwinSettings) -> MotorLearning | None:

@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
+from servotwin.cli import certify as certification
 from servotwin.cli.app import app
 from servotwin.cli.certify import GridOptions, certify
 from servotwin.errors import InvalidInput
@@ -114,6 +115,37 @@ def test_an_interrupt_says_what_is_finished(tmp_path: Path, monkeypatch) -> None
     monkeypatch.setattr("servotwin.cli.certify.build", interrupted)
     with pytest.raises(KeyboardInterrupt, match=r"interrupted: 3 of 8 cells are in .*one\.table; the same command"):
         certify(twin_file(tmp_path, ("one", "one.table")), grid=COARSE, console=quiet())
+
+
+def test_progress_is_shown_as_lines_where_there_is_no_terminal(tmp_path: Path, monkeypatch) -> None:
+    """A table of an axis with friction takes half an hour or more."""
+    console = quiet()
+
+    def looked_for(*_given):
+        assert console.file.getvalue() == "looking for a verified fallback set\n"
+        return jobs(*_given)
+
+    jobs = certification._jobs
+    monkeypatch.setattr(certification, "_jobs", looked_for)
+    monkeypatch.setattr(certification, "build", lambda *_given: (step for step in [(1, 8), (2, 8)]))
+    monkeypatch.setattr(certification, "load", lambda *_given: None)
+    monkeypatch.setattr(certification, "_summary", lambda *_given: "written")
+    monkeypatch.setattr(certification, "_LINE_EVERY", 0.0)
+    certify(twin_file(tmp_path, ("one", "one.table")), grid=COARSE, console=console)
+    lines = console.file.getvalue().splitlines()
+    assert lines == [lines[0], "verifying one: 1 of 8 cells", "verifying one: 2 of 8 cells", "written"]
+
+
+def test_the_search_for_a_fallback_set_is_shown(tmp_path: Path, monkeypatch) -> None:
+    console = Console(file=io.StringIO(), width=200, force_terminal=True)
+
+    def interrupted(*_given):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(certification, "_jobs", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        certify(twin_file(tmp_path, ("one", "one.table")), grid=COARSE, console=console)
+    assert "looking for a verified fallback set" in console.file.getvalue()
 
 
 @pytest.mark.parametrize(

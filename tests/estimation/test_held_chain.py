@@ -10,6 +10,7 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import default_method, estimate_gap
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.output_error.estimator import problem_of
 from servotwin.estimation.output_error.held_chain import MovingChain, lever
 from servotwin.estimation.output_error.settings import OutputErrorSettings
@@ -21,7 +22,7 @@ from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Run, simulate
-from servotwin.twin.estimating import known_machine
+from servotwin.twin.estimating import estimator_of, known_machine
 from servotwin.twin.settings import TwinSettings
 
 PAPER = Servo.preset("paper")
@@ -116,6 +117,44 @@ def test_friction_that_is_twice_the_stated_one_is_no_gap() -> None:
     assert "with the stated load friction the gap would be" in estimate.reasons[0]
     off = float(estimate.reasons[0].rpartition(" best is ")[2].removesuffix(" % off"))
     assert off == pytest.approx(100.0, abs=5.0)
+
+
+def test_friction_within_what_is_known_of_it_is_believed() -> None:
+    """The stated friction would make the gap 1.3 deg wider, and its interval just contains that."""
+    window, axis = measured(worn(screw_axis(3, 0.118)), noise=1e-6), screw_axis(3, 0.1)
+    estimate = estimate_gap(window, axis)
+    assert estimate.ok, estimate.reasons
+    assert abs(estimate.gap - GAP) < math.radians(0.05)
+    wound = math.radians(1.295)
+    assert wound < estimate.interval[1] - estimate.gap < 1.02 * wound
+    refused = estimate_gap(window, axis, settings=OutputErrorSettings(friction=0.15))
+    assert refused.status is GapStatus.UNIDENTIFIABLE
+    assert refused.reasons[0].endswith("the friction that fits best is +18 % off")
+
+
+def test_friction_that_falls_is_not_believed() -> None:
+    load = dataclasses.replace(screw_axis(3, 0.1).load, static=0.12, stribeck=1e-3)
+    falling = screw_axis(3, 0.1).replace(load=load)
+    problem, _ = problem_of(measured(worn(screw_axis(3, 0.1))), falling, None)
+    values = problem.model.start(0.5 * lever(falling) * GAP, 0.0, (0.0, 0.0))
+    assert not problem.model.believes(values, 0.25)
+
+
+def test_friction_that_could_be_all_of_the_gap_is_refused() -> None:
+    """A fifth of the friction winds up more than the gap."""
+    gap = math.radians(1.0)
+    run = simulate(screw_axis(2, 0.24), 8.0, reference=SquareWave(1e-3, 8.0), gap=gap)
+    estimate = estimate_gap(measured(run, noise=1e-7), screw_axis(2, 0.2))
+    assert estimate.status is GapStatus.UNIDENTIFIABLE
+    assert "with the stated load friction the gap would be" in estimate.reasons[0]
+
+
+def test_a_twin_believes_friction_as_far_as_it_is_known() -> None:
+    window, axis = measured(worn(screw_axis(3, 0.118)), noise=1e-6), screw_axis(3, 0.1)
+    known = TwinSettings().uncertainty
+    for width, believed in ((0.25, True), (0.15, False)):
+        settings = TwinSettings(uncertainty=known.replace(own_friction=width))
+        assert estimator_of(axis, settings)(window, Expectation(None)).ok == believed
 
 
 def test_friction_that_falls_with_the_speed_widens_the_interval() -> None:

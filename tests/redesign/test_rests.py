@@ -14,9 +14,12 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.learning.motor import LearntMotor
 from servotwin.estimation.window import Window
 from servotwin.messages import Setting
+from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SquareWave
+from servotwin.plant.transmission import Transmission
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.uncertainty import Range, Uncertainty
 from servotwin.redesign.policy import Evidence
@@ -210,6 +213,21 @@ def test_rests_that_the_models_friction_explains_show_neither_bias_nor_more_fric
         (low, high), friction = _axis_ranges(calm, *found)
         assert -0.01 < low <= 0.0 <= high < 0.01
         assert friction == (0.0, 0.0)
+
+
+def test_rests_beyond_the_load_s_friction_behind_an_elastic_screw_speak_of_no_other_friction() -> None:
+    """The motor's friction could not be simulated: the policy had no setting for such a machine."""
+    load = Load((5.2, 5.2), (1e4, 1e4), (36.9, 36.9), friction=0.2)
+    motor = DcMotor(SERVO.J, SERVO.R, SERVO.k_T, SERVO.k_B, SERVO.L)
+    axis = Axis(motor, Transmission(SERVO.p, 1e5), load, SERVO.controller)
+    policy = CertifiedPolicy(axis, Uncertainty(input_bias=(-0.1, 0.1)))
+    apart = 4.0 * axis.command_of(axis.own_friction) + 0.02
+    forth, back = (Disturbance(bias, 1e-5, 0.0, 0.3, 0.0) for bias in (-apart, apart))
+    seen = evidence([forth, back])
+    assert policy.ranges.friction(seen) == (0.0, 0.0)
+    _, (least, most) = policy.ranges.input_bias(seen)
+    assert least <= -apart
+    assert most >= apart
 
 
 def test_an_integral_may_hold_what_the_models_friction_does() -> None:

@@ -210,6 +210,11 @@ class HeldChainModel:
         softness = math.exp(-named[STIFFNESS]) * self.moving.flexibility()
         return softness * other_friction(self.axis, named.get(FRICTION, 0.0))
 
+    def believes(self, values: Array, width: float) -> bool:
+        """Tell whether the friction of unknowns (u,) is within a half-width of the stated one, which does not fall."""
+        factor = dict(zip(self._names, values.tolist(), strict=True)).get(FRICTION, 0.0)
+        return abs(math.expm1(factor)) <= width and self.axis.guide.stribeck.drop == 0.0
+
     def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
         """Motion under the motor's motion (N,) at the load, for unknowns (u,).
 

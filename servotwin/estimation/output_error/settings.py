@@ -23,6 +23,16 @@ class OutputErrorSettings:
     ratio: Annotated[float, key("ratio_share", above=0.0, help="Standard deviation of the transmission's ratio.")] = (
         0.005
     )
+    friction: Annotated[
+        float,
+        key(
+            "friction_share",
+            minimum=0.0,
+            below=1.0,
+            help="Half-width of the stated Coulomb friction of a load that the gap holds: within it the friction that "
+            "fits best is believed, and its doubt is in the interval.",
+        ),
+    ] = 0.25
     delay: Annotated[
         float | None,
         key(

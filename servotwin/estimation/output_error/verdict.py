@@ -95,7 +95,7 @@ def judge(
     if likely_single:
         return _bounded(found, single, "one flank explains the window nearly as well as two")
     allowed = _allowed(found, known.half, settings)
-    doubts, explained = _doubts(found, known, allowed, unit)
+    doubts, explained = _doubts(found, known, allowed, unit, settings.friction)
     if not doubts and _out_of_reach(found, known.half + NORMAL_95 * explained):
         return _bounded(found, single, "the interval contains gaps that the motor does not cross in the window")
     if not doubts:
@@ -156,13 +156,15 @@ def _out_of_reach(found: Search, half: float) -> bool:
     return isinstance(found.problem.model, HeldChainModel) and 2.0 * half >= float(np.ptp(found.problem.drive))
 
 
-def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tuple[tuple[str, ...], float]:
+def _doubts(
+    found: Search, known: _KnownHalf, allowed: float, unit: float, width: float
+) -> tuple[tuple[str, ...], float]:
     """List what speaks against a half gap, and its standard deviation with all that the model leaves.
 
-    `allowed` (m or rad at the load) is a standard deviation.
+    `allowed` (m or rad at the load) is a standard deviation, `width` the half-width of the stated friction.
     """
     half, std, total = known
-    friction = _hidden_friction(found, found.best)
+    friction = _friction_doubt(found, half, width)
     left, times = unexplained(found), time_jitter(found)
     doubts = (
         _wide(std, allowed, unit),
@@ -173,8 +175,31 @@ def _doubts(found: Search, known: _KnownHalf, allowed: float, unit: float) -> tu
         _of_jitter(times, allowed, unit),
     )
     contact = 0.0 if any(doubts) else moved_by_contact(found)
-    explained = math.hypot(total, friction, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
+    explained = math.hypot(total, friction.std, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
     return tuple(filter(None, doubts)), explained
+
+
+class _FrictionDoubt(NamedTuple):
+    """Change of the half gap that the stated friction would make, with its standard deviation, m or rad at the load.
+
+    `counts`: true where it speaks against the gap as far as it is more than allowed.
+    """
+
+    hidden: float
+    std: float
+    counts: bool
+
+
+def _friction_doubt(found: Search, half: float, width: float) -> _FrictionDoubt:
+    """Doubt of a half gap by the friction that fits best, which is believed within a half-width of the stated one.
+
+    The interval then just contains the gap with the stated friction, and the doubt speaks against the gap only where
+    that one would be 0.
+    """
+    hidden, model = _hidden_friction(found, found.best), found.problem.model
+    if not (isinstance(model, HeldChainModel) and model.believes(found.best.values, width)):
+        return _FrictionDoubt(hidden, hidden, True)
+    return _FrictionDoubt(hidden, hidden / NORMAL_95, hidden > half)
 
 
 def _hidden_friction(found: Search, fit: Fit) -> float:
@@ -205,16 +230,16 @@ def _wide(std: float, allowed: float, unit: float) -> str:
     return f"the gap is known to {_deg(unit * std)} only, and {_deg(unit * allowed)} are allowed"
 
 
-def _of_friction(found: Search, friction: float, allowed: float, unit: float) -> str:
+def _of_friction(found: Search, friction: _FrictionDoubt, allowed: float, unit: float) -> str:
     """Sentence for a half gap (m or rad at the load) that would be another with the stated friction."""
-    if friction <= allowed:
+    if not friction.counts or friction.hidden <= allowed:
         return ""
     names = (unknown.name for unknown in found.problem.model.unknowns)
     fitted = dict(zip(names, found.best.values.tolist(), strict=True)).get(FRICTION)
     best = "" if fitted is None else f"; the friction that fits best is {100.0 * math.expm1(fitted):+.2g} % off"
     return (
-        f"with the stated load friction the gap would be {_deg(unit * friction)} off, and {_deg(unit * allowed)} are "
-        f"allowed: slow motion does not tell friction from a gap{best}"
+        f"with the stated load friction the gap would be {_deg(unit * friction.hidden)} off, and "
+        f"{_deg(unit * allowed)} are allowed: slow motion does not tell friction from a gap{best}"
     )
 
 

@@ -184,6 +184,9 @@ class EvidenceRanges:
         low, high = max(rests) - self._held, min(rests) + self._held
         if low > high:
             half = 0.5 * (max(rests) - min(rests))
+            if self.servo.backlash_kind is BacklashKind.HELD:
+                # The load's friction and its springs pull at this motor, which has none.
+                return _Rest(0.5 * (low + high), max(NORMAL_95 * std, half), 0.0)
             return _Rest(0.5 * (low + high), max(NORMAL_95 * std, 0.5 * half), _HOLDS * half - self._own)
         least, most = self.uncertainty.input_bias
         if least <= high and most >= low:
@@ -274,7 +277,7 @@ class EvidenceRanges:
         high = max(high, self._rest(evidence).friction * torque)
         if evidence.tuned_for is None or now is None or not math.isfinite(disturbance.bias_std):
             return low, high
-        if not 0.0 < abs(now.feedforward) < self.feedforward_limit:
+        if not 0.0 < abs(now.feedforward) < self.feedforward_limit or servo.backlash_kind is BacklashKind.HELD:
             return low, high
         left = max(0.0, abs(disturbance.bias + now.feedforward) - self._held)
         return low, max(high, left * torque) if left > _BIAS_MOVED * self.smallest_answer else high
