@@ -185,7 +185,7 @@ class EvidenceRanges:
         if low > high:
             half = 0.5 * (max(rests) - min(rests))
             if self.servo.backlash_kind is BacklashKind.HELD:
-                # The load's friction and its springs pull at this motor, which has none.
+                # The load's friction and its springs pull at this motor: the rests show no more friction of its own.
                 return _Rest(0.5 * (low + high), max(NORMAL_95 * std, half), 0.0)
             return _Rest(0.5 * (low + high), max(NORMAL_95 * std, 0.5 * half), _HOLDS * half - self._own)
         least, most = self.uncertainty.input_bias
