@@ -179,3 +179,5 @@ def test_no_law_costs_less_than_a_motor_that_runs_at_its_limit() -> None:
     costs = screening.expected_costs(settings)
     assert screening.least_cost < min(costs.values()) < 1.3 * screening.least_cost
     assert Screening(Question(SERVO, known, few, trial, noise=0.0)).least_cost == 0.0
+    slow = SERVO.replace(voltage_limit=0.01)
+    assert Screening(Question(slow, known, few, trial, noise=0.0)).least_cost == 0.0, "longer than it is simulated"

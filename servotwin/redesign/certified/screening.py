@@ -151,12 +151,14 @@ class Screening:
     def least_cost(self) -> float:
         """s: mean cost of a move whose motor runs at the limit of its command all the way; 0 where nothing limits it.
 
-        This part of the expected costs is the same whatever the law.
+        This part of the expected costs is the same whatever the law. It counts as 0 too where such a move takes longer
+        than it is simulated: the next one begins on the way then.
         """
         servo = self.question.servo
         limit = min(servo.controller.voltage_limit or math.inf, servo.command_limit or math.inf)
         full = np.array([[plant.command_per_speed / plant.p] for plant in self._moving.plants])
-        return float(np.mean(full * self._moving.step)) / (2.0 * limit)
+        times = full * self._moving.step / limit
+        return 0.5 * float(times.mean()) if times.max() < self.question.trial.half.half.duration else 0.0
 
     @cached_property
     def _moving(self) -> SimulatedMachines:
