@@ -27,6 +27,7 @@ from servotwin.redesign.certified.certify import certify
 from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.machines import draw, draw_independently
 from servotwin.redesign.certified.margins import loop_margins, margins_in_every_zone, widened
+from servotwin.redesign.certified.screening import Screening
 from servotwin.redesign.certified.trial import Trial
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.design import Design
@@ -197,6 +198,21 @@ def test_a_law_whose_plainer_one_is_verified_is_not_verified_to_its_end(monkeypa
     assert isinstance(found, Certificate)
     assert found.setting.controller.velocity_feedforward == 0.0
     assert finished == [found.setting]
+
+
+def test_a_motor_at_its_limit_takes_a_setting_that_saves_much_of_the_little_that_a_law_can_change() -> None:
+    """Two percent of the whole cost are more than a tenth of what the motor does not need at full speed."""
+    servo, known = SERVO.replace(voltage_limit=1.0), Uncertainty(gap=gaps(24, 27), usual_step=(1.8e-3, 1.8e-3))
+    best = certify(servo, known, SMALL, SHORT)
+    assert isinstance(best, Certificate)
+    screening = Screening(Question(servo, known, SMALL, SHORT, noise=0.0))
+    costs = screening.expected_costs(candidates_of(servo, known, SMALL, disturbed=False, noisy=False))
+    least = costs[best.setting]
+    running = max((each for each in costs if costs[each] <= 1.03 * least), key=lambda each: costs[each])
+    assert costs[running] - screening.least_cost > 1.1 * (least - screening.least_cost)
+    found = certify(servo, known, SMALL, SHORT, running=running)
+    assert isinstance(found, Certificate)
+    assert found.setting == best.setting != running
 
 
 def test_no_candidate_is_one_sentence() -> None:

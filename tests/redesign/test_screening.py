@@ -166,3 +166,18 @@ def test_what_friction_leaves_at_most_counts_and_not_where_a_few_machines_stop()
     assert not question._larger_step(calm)
     integral = Design(SERVO.controller.replace(Ki=0.01 * SERVO.controller.Ki))
     assert not exceeds_error_limit(question, integral)
+
+
+def test_no_law_costs_less_than_a_motor_that_runs_at_its_limit() -> None:
+    known, step, volt = Uncertainty(gap=(0.1, 0.11), usual_step=(1.8e-3, 1.8e-3)), 1.8e-3, 1.0
+    limited = SERVO.replace(voltage_limit=volt)
+    few = replace(DEMANDS, screened=1)
+    trial = trial_for(limited, known, few)
+    screening = Screening(Question(limited, known, few, trial, noise=0.0))
+    assert screening.least_cost == pytest.approx(step * SERVO.k_B / (2.0 * SERVO.p * volt), rel=1e-12)
+    settings = candidates_of(limited, known, few, disturbed=False, noisy=False)
+    costs = screening.expected_costs(settings)
+    assert screening.least_cost < min(costs.values()) < 1.3 * screening.least_cost
+    assert Screening(Question(SERVO, known, few, trial, noise=0.0)).least_cost == 0.0
+    slow = SERVO.replace(voltage_limit=0.01)
+    assert Screening(Question(slow, known, few, trial, noise=0.0)).least_cost == 0.0, "longer than it is simulated"

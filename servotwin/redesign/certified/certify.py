@@ -42,7 +42,8 @@ _LEFT_OUT = 64
 _MOVED = 12
 # The same where each law with integral action has six zones.
 _MOVED_IN_ZONES = 36
-# Cost of a running setting with velocity feedforward over that of the cheapest one, up to which it stays.
+# Cost of a running setting with velocity feedforward over that of the cheapest one, up to which it stays. Where the
+# usual steps are known, these factors are on what a law can change of a cost.
 _WORTH = 1.03
 # Cost of a law without velocity feedforward over the same law with it, up to which the plain one is better: it
 # overshoots less and comes to rest sooner. In force it stays a little longer, so that the two do not take turns.
@@ -167,7 +168,7 @@ def _plainer(question: Question, screening: Screening, found: Design) -> Certifi
     if screening.fails(plain):
         return None
     costs = screening.expected_costs([found, plain])
-    if costs[plain] > _ALIKE * costs[found]:
+    if _reduced(costs[plain], screening.least_cost, _ALIKE) > costs[found]:
         return None
     attempt = Attempt(question, plain)
     return None if attempt.cannot_pass() else attempt.verified()
@@ -285,6 +286,15 @@ def _worth(running: Design) -> float:
     return _WORTH if _velocity(running.controller) else _ALIKE_IN_FORCE
 
 
+def _reduced(cost: float, least: float, factor: float) -> float:
+    """A cost whose part beyond the least that any law has is divided by a factor.
+
+    On a motor that runs at its limit most of the way the least is nearly all of it: a few percent of the whole would be
+    more than the candidates differ by.
+    """
+    return cost if cost <= least else least + (cost - least) / factor
+
+
 def _with_running(screening: Screening, candidates: list[Design], running: Design | None) -> Iterator[Design]:
     """Candidates by their cost over all steps, the running setting where it is hardly dearer than the next one."""
     waits = running is not None and not screening.fails(running)
@@ -303,5 +313,8 @@ def _by_moves(
     moved = _MOVED_IN_ZONES if has_slow_integral(screening.question.servo) else _MOVED
     settings = dict.fromkeys([*islice(screening.ranked(candidates, passing=True), moved), *always])
     costs = screening.expected_costs([each for each in settings if not screening.fails(each)])
-    yield from sorted(costs, key=lambda each: costs[each] / (_worth(each) if each == running else 1.0))
+    least = screening.least_cost
+    yield from sorted(
+        costs, key=lambda each: _reduced(costs[each], least, _worth(each)) if each == running else costs[each]
+    )
     yield from (each for each in screening.ranked(candidates) if each not in costs)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +19,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.retuning import friction_feedforward, integrates
 from servotwin.redesign.certified.assess import MachineMeasures, assess, costs_to_and_fro, joined, steady_error
 from servotwin.redesign.certified.attempt import ROUNDED, Question
-from servotwin.redesign.certified.machines import draw
+from servotwin.redesign.certified.machines import SimulatedMachines, draw
 from servotwin.redesign.certified.margins import has_slow_integral
 from servotwin.redesign.design import Design
 
@@ -141,11 +142,29 @@ class Screening:
         """
         if not settings:
             return {}
-        question, demands = self.question, self.question.demands
-        members = draw(question.servo, self._moves, demands.screened, demands.conditions // 2, demands.seed)
-        moves = costs_to_and_fro([self._quick(each) for each in settings], members, question.trial.half.half)
+        question = self.question
+        moves = costs_to_and_fro([self._quick(each) for each in settings], self._moving, question.trial.half.half)
         costs = [float(cost.mean()) + question.price(each) for each, cost in zip(settings, moves, strict=True)]
         return dict(zip(settings, costs, strict=True))
+
+    @cached_property
+    def least_cost(self) -> float:
+        """s: mean cost of a move whose motor runs at the limit of its command all the way; 0 where nothing limits it.
+
+        This part of the expected costs is the same whatever the law. It counts as 0 too where such a move takes longer
+        than it is simulated: the next one begins on the way then.
+        """
+        servo = self.question.servo
+        limit = min(servo.controller.voltage_limit or math.inf, servo.command_limit or math.inf)
+        full = np.array([[plant.command_per_speed / plant.p] for plant in self._moving.plants])
+        times = full * self._moving.step / limit
+        return 0.5 * float(times.mean()) if times.max() < self.question.trial.half.half.duration else 0.0
+
+    @cached_property
+    def _moving(self) -> SimulatedMachines:
+        """Machines that move to and fro."""
+        demands = self.question.demands
+        return draw(self.question.servo, self._moves, demands.screened, demands.conditions // 2, demands.seed)
 
     def _start(self, candidates: Sequence[Design]) -> None:
         """Simulate the candidates that are new: the first of all on every machine, which tells the costliest ones."""
