@@ -147,3 +147,25 @@ def test_a_twin_of_a_machine_with_a_soft_screw_says_so_and_its_intervals_hold():
             assert estimate.interval[0] <= case.gap <= estimate.interval[1]
     assert accepted >= 6
     assert "the screw is softer than the model says" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("loop", "least", "stiffness"), [("no dead zone", 7, 5e5), ("calm", 4, 2e5)])
+def test_a_twin_learns_a_machine_whose_screw_is_elastic(loop: str, least: int, stiffness: float) -> None:
+    """Model and screw are off; what the screw's stiffness does to the gap is in the interval."""
+    rng, settings = np.random.default_rng(5), TwinSettings()
+    model = MODEL.replace(k_d=stiffness)
+    machine = ModelError(0.05, 0.3, 0.005).machine(rng, model).replace(k_d=1.18 * stiffness)
+    run = worn_run(rng, model, machine, loop, 8, math.radians(20.0))
+    estimator, wear, accepted = estimator_of(model, settings), Wear(0.0), 0
+    for case in step_windows(run, loop, model, 1e-6, rng):
+        now = case.window.mid_time
+        expected = wear.expect(settings.trend, "boot", now, now, settings.learning)
+        estimate = estimator(case.window, expected)
+        wear, _ = wear.update(settings.trend, "boot", estimate, now, settings.learning)
+        if estimate.ok:
+            accepted += 1
+            true = float(run.gap[round(estimate.time * run.sample_rate)])
+            assert estimate.interval[0] <= true <= estimate.interval[1]
+    assert accepted >= least
+    assert wear.machine is not None
