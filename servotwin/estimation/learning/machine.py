@@ -279,8 +279,8 @@ def _softened(before: tuple[float, float], after: tuple[float, float]) -> str:
     if softness * math.sqrt(information) <= _DRIFT or was * math.sqrt(known) > _DRIFT:
         return ""
     return (
-        f"the screw is softer than the model says, by {100.0 * softness:.2g} % of the structure's compliance; intervals "
-        "are widened by what that does to the gap"
+        f"the screw is softer than the model says, by {100.0 * softness:.2g} % of the structure's compliance; "
+        "intervals are widened by what that does to the gap"
     )
 
 

@@ -27,9 +27,9 @@ from servotwin.estimation.estimate import (
 from servotwin.estimation.whitened.doubt import way_doubt
 from servotwin.estimation.whitened.estimator import WindowFit
 from servotwin.estimation.whitened.fit import WhitenedFit
-from servotwin.estimation.whitened.free_model import PITCH, FactorPrior, FreeFit
+from servotwin.estimation.whitened.free_model import PITCH, SCREW_SPREAD, FactorPrior, FreeFit
 from servotwin.estimation.whitened.gate import misfits, sure_of_contact, with_free_model
-from servotwin.estimation.whitened.learning import SCREW_SPREAD, LearntFit, as_known
+from servotwin.estimation.whitened.learning import LearntFit, as_known
 from servotwin.estimation.whitened.nearby import own_softness
 from servotwin.estimation.whitened.reduction import CONSTANT, PLACE, RESIDUAL, Point
 from servotwin.estimation.whitened.shift import fastest

@@ -21,7 +21,7 @@ from servotwin.estimation.core.contacts import BY_RATE
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import MachineReading
-from servotwin.estimation.whitened.nearby import nearby
+from servotwin.estimation.whitened.nearby import nearby, own_softness
 from servotwin.estimation.whitened.reduction import CONSTANT, GAP, RESIDUAL, Misfit, Point, Reduction
 from servotwin.estimation.whitened.search import PLACES
 from servotwin.estimation.whitened.sensor_errors import cyclic_motions, lag_motion
@@ -33,6 +33,7 @@ PITCH = FACTORS.index("pitch")
 FREEDOM = (0.1, 0.5, 0.05, 0.1)  # relative standard deviations of the factors where nothing else is known of them
 LARGEST = 4.0  # standard deviations by which a factor may move
 COMPLIANCE = 0.1  # usual size of that ratio where nothing is known of it
+SCREW_SPREAD = 0.2  # relative, of an elastic screw's stiffness: shaft, nut and bearings in series are known roughly
 CYCLIC = 2e-3 * math.pi  # rad, usual size of an error once per turn: a thousandth of a turn
 _WIDE = (0.01, 0.05, 0.005, 0.02)  # relative spreads of the factors: within these, the motion is linear in them
 _FIRST_DAMPING, _FIRST_LINEAR, _LARGEST_DAMPING, _LEAST_DAMPING = 1e-3, 1e-6, 1e8, 1e-9
@@ -273,6 +274,17 @@ class FreeProblem:
             else:
                 damping *= 10.0
         return FreeFit(Point(float(q[0]), float(q[1])), q[2:], cost, rows, movable, count, floor)
+
+
+def other_screws(problem: FreeProblem, start: Array, free: tuple[bool, bool], gain: float = _GAIN) -> list[FreeFit]:
+    """Fits from a start (6,) with an elastic screw as soft, and as stiff, as it may be; none with a rigid one."""
+    servo, fits = problem.servo, []
+    for share in () if servo.rigid else (1.0 / (1.0 + SCREW_SPREAD), 1.0 + SCREW_SPREAD):
+        here = start.copy()
+        # The structure is held at its other end too: a soft screw takes its share of the travel.
+        here[2 + PITCH] += (1.0 / share - 1.0) * own_softness(servo)
+        fits.append(replace(problem, servo=servo.replace(k_d=share * servo.k_d)).descend(here, free, gain=gain))
+    return fits
 
 
 def _promised(step: Array, residual: Array, rows: Array) -> float:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.core.contacts import travel
-from servotwin.estimation.whitened.free_model import BELIEVED, HOPELESS, FreeFit, FreeProblem
+from servotwin.estimation.whitened.free_model import BELIEVED, HOPELESS, FreeFit, FreeProblem, other_screws
 from servotwin.estimation.whitened.nearby import PITCH, own_softness
 
 # Structure's stiffness over the screw's, beyond that of the model. Below the first the lead moves by little, and a
@@ -50,7 +50,11 @@ def possible_leads(problem: FreeProblem, single: FreeFit, variance: float) -> li
     allowed = BELIEVED * variance
     fits = list(_softer(problem, single, allowed))
     least = min(fit.cost for fit in fits)
-    return [_lead(problem, fit, variance) for fit in fits if fit.cost <= least + allowed]
+    possible = [fit for fit in fits if fit.cost <= least + allowed]
+    # Without noise none of a few screws explains the window as well as the true one, which lies between them.
+    start = np.array([*single.point, *single.factors])
+    possible += other_screws(replace(problem, compliance=0.0), start, (False, True), _GAIN)
+    return [_lead(problem, fit, variance) for fit in possible]
 
 
 def _softer(problem: FreeProblem, single: FreeFit, allowed: float) -> Iterator[FreeFit]:

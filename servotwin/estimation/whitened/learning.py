@@ -25,13 +25,12 @@ from servotwin.estimation.whitened.free_model import (
     FACTORS,
     FREEDOM,
     LARGEST,
-    PITCH,
     FactorPrior,
     FreeFit,
     FreeProblem,
     adapted,
+    other_screws,
 )
-from servotwin.estimation.whitened.nearby import own_softness
 from servotwin.estimation.whitened.reduction import Point
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.plant.servo import Servo
@@ -44,7 +43,6 @@ _GAP_ROW, _PLACE_ROW = 0, 1  # of the derivatives
 _AT_END = 1e-3  # of the range of a factor
 _SHOWN = 1.0  # information on the softness beyond what is usual of it: below, the window says nothing
 _MOST_KNOWN = 1e7  # of the softness: no number of windows tells it better than to 0.0003
-SCREW_SPREAD = 0.2  # relative, of an elastic screw's stiffness: shaft, nut and bearings in series are known roughly
 _VAGUE = 1e-5  # of the position's variation: white noise that small leaves all to the window, nothing to the prior
 
 
@@ -138,15 +136,11 @@ class LearntFit:
         A stiffer and a softer screw count as far as the window makes them likely beside the model's. What many windows
         told does not: the factors took up there what the screw was off by.
         """
-        servo, prior = self.problem.servo, self.problem.prior
-        if servo.rigid:
+        prior = self.problem.prior
+        if self.problem.servo.rigid:
             return Point(0.0, 0.0)
-        problem, fits = replace(self.problem, prior=prior if prior.wide else FactorPrior.of_spreads(*FREEDOM)), []
-        for share in (1.0, 1.0 / (1.0 + SCREW_SPREAD), 1.0 + SCREW_SPREAD):
-            start = at.copy()
-            # The structure is held at its other end too: a soft screw takes its share of the travel.
-            start[2 + PITCH] += (1.0 / share - 1.0) * own_softness(servo)
-            fits.append(replace(problem, servo=servo.replace(k_d=share * servo.k_d)).descend(start, free))
+        problem = replace(self.problem, prior=prior if prior.wide else FactorPrior.of_spreads(*FREEDOM))
+        fits = [problem.descend(at, free), *other_screws(problem, at, free)]
         worse = np.array([fit.cost for fit in fits]) - min(fit.cost for fit in fits)
         likely = np.exp(-0.5 * worse / max(1.0, self.aligned.whitened.variance))
         moved = np.array([fit.point for fit in fits]) - np.array(fits[0].point)
