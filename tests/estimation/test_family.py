@@ -21,9 +21,12 @@ def scaled(servo: Servo, name: str, factor: float) -> Servo:
 
 
 @pytest.mark.parametrize("hold", list(InputHold))
-@pytest.mark.parametrize(("make", "names"), [(motor_family, MOTOR), (structure_family, STRUCTURE)])
-def test_derivatives_are_those_of_the_responses(make, names, hold):
-    servo = Servo.preset("paper").replace(m=(5.2, 4.0, 6.1), k=(1e4, 9e3, 1.2e4), c=(36.9, 30.0, 45.0))
+@pytest.mark.parametrize(
+    ("make", "names", "screw"),
+    [(motor_family, MOTOR, np.inf), (structure_family, STRUCTURE, np.inf), (structure_family, STRUCTURE, 3e5)],
+)
+def test_derivatives_are_those_of_the_responses(make, names, screw, hold):
+    servo = Servo.preset("paper").replace(m=(5.2, 4.0, 6.1), k=(1e4, 9e3, 1.2e4), c=(36.9, 30.0, 45.0), k_d=screw)
     family, step = make(servo), 1e-5
     start = np.linspace(0.5, 1.0, family.system.B.size)
     found = family.sampled(RATE, hold).respond(SIGNAL, start)

@@ -17,10 +17,11 @@ from scipy.linalg.lapack import dgebal
 from servotwin.hybrid.compiled import compiled
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
+from servotwin.plant.structure import chain
 
 _TERMS = 18  # of the series, for a norm below 1/4
 MOTOR = ("J", "L", "R", "k_T", "k_B")
-STRUCTURE = ("k/m", "c/m", "pitch")
+STRUCTURE = ("k/m", "c/m", "pitch", "k_d")
 
 
 class InputHold(StrEnum):
@@ -216,20 +217,27 @@ def motor_family(servo: Servo) -> Family:
 
 
 def structure_family(servo: Servo) -> Family:
-    """Screw angle (rad) to the last mass's position (m), for all stiffnesses, all dampings over the masses, and p.
+    """Screw angle (rad) to the last mass's position (m), for stiffnesses and dampings over the masses, p, and k_d.
 
-    "k/m" scales every stiffness, "c/m" every damping, "pitch" the screw. The state is z = x - B_velocity d, whose
-    derivative does not contain the input's. Only a rigid screw is a function of its angle alone.
+    "k/m" scales every stiffness but that of an elastic screw, which "k_d" scales, "c/m" every damping, "pitch" the
+    screw. The state is z = x - B_velocity d, whose derivative does not contain the input's.
     """
     p, whole = servo.p, servo.chain()
     by_k, by_c = np.zeros((2, *whole.A.shape))
     # The accelerations (lower half) are linear in the stiffnesses (by the positions) and the dampings (by the speeds).
     masses = len(whole.A) // 2
     by_k[masses:, :masses], by_c[masses:, masses:] = whole.A[masses:, :masses], whole.A[masses:, masses:]
+    by_screw, position_by_screw = np.zeros_like(by_k), np.zeros_like(whole.B_position)
+    if not servo.rigid:
+        alone = chain(servo.masses, 0.0 * servo.stiffnesses, 0.0 * servo.dampings, servo.k_d)
+        by_screw[masses:, :masses], position_by_screw = alone.A[masses:, :masses], alone.B_position
+    by_k -= by_screw
+    position_by_k = whole.B_position - position_by_screw
     velocity, row = whole.B_velocity, whole.C_last
     B, D = p * (whole.A @ velocity + whole.B_position), p * float(row @ velocity + whole.D[-1])
     none = np.zeros_like(B)
-    stiffness = Matrices(by_k, p * (by_k @ velocity + whole.B_position), none, 0.0)
+    stiffness = Matrices(by_k, p * (by_k @ velocity + position_by_k), none, 0.0)
     damping = Matrices(by_c, p * (by_c @ velocity + whole.A @ velocity), none, p * float(row @ velocity))
     pitch = Matrices(np.zeros_like(by_k), B, none, D)
-    return Family(STRUCTURE, Matrices(whole.A, B, row, D), (stiffness, damping, pitch))
+    screw = Matrices(by_screw, p * (by_screw @ velocity + position_by_screw), none, 0.0)
+    return Family(STRUCTURE, Matrices(whole.A, B, row, D), (stiffness, damping, pitch, screw))

@@ -50,7 +50,7 @@ from servotwin.plant.signals import Array
 
 __all__ = ["JointEstimate", "JointSettings", "SharedFit", "estimate_jointly"]
 
-_SHARED = ("k/m", "c/m", "pitch", "k_B")
+_SHARED = ("k/m", "c/m", "pitch", "k_d", "k_B")
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,12 +156,12 @@ def estimate_jointly(
     ----------
     window : Window, or several
         Position and theta_m, or position and voltage: the angle is then computed from the voltage. Several windows are
-        fitted together: each has its own gap and delay, k/m, c/m, pitch and k_B are the same in all.
+        fitted together: each has its own gap and delay, k/m, c/m, pitch, k_d and k_B are the same in all.
     servo : Servo
         The model to start from.
     free : tuple of str, optional
-        Of "k/m", "c/m", "pitch", "k_B", "gap rate". By default k/m, c/m and the pitch; without the motor's angle k_B in
-        place of the pitch, because the position shows only their ratio.
+        Of "k/m", "c/m", "pitch", "k_d", "k_B", "gap rate". By default k/m, c/m and the pitch, and k_d of an elastic
+        screw; without the motor's angle k_B in place of the pitch, because the position shows only their ratio.
     prior : number, GapEstimate or Prior, optional
         A gap (rad) to search from as well; a `Prior`'s spread counts as information, on the first window.
     settings : JointSettings, optional
@@ -170,7 +170,7 @@ def estimate_jointly(
     ------
     InvalidInput
         An axis made of parts; unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short;
-        an elastic screw; no window at all, or some with theta_m and some without.
+        an elastic screw without the motor's angle; no window at all, or some with theta_m and some without.
     """
     if not isinstance(servo, Servo):
         raise InvalidInput(
@@ -179,7 +179,7 @@ def estimate_jointly(
         )
     given = (settings or JointSettings()).on(scales(servo).time)
     windows = _windows(window)
-    names = _free(windows[0], free)
+    names = _free(windows[0], servo, free)
     fits = [_fit(one, servo, names, prior if one is windows[0] else _start_of(prior), given) for one in windows]
     results = [_alone(fit) for fit in fits]
     counted = [
@@ -207,10 +207,11 @@ def _start_of(prior: AnyPrior) -> AnyPrior:
     return prior.gap if isinstance(prior, Prior) else prior
 
 
-def _free(window: Window, free: tuple[str, ...] | None) -> tuple[str, ...]:
+def _free(window: Window, servo: Servo, free: tuple[str, ...] | None) -> tuple[str, ...]:
     """Names of the free parameters, checked."""
     measured = window.theta_m is not None
-    names = (_WITH_ANGLE if measured else _FROM_VOLTAGE) if free is None else tuple(free)
+    usual = _WITH_ANGLE if measured else _FROM_VOLTAGE
+    names = (usual if servo.rigid else (*usual, "k_d")) if free is None else tuple(free)
     for name in names:
         if name not in SPREADS:
             raise InvalidInput(f"free parameter {name!r} does not exist: allowed are {', '.join(SPREADS)}")
@@ -218,6 +219,8 @@ def _free(window: Window, free: tuple[str, ...] | None) -> tuple[str, ...]:
         raise InvalidInput(
             "k_B cannot be free where theta_m is measured: the position depends on it through theta_m only"
         )
+    if servo.rigid and "k_d" in names:
+        raise InvalidInput("k_d cannot be free: the servo's screw is rigid (k_d = inf); give it a finite stiffness")
     if not measured and {"k_B", "pitch"} <= set(names):
         raise InvalidInput("k_B and pitch cannot both be free without theta_m: the position shows p/k_B only")
     return tuple(dict.fromkeys(names))
@@ -226,8 +229,11 @@ def _free(window: Window, free: tuple[str, ...] | None) -> tuple[str, ...]:
 def _model(window: Window, servo: Servo, free: tuple[str, ...], settings: JointSettings) -> JointModel:
     if window.theta_m is None and window.voltage is None:
         raise InvalidInput(f"{window.where}the window has neither theta_m (rad) nor voltage (V): one of them is needed")
-    if not servo.rigid:
-        raise InvalidInput(f"servo k_d = {servo.k_d} N/m: the joint estimator needs a rigid screw (k_d = inf)")
+    if window.theta_m is None and not servo.rigid:
+        raise InvalidInput(
+            f"{window.where}the window has no theta_m, and servo k_d = {servo.k_d} N/m: from the voltage the joint "
+            "estimator needs a rigid screw (k_d = inf), whose load does not act back on the motor"
+        )
     delay = ("delay",) if settings.delay_limit > 0.0 else ()
     motor = MOTOR_START if window.theta_m is None else ()
     margin, factor = margin_for(settings.delay_limit, window.sample_rate), decimation_factor(servo, window.sample_rate)

@@ -44,7 +44,7 @@ class JointModel:
     """Model of a window as a function of named parameters.
 
     Parameters are "gap" (rad), "place" (-1..1, where in the gap the screw begins), "delay" (s, of the position),
-    "gap rate" (rad/s), the logarithms of "k/m", "c/m", "pitch" and "k_B" over the servo's, "speed0" and "current0".
+    "gap rate" (rad/s), the logarithms of "k/m", "c/m", "pitch", "k_d" and "k_B" over the servo's, "speed0" and "current0".
 
     Attributes
     ----------
@@ -84,7 +84,7 @@ class JointModel:
 
     def adapted(self, values: Mapping[str, float]) -> Servo:
         """The servo with the parameters' factors."""
-        names = zip(("k", "c", "p", "k_B"), (*STRUCTURE, "k_B"), strict=True)
+        names = zip(("k", "c", "p", "k_d", "k_B"), (*STRUCTURE, "k_B"), strict=True)
         return self._apart.scaled({name: math.exp(values.get(parameter, 0.0)) for name, parameter in names})
 
     @cached_property

@@ -14,7 +14,7 @@ from servotwin.estimation.core.family import InputHold
 
 _LARGEST_DELAY = 2e-3  # s of the paper's servo
 SPREADS: Mapping[str, float] = MappingProxyType(
-    {"k/m": 0.1, "c/m": 0.5, "pitch": 0.03, "k_B": 0.1, "gap rate": math.radians(0.5)}
+    {"k/m": 0.1, "c/m": 0.5, "pitch": 0.03, "k_d": 0.2, "k_B": 0.1, "gap rate": math.radians(0.5)}
 )
 
 
@@ -26,7 +26,7 @@ class JointSettings:
     Parameters
     ----------
     spreads : mapping
-        Prior standard deviation of each free parameter, of the logarithm for "k/m", "c/m", "pitch"
+        Prior standard deviation of each free parameter, of the logarithm for "k/m", "c/m", "pitch", "k_d"
         and "k_B" (0.1: about 10 %), in rad/s for "gap rate" (by default on the paper's servo, and as much in its own
         time on another). A parameter may move by four of them.
     hold : InputHold, optional

@@ -213,6 +213,7 @@ def _parameter(servo: Servo, name: str, value: float, std: float) -> Parameter:
         "k/m": servo.stiffnesses[-1] / servo.masses[-1],
         "c/m": servo.dampings[-1] / servo.masses[-1],
         "pitch": servo.p,
+        "k_d": servo.k_d,
         "k_B": servo.k_B,
     }[name]
     factor = math.exp(value)
