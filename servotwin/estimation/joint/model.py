@@ -44,7 +44,8 @@ class JointModel:
     """Model of a window as a function of named parameters.
 
     Parameters are "gap" (rad), "place" (-1..1, where in the gap the screw begins), "delay" (s, of the position),
-    "gap rate" (rad/s), the logarithms of "k/m", "c/m", "pitch", "k_d" and "k_B" over the servo's, "speed0" and "current0".
+    "gap rate" (rad/s), the logarithms of "k/m", "c/m", "pitch", "k_d" and "k_B" over the servo's, "speed0" and
+    "current0".
 
     Attributes
     ----------
