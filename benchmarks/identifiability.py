@@ -203,13 +203,13 @@ def _from_position(
     theta_m: Array, servo: Servo, at: Gap, rate: float, motor: tuple[Array, Array], noise: float
 ) -> tuple[MotorCase, ...]:
     """Cases with the position, where gap, first screw angle and initial states are unknown as well."""
-    structure, screw = structure_family(servo).sampled(rate), contacts(theta_m, at)
+    structure, screw = structure_family(servo).select(("pitch",)).sampled(rate), contacts(theta_m, at)
     position = structure.respond(screw[SCREW])
     driven, free = (through_gap(columns, theta_m, at) for columns in motor)
     unknown = np.vstack([structure.plain(np.vstack([free, screw[[BY_GAP, BY_START]]])), structure.free(theta_m.size)])
     skewed = np.vstack([unknown, np.gradient(position[0])])
     shown, names = structure.plain(driven), (*MOTOR, "pitch")
-    with_pitch = np.vstack([shown, position[3:]])
+    with_pitch = np.vstack([shown, position[1:]])
     return (
         MotorCase("voltage and position, clocks in step", identifiability(MOTOR, shown, unknown, noise)),
         MotorCase("voltage and position, delay unknown", identifiability(MOTOR, shown, skewed, noise)),
