@@ -60,8 +60,8 @@ class MachineReading:
     covariance : tuple of 16 float
         Of these, row by row.
     softness : (float, float)
-        The structure's stiffness over the screw's, and one over the variance of that; (0, 0): nothing is known of it.
-        The fitted model has a rigid screw all the same: this says what that leaves out.
+        The structure's stiffness over the screw's beyond that of the model, and one over the variance of that; (0, 0):
+        nothing is known of it. The fitted screw is the model's all the same: this says what that leaves out.
     """
 
     factors: tuple[float, ...]

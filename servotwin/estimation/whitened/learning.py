@@ -47,12 +47,12 @@ _VAGUE = 1e-5  # of the position's variation: white noise that small leaves all 
 
 
 class WindowSoftness(NamedTuple):
-    """The screw's softness as one window shows it, and what it does to the gap that is fitted with a rigid screw.
+    """The screw's softness as one window shows it, and what it does to the gap that is fitted with the model's screw.
 
     Attributes
     ----------
     value, information : float
-        The structure's stiffness over the screw's, and one over its variance in noise of variance 1.
+        The structure's stiffness over the screw's beyond the model's, and one over its variance in noise of variance 1.
     slope : float
         Change of the gap (rad), or of the place, per softness, the model's factors moving along.
     """
