@@ -66,9 +66,12 @@ def tune(
     delay_ms: Annotated[float, typer.Option(help="Delay in series with the plant, ms.")] = 0.0,
     b: Annotated[float, typer.Option(help="Setpoint weight of the proportional term.")] = 1.0,
     c: Annotated[float | None, typer.Option(help="Setpoint weight of the derivative term; by default b.")] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="TOML to be written: the servo or axis with these gains.")
+    ] = None,
     json: _Json = False,
 ) -> None:
-    """Find gains for a crossover and a phase margin, and compare them with the present controller."""
+    """Find gains for a crossover and a phase margin, and compare them with the present controller, if there is one."""
     from servotwin.cli.tune import TuneOptions, print_tuning
 
     options = TuneOptions(
@@ -81,6 +84,7 @@ def tune(
         delay_ms=delay_ms,
         b=b,
         c=c,
+        output=output,
     )
     print_tuning(options, json)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -15,7 +17,7 @@ from servotwin.analysis.tuning.setpoint import overshoot
 from servotwin.analysis.tuning.tune import Tuning, evaluate
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.laws import LINEAR_LAW, filtered_pid
+from servotwin.control.laws import LINEAR_LAW, AnyController, filtered_pid
 from servotwin.control.linear_law import LinearLaw
 from servotwin.design import tune, tuned_system
 from servotwin.errors import InvalidInput
@@ -25,6 +27,7 @@ from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.loop import gain_units
 from servotwin.plant.margins import Margins
 from servotwin.plant.plants import Plant, resolve_plant
+from servotwin.runtime.files import atomic_output, check_file
 
 # A loop with a delay has infinitely many phase crossovers; those beyond this gain margin are not shown.
 _FAR = 1e3
@@ -44,13 +47,16 @@ class TuneOptions:
     delay_ms: float
     b: float
     c: float | None
+    output: Path | None = None
 
 
 def print_tuning(request: TuneOptions, as_json: bool) -> None:
-    """Print a table, or one JSON object, on the standard output."""
+    """Print a table, or one JSON object, on the standard output; write the tuned axis or servo where that is asked."""
     if not 0.0 < request.phase_margin_deg < 180.0:
         raise InvalidInput(f"phase margin {request.phase_margin_deg:g} deg: must be above 0 and below 180 deg")
-    servo = resolve_plant(request.servo)
+    if request.output is not None:
+        check_file(request.output, (".toml",))
+    servo = resolve_plant(request.servo, tuned=False)
     if isinstance(servo, Axis) and isinstance(servo.controller, Cascade):
         print_cascade(servo, servo.controller, request, as_json)
         return
@@ -59,8 +65,8 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
             f'{request.servo}: controller.kind = "{LINEAR_LAW}": tune finds the gains of a filtered PID or a cascade; '
             "describe one of these in the table [controller]"
         )
+    own, delay = filtered_pid(servo.controller), 1e-3 * request.delay_ms
     servo = servo.replace(sample_rate=None)
-    delay = 1e-3 * request.delay_ms
     tuning = tune(
         servo,
         request.crossover,
@@ -75,13 +81,15 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     if delay == 0.0:
         weighted = overshoot(servo, tuning.controller, b, c)
         overshoots = (overshoot(servo, tuning.controller), weighted)
+    _write(request, servo, tuning.controller.replace(sample_rate=own.sample_rate))
     if as_json:
         print(json.dumps(as_dict(tuning, overshoots), indent=2))
         return
     console = Console()
-    own = filtered_pid(servo.controller)
-    present = evaluate(tuned_system(servo), own, delay)
-    _print(console, servo, {"tuned": (tuning.controller, tuning.margins), "present": (own, present)})
+    laws = {"tuned": (tuning.controller, tuning.margins)}
+    if any((own.Kp, own.Ki, own.Kd)):
+        laws["present"] = own, evaluate(tuned_system(servo), own, delay)
+    _print(console, servo, laws)
     angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))
     console.print(f"factors at {angles.wc:g} rad/s: K = {angles.K:.6g}, {shown}", highlight=False)
@@ -90,6 +98,22 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
         more = f"; with setpoint weights b = {b:g}, c = {c:g}: {100 * overshoots[1]:.1f} %"
         more = more if (b, c) != (1.0, 1.0) else ""
         console.print(f"overshoot without a gap {100 * overshoots[0]:.1f} %{more}", highlight=False)
+    _print_written(console, request)
+
+
+def _write(request: TuneOptions, servo: Plant, law: AnyController) -> None:
+    """Write the axis or servo with its new controller, if that is asked, once this is stable at its sample rate."""
+    if request.output is None:
+        return
+    servo.check_loop(law)
+    changed = dataclasses.replace(servo, controller=law)  # type: ignore[arg-type]
+    with atomic_output(request.output) as temporary:
+        temporary.write_text(changed.dumps(), encoding="utf-8")
+
+
+def _print_written(console: Console, request: TuneOptions) -> None:
+    if request.output is not None:
+        console.print(f"written: {request.output}", highlight=False)
 
 
 def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool) -> None:
@@ -102,20 +126,29 @@ def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool)
             f"--ms-max {request.Ms_max:g}: the cascade with this crossover and phase margin has Ms = "
             f"{tuned.margins.Ms:.4g}; lower the crossover, or raise the margin"
         )
+    _write(request, axis, tuned.controller)
     found, present = (file_values(law, axis.actuator.unit, axis.load.motion) for law in (tuned.controller, own))
     gains = {name: value for name, value in found.items() if name.startswith(_CASCADE_GAINS)}
     if as_json:
         loop = {"omega": tuned.position_crossover, "phase_margin_deg": math.degrees(tuned.position_margin)}
         print(json.dumps({"gains": gains, "position_loop": loop, "Ms": tuned.margins.Ms}, indent=2))
         return
-    table = Table("", "tuned", "present", box=None, pad_edge=False)
+    heads = ("tuned", "present") if own.position_gain > 0.0 else ("tuned",)
+    table = Table("", *heads, box=None, pad_edge=False)
     for name, value in gains.items():
-        table.add_row(name, f"{value:.6g}", f"{present.get(name, math.nan):.6g}")
+        shown = (f"{value:.6g}", f"{present.get(name, math.nan):.6g}")
+        table.add_row(name, *shown[: len(heads)])
     console = Console()
     console.print(table, highlight=False)
+    console.print(
+        f"velocity loop, crossover (phase margin): {request.crossover:.4f} rad/s ({request.phase_margin_deg:.2f} deg)",
+        highlight=False,
+    )
     outer = f"{tuned.position_crossover:.4f} rad/s ({math.degrees(tuned.position_margin):.2f} deg)"
     console.print(f"position loop, crossover (phase margin): {outer}", highlight=False)
+    console.print(f"at the command, crossovers (phase margins): {_crossovers(tuned.margins)}", highlight=False)
     console.print(f"Ms at the command, at the law's own rate: {tuned.margins.Ms:.4f}", highlight=False)
+    _print_written(console, request)
 
 
 def _check_cascade(request: TuneOptions) -> None:
@@ -159,10 +192,16 @@ def _print(console: Console, servo: Plant, rows: dict[str, tuple[Controller, Mar
         table.add_row(name, *gains, f"{margins.Ms:.4f}")
     console.print(table, highlight=False)
     for name, (_, margins) in rows.items():
-        crossovers = [f"{x.omega:.4f} rad/s ({math.degrees(x.phase_margin):.2f} deg)" for x in margins.gain_crossovers]
-        console.print(f"{name}, crossovers (phase margins): {', '.join(crossovers)}", highlight=False)
+        if not margins.stable:
+            console.print(f"{name}: the loop is unstable", highlight=False)
+            continue
+        console.print(f"{name}, crossovers (phase margins): {_crossovers(margins)}", highlight=False)
         first = [
             f"{x.gain_margin:.3f} at {x.omega:.2f} rad/s" for x in margins.phase_crossovers if x.gain_margin < _FAR
         ]
         if first:
             console.print(f"{name}, gain margins: {', '.join(first)}", highlight=False)
+
+
+def _crossovers(margins: Margins) -> str:
+    return ", ".join(f"{x.omega:.4f} rad/s ({math.degrees(x.phase_margin):.2f} deg)" for x in margins.gain_crossovers)

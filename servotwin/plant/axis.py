@@ -106,8 +106,10 @@ class Axis:
         return cls.loads(text, f"{name}.toml")
 
     @classmethod
-    def from_file(cls, path: str | os.PathLike[str]) -> Axis:
+    def from_file(cls, path: str | os.PathLike[str], tuned: bool = True) -> Axis:
         """An axis from a TOML file, as `dumps` writes it.
+
+        Where it is not `tuned` yet, its controller or that one's gains may be missing, and its loop may be unstable.
 
         Raises
         ------
@@ -115,7 +117,7 @@ class Axis:
             The file cannot be read, a key is missing or unknown, a value is out of its range, parts do not fit, or the
             loop is unstable.
         """
-        return cls._from_table(read_toml(path), Path(path).parent)
+        return cls._from_table(read_toml(path), Path(path).parent, tuned)
 
     @classmethod
     def loads(cls, text: str, source: str) -> Axis:
@@ -123,10 +125,11 @@ class Axis:
         return cls._from_table(parse_toml(text, source))
 
     @classmethod
-    def _from_table(cls, table: Table, folder: Path = Path()) -> Axis:
+    def _from_table(cls, table: Table, folder: Path = Path(), tuned: bool = True) -> Axis:
         with named(table):
-            axis = cls(**read_parts(table, folder)._asdict())
-            axis.check_loop()
+            axis = cls(**read_parts(table, folder, tuned)._asdict())
+            if tuned:
+                axis.check_loop()
             return axis
 
     def dumps(self) -> str:

@@ -11,8 +11,9 @@ from servotwin.config.keys import Maker, items_of, key
 from servotwin.config.own_units import OwnUnits
 from servotwin.config.table import Table
 from servotwin.config.toml import Values, kind_of, read, read_kind, values_of
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
-from servotwin.control.laws import CONTROLLERS, FILTERED_PID, LINEAR_LAW, AnyController
+from servotwin.control.laws import CASCADE, CONTROLLERS, FILTERED_PID, LINEAR_LAW, AnyController
 from servotwin.control.laws import kind_of as kind_of_law
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
@@ -147,6 +148,11 @@ TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
 LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
 LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: linear_law}
 """Controllers that the file of an axis can describe, by their key `kind`."""
+UNTUNED: Mapping[str, AnyController] = {
+    FILTERED_PID: Controller(0.0, 0.0, 0.0, 1.0),
+    CASCADE: Cascade(0.0, 1.0, velocity_gain=1.0),
+}
+"""Controllers whose gains stand for those that a file to be tuned may lack."""
 _MASSES = {LINEAR: "mass_kg", ROTARY: "inertia_kg_m2"}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
 
@@ -161,15 +167,18 @@ class Parts(NamedTuple):
     sensors: Sensors
 
 
-def read_parts(table: Table, folder: Path) -> Parts:
+def read_parts(table: Table, folder: Path, tuned: bool = True) -> Parts:
     """Read the parts of an axis from its file's table, to the last key; paths are relative to `folder`.
+
+    Where the axis is not `tuned` yet, the controller or its gains may be missing: `UNTUNED` stands for them.
 
     Raises
     ------
     InvalidInput
         A key is missing or unknown, a value is out of its range, the load is not of the transmission's kind.
     """
-    tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load", "controller")}
+    tables = {name: table.table(name, required=True) for name in ("actuator", "transmission", "load")}
+    described = table.table("controller", required=tuned)
     actuator: Actuator = read_kind(tables["actuator"], ACTUATORS, Path())
     kind = kind_of(tables["transmission"], TRANSMISSIONS)
     both = [name for name in ("pitch_m_per_rad", "lead_mm_per_rev") if name in tables["transmission"].values]
@@ -185,7 +194,7 @@ def read_parts(table: Table, folder: Path) -> Parts:
                 f"{table.source}: load.{name} = {tables['load'].values[name]!r}: this load is {motion}; give load.{own}"
             )
     load: Load = read_kind(tables["load"], LOADS, Path())
-    law = _read_controller(tables["controller"], folder, actuator.unit, motion, transmission.p)
+    law = _read_controller(described, folder, actuator.unit, motion, transmission.p, tuned)
     encoders = table.table("sensors").in_units(units_of(actuator.unit, motion))
     sensors: Sensors = read(encoders, Sensors)
     encoders.done()
@@ -193,14 +202,14 @@ def read_parts(table: Table, folder: Path) -> Parts:
     return Parts(actuator, transmission, load, law, sensors)
 
 
-def _read_controller(table: Table, folder: Path, unit: str, motion: str, ratio: float) -> AnyController:
+def _read_controller(table: Table, folder: Path, unit: str, motion: str, ratio: float, tuned: bool) -> AnyController:
     """Read the controller in the units of its axis; the ratio is the transmission's where it is not given."""
     kind = kind_of(table, LAWS, FILTERED_PID)
     units = units_of(unit, motion)
     controller = table.in_units(units)
     controller.known("kind")
     own = {"ratio": ratio} if kind != FILTERED_PID and units.key("travel_m_per_rad") not in controller.values else {}
-    law: AnyController = read(controller, LAWS[kind], folder, **own)
+    law: AnyController = read(controller, LAWS[kind], folder, None if tuned else UNTUNED.get(kind), **own)
     controller.done()
     return law
 

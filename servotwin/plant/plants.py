@@ -20,8 +20,10 @@ Plant: TypeAlias = Servo | Axis
 """A machine that can be simulated: the paper's servo, or an axis made of parts."""
 
 
-def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Plant:
+def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".", tuned: bool = True) -> Plant:
     """A preset's name, or the path of the TOML of a servo or of an axis, relative to `folder`.
+
+    Where it is not `tuned` yet, its loop may be unstable, and an axis's controller or its gains may be missing.
 
     Raises
     ------
@@ -38,7 +40,7 @@ def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".") -> Pl
         every = (*PRESETS, *AXES)
         hint = did_you_mean(name_or_path, every)
         raise InvalidInput(f"preset {name_or_path!r} does not exist{hint}; give one of {', '.join(every)}")
-    return Axis.from_file(path) if "actuator" in read_toml(path).values else Servo.load(path)
+    return Axis.from_file(path, tuned) if "actuator" in read_toml(path).values else Servo.load(path, tuned)
 
 
 def plant_of(text: str, source: str) -> Plant:

@@ -88,6 +88,58 @@ def test_the_command_shows_the_keys_of_the_file(tmp_path: Path, capsys: pytest.C
     assert "position_gain_per_s" in capsys.readouterr().out
 
 
+def without(text: str, *keys: str) -> str:
+    return "\n".join(line for line in text.splitlines() if not line.startswith(keys))
+
+
+GAINS = ("position_gain", "velocity_gain_n", "integral_time")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        pytest.param(without(AXIS.dumps(), *GAINS), id="without gains"),
+        pytest.param(AXIS.replace(velocity_gain=10.0).dumps(), id="unstable"),
+    ],
+)
+def test_an_axis_that_cannot_run_yet_is_tuned_and_written(text: str, tmp_path: Path) -> None:
+    path, tuned = tmp_path / "axis.toml", tmp_path / "tuned.toml"
+    path.write_text(text)
+    with pytest.raises(st.InvalidInput, match="is missing|unstable on this axis"):
+        st.Axis.from_file(path)
+    print_tuning(TuneOptions(str(path), "PIDF", 300.0, 40.0, math.inf, "Ms", 0.0, 1.0, None, tuned), as_json=True)
+    assert st.Axis.from_file(tuned) == AXIS.replace(controller=tune_cascade(AXIS, 300.0, math.radians(40.0)).controller)
+
+
+def test_a_result_is_written_only_where_it_is_stable_at_its_rate(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In continuous time the loop has the margin; held for 20 ms it has none."""
+    path, tuned = tmp_path / "axis.toml", tmp_path / "tuned.toml"
+    text = without(SCREW.dumps(), "kp_", "ki_", "kd_", "filter_time")
+    path.write_text(text.replace("sample_rate_hz = 2000.0", "sample_rate_hz = 50.0"))
+    options = TuneOptions(str(path), "PIDF", 100.0, 50.0, math.inf, "Ms", 0.0, 1.0, None, tuned)
+    with pytest.raises(st.InvalidInput, match="unstable"):
+        print_tuning(options, as_json=False)
+    assert not tuned.exists()
+    assert not capsys.readouterr().out
+    path.write_text(text)
+    print_tuning(options, as_json=False)
+    shown = capsys.readouterr().out
+    assert "present" not in shown
+    assert "written: " in shown
+    found = st.Axis.from_file(tuned)
+    assert found.replace(controller=SCREW.controller) == SCREW
+    assert found.replace(sample_rate=None).margins().gain_crossovers[0].omega == pytest.approx(100.0, rel=1e-9)
+
+
+def test_an_axis_file_without_a_controller_is_tuned_in_continuous_time(tmp_path: Path) -> None:
+    path, tuned = tmp_path / "axis.toml", tmp_path / "tuned.toml"
+    path.write_text(SCREW.dumps().split("[controller]")[0])
+    print_tuning(TuneOptions(str(path), "PIDF", 100.0, 50.0, math.inf, "Ms", 0.0, 1.0, None, tuned), as_json=True)
+    assert st.Axis.from_file(tuned).controller.sample_rate is None
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
