@@ -8,8 +8,9 @@ from functools import cached_property
 from typing import Annotated
 
 from servotwin.commissioning.guarding import Guarding, guarding, start_of
+from servotwin.commissioning.move_time import move_time
 from servotwin.config.keys import key, settings
-from servotwin.control.gains import gains_of
+from servotwin.control.gains import gains_of, with_gains
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates
 from servotwin.edge.guard import Limits
@@ -33,6 +34,7 @@ from servotwin.twin.settings import TwinSettings
 # Seconds here are the servo's own (`plant.scales`).
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+_LONGEST_MOVE, _BEYOND_MOVE = 10.0, 1.5  # windows of the machine's own for which a step is followed; times its duration
 _MOST_SAMPLES = 1e8  # some 10 GB of signals
 
 
@@ -59,7 +61,12 @@ class Recording:
     ] = 5000.0
     window: Annotated[
         float | None,
-        key("window_s", above=0.0, help="Length of a window; where absent it follows from the controller."),
+        key(
+            "window_s",
+            above=0.0,
+            help="Length of a window; where absent it follows from the controller, and is at least one and a half "
+            "times what a step takes with the setting that the servo starts with.",
+        ),
     ] = None
     pre_trigger: Annotated[
         float | None,
@@ -148,9 +155,22 @@ class Commissioning:
         """True for a loop with hardly any integral action, which therefore does not hunt through the gap."""
         return not integrates(self.law) or self.twin.policy == "certified"
 
-    @property
+    @cached_property
     def window(self) -> float:
-        """Length of a window, s."""
+        """Length of a window, s: the machine's own, or one in which a slow loop does most of a step.
+
+        The load touches the other flank where it is slowed down.
+        """
+        own, start = self._own_window, self.start
+        if self.recording.window is not None:
+            return own
+        law, step = with_gains(self.law, start.setting.gains), self.twin.uncertainty.step[1]
+        taken = move_time(self.servo, law, start.setting.tolerance, step, _LONGEST_MOVE * own)
+        return max(own, self._whole(_BEYOND_MOVE * taken))
+
+    @property
+    def _own_window(self) -> float:
+        """Length of a window, s: the one that is given, or as the machine's own time has it."""
         window = self.recording.window
         if window is not None:
             return window
@@ -188,7 +208,7 @@ class Commissioning:
         """Part of a window before the change of the reference, s."""
         pre_trigger = self.recording.pre_trigger
         calm = self._whole(CALM_PRE_TRIGGER * scales(self.servo).time)
-        fits = self.calm and self.window > 2.0 * calm
+        fits = self.calm and self._own_window > 2.0 * calm
         return pre_trigger if pre_trigger is not None else (calm if fits else 0.0)
 
     @property
@@ -212,11 +232,12 @@ class Commissioning:
         if slow:
             raise InvalidInput(f"recording sample_rate_hz: {slow}")
         rate = max(self.recording.sample_rate, self.law.sample_rate or 0.0)
-        check_samples("window", self.recording.longest_window or self.window, rate)
+        window = self._own_window
+        check_samples("window", self.recording.longest_window or window, rate)
         needed, why = self._shortest_window
-        if self.window < needed * (1.0 - 1e-9):
+        if window < needed * (1.0 - 1e-9):
             raise InvalidInput(
-                f"window = {self.window!r} s is too short for {why}: must be at least {needed:.6g} s at "
+                f"window = {window!r} s is too short for {why}: must be at least {needed:.6g} s at "
                 f"{self.recording.sample_rate:g} Hz"
             )
 
