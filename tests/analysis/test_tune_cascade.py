@@ -105,7 +105,7 @@ GAINS = ("position_gain", "velocity_gain_n", "integral_time")
 def test_an_axis_that_cannot_run_yet_is_tuned_and_written(text: str, tmp_path: Path) -> None:
     path, tuned = tmp_path / "axis.toml", tmp_path / "tuned.toml"
     path.write_text(text)
-    with pytest.raises(st.InvalidInput, match="is missing|unstable on this axis"):
+    with pytest.raises(st.InvalidInput, match=r"is missing|unstable on this axis"):
         st.Axis.from_file(path)
     print_tuning(TuneOptions(str(path), "PIDF", 300.0, 40.0, math.inf, "Ms", 0.0, 1.0, None, tuned), as_json=True)
     assert st.Axis.from_file(tuned) == AXIS.replace(controller=tune_cascade(AXIS, 300.0, math.radians(40.0)).controller)
