@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from itertools import pairwise
@@ -12,12 +13,13 @@ import numpy as np
 from rich.table import Table
 
 from servotwin.cosim import Loop
-from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.plant.display_units import position_unit
 from servotwin.simulation import Run
 
 _ENDS, _RESTS, _COUNTS = 0.1, 0.01, 2.0
 """Last part of a step in which it must rest; largest error there, of the step; and counts of the sensor beside it."""
+_NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
 _CHANGES = 0.02
 """Of the samples: a reference that changes in more of them does not step."""
 
@@ -85,6 +87,12 @@ def _of_estimates(loop: Loop) -> Iterator[str]:
     for status, count in Counter(each.status for each in others).items():
         reasons = (reason for each in others if each.status is status for reason in each.reasons[:1])
         yield f"  {count} {status}: {_most(reasons)}"
+    if all(each.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND) for each in loop.estimates):
+        length = loop.scenario.commissioning.window
+        yield (
+            f"  no window of {length:.3g} s tells both flanks: record longer ones ([recording] window_s), or let the twin "
+            "request them, and moves ([twin.excitation])"
+        )
 
 
 def _of_settings(loop: Loop) -> Iterator[str]:
@@ -125,7 +133,7 @@ def true_gap(loop: Loop, estimate: GapEstimate) -> float:
 
 def window_table(loop: Loop) -> Table:
     """A line for each window: the gap, its estimate, and the setting."""
-    table = Table(box=None)
+    table = Table(box=None, padding=(0, 1, 0, 0))  # 80 columns
     for heading in ("time, s", "gap, deg", "estimate, deg", "95 % interval, deg"):
         table.add_column(heading, justify="right")
     table.add_column("status")
@@ -145,11 +153,11 @@ def window_table(loop: Loop) -> Table:
 
 
 def reasons(loop: Loop) -> Iterator[str]:
-    """Reasons why windows gave no setting, or the fallback set, each with its windows."""
-    times: dict[str, list[float]] = {}
+    """Reasons why windows gave no setting, or the fallback set; those that differ by their numbers only count as one."""
+    alike: dict[str, list[tuple[float, str]]] = {}
     for each, redesign in zip(loop.estimates, loop.redesigns, strict=True):
         if redesign.reason:
-            times.setdefault(redesign.reason, []).append(each.time)
-    for reason, windows in times.items():
-        others = "" if len(windows) == 1 else f" and {len(windows) - 1} more"
-        yield f"  {windows[0]:.4g} s{others}: {reason}"
+            alike.setdefault(_NUMBER.sub("", redesign.reason), []).append((each.time, redesign.reason))
+    for (time, reason), *others in alike.values():
+        more = f" and {len(others)} more, the first" if others else ""
+        yield f"  {time:.4g} s{more}: {reason}"

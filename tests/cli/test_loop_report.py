@@ -85,14 +85,36 @@ def test_the_report_says_what_the_twin_found(loop: Loop) -> None:
     assert f"{truth:.4g}" in text
 
 
+def test_where_no_window_tells_both_flanks_longer_ones_are_named(loop: Loop) -> None:
+    assert "[twin.excitation]" not in told(loop)
+    unseen = [replace(each, status=GapStatus.UNIDENTIFIABLE, reasons=("one flank",)) for each in loop.estimates]
+    assert "no window of 2 s tells both flanks: record longer ones ([recording] window_s)" in told(
+        replace(loop, estimates=tuple(unseen))
+    )
+
+
+def test_a_window_takes_one_line_of_a_terminal(loop: Loop) -> None:
+    worst = [replace(each, status=GapStatus.MODEL_MISMATCH, interval=(0.01234, 0.12345)) for each in loop.estimates]
+    sent = [replace(each, reason="the fallback set is sent", setting=loop.updates[0]) for each in loop.redesigns]
+    console = Console(record=True, width=80)
+    console.print(window_table(replace(loop, estimates=tuple(worst), redesigns=tuple(sent))))
+    assert len(console.export_text().splitlines()) == 1 + len(worst)
+
+
 def test_every_window_without_a_setting_has_a_reason(loop: Loop) -> None:
     assert list(reasons(loop)) == []
     first, *others = loop.redesigns
     kept = [Redesign(None, math.nan, "in force already")] * len(others)
     found = list(reasons(replace(loop, redesigns=(replace(first, reason="the fallback set is sent"), *kept))))
     times = [each.time for each in loop.estimates]
-    more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+    more = f" and {len(others) - 1} more, the first" if len(others) > 1 else ""
     assert found == [f"  {times[0]:.4g} s: the fallback set is sent", f"  {times[1]:.4g} s{more}: in force already"]
+
+
+def test_reasons_that_differ_by_their_numbers_only_are_one(loop: Loop) -> None:
+    grows = [replace(each, reason=f"may grow to {1.5 + n} deg") for n, each in enumerate(loop.redesigns)]
+    (line,) = reasons(replace(loop, redesigns=tuple(grows)))
+    assert line.endswith(f"s and {len(grows) - 1} more, the first: may grow to 1.5 deg")
 
 
 def test_simulate_shows_the_report_and_writes_what_is_asked_for(file: Path, tmp_path: Path) -> None:
