@@ -90,8 +90,8 @@ def _of_estimates(loop: Loop) -> Iterator[str]:
     if all(each.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND) for each in loop.estimates):
         length = loop.scenario.commissioning.window
         yield (
-            f"  no window of {length:.3g} s tells both flanks: record longer ones ([recording] window_s), or let the twin "
-            "request them, and moves ([twin.excitation])"
+            f"  no window of {length:.3g} s tells both flanks: record longer ones ([recording] window_s), or let the "
+            "twin request them, and moves ([twin.excitation])"
         )
 
 
@@ -153,7 +153,7 @@ def window_table(loop: Loop) -> Table:
 
 
 def reasons(loop: Loop) -> Iterator[str]:
-    """Reasons why windows gave no setting, or the fallback set; those that differ by their numbers only count as one."""
+    """Reasons why windows gave no setting, or the fallback set; those that differ by numbers only count as one."""
     alike: dict[str, list[tuple[float, str]]] = {}
     for each, redesign in zip(loop.estimates, loop.redesigns, strict=True):
         if redesign.reason:
