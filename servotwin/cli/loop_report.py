@@ -90,8 +90,8 @@ def _of_estimates(loop: Loop) -> Iterator[str]:
     if all(each.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND) for each in loop.estimates):
         length = loop.scenario.commissioning.window
         yield (
-            f"  no window of {length:.3g} s tells both flanks: record longer ones ([recording] window_s), or let the "
-            "twin request them, and moves ([twin.excitation])"
+            f"  no window of {length:.3g} s tells both flanks: record longer ones, best with a move each way "
+            "([recording] window_s), or let the twin request them, and moves ([twin.excitation])"
         )
 
 

@@ -88,7 +88,7 @@ def test_the_report_says_what_the_twin_found(loop: Loop) -> None:
 def test_where_no_window_tells_both_flanks_longer_ones_are_named(loop: Loop) -> None:
     assert "[twin.excitation]" not in told(loop)
     unseen = [replace(each, status=GapStatus.UNIDENTIFIABLE, reasons=("one flank",)) for each in loop.estimates]
-    assert "no window of 2 s tells both flanks: record longer ones ([recording] window_s)" in told(
+    assert "no window of 2 s tells both flanks: record longer ones, best with a move each way" in told(
         replace(loop, estimates=tuple(unseen))
     )
 
