@@ -34,6 +34,7 @@ from servotwin.twin.settings import TwinSettings
 # Seconds here are the servo's own (`plant.scales`).
 WINDOW = 1.0  # s, section 4.2
 CALM_WINDOW, CALM_PRE_TRIGGER = 2.0, 0.3  # s
+_LONGEST_REQUEST = 2.0  # windows of a slow loop, at least
 _LONGEST_MOVE, _BEYOND_MOVE = 10.0, 1.5  # windows of the machine's own for which a step is followed; times its duration
 _MOST_SAMPLES = 1e8  # some 10 GB of signals
 
@@ -182,6 +183,8 @@ class Commissioning:
     def with_longest(self, window: float, pre_trigger: float, samples: int) -> Commissioning:
         """The same with the longest window and pre-trigger that the twin may request, in the servo's own seconds.
 
+        For a slow loop that is at least twice its window.
+
         Raises
         ------
         InvalidInput
@@ -194,7 +197,9 @@ class Commissioning:
                 f"window = {self.window!r} s: {count}; the twin takes at most samples_per_window = {samples}"
             )
         second = scales(self.servo).time
-        longest = max(min(self._whole(window * second), samples / rate), self.window)
+        slow = self.window > self._own_window
+        allowed = max(self._whole(window * second), _LONGEST_REQUEST * self.window if slow else 0.0)
+        longest = max(min(allowed, samples / rate), self.window)
         before = max(self._whole(min(pre_trigger * second, longest / 2.0)), self.pre_trigger)
         recording = dataclasses.replace(self.recording, longest_window=longest, longest_pre_trigger=before)
         return dataclasses.replace(self, recording=recording)

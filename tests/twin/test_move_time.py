@@ -66,3 +66,8 @@ def test_windows_of_a_slow_loop_contain_where_the_load_is_slowed_down() -> None:
 
 def test_a_window_that_is_given_stays() -> None:
     assert edge(0.05).window == 0.05
+
+
+def test_the_twin_may_request_windows_of_a_slow_loop_twice_as_long() -> None:
+    slow = edge().with_longest(4.0, 0.3, 250_000)
+    assert slow.recording.longest_window == pytest.approx(2.0 * edge().window)
