@@ -140,10 +140,9 @@ def print_cascade(axis: Axis, own: Cascade, request: TuneOptions, as_json: bool)
         table.add_row(name, *shown[: len(heads)])
     console = Console()
     console.print(table, highlight=False)
-    console.print(
-        f"velocity loop, crossover (phase margin): {request.crossover:.4f} rad/s ({request.phase_margin_deg:.2f} deg)",
-        highlight=False,
-    )
+    if own.velocity_gain is not None:
+        inner = f"{request.crossover:.4f} rad/s ({request.phase_margin_deg:.2f} deg)"
+        console.print(f"velocity loop, crossover (phase margin): {inner}", highlight=False)
     outer = f"{tuned.position_crossover:.4f} rad/s ({math.degrees(tuned.position_margin):.2f} deg)"
     console.print(f"position loop, crossover (phase margin): {outer}", highlight=False)
     console.print(f"at the command, crossovers (phase margins): {_crossovers(tuned.margins)}", highlight=False)

@@ -148,11 +148,6 @@ TRANSMISSIONS: Mapping[str, Maker] = {"screw": screw, "gear": gear}
 LOADS: Mapping[str, Maker] = {"linear": linear_load, "rotary": rotary_load}
 LAWS: Mapping[str, Maker] = {**CONTROLLERS, LINEAR_LAW: linear_law}
 """Controllers that the file of an axis can describe, by their key `kind`."""
-UNTUNED: Mapping[str, AnyController] = {
-    FILTERED_PID: Controller(0.0, 0.0, 0.0, 1.0),
-    CASCADE: Cascade(0.0, 1.0, velocity_gain=1.0),
-}
-"""Controllers whose gains stand for those that a file to be tuned may lack."""
 _MASSES = {LINEAR: "mass_kg", ROTARY: "inertia_kg_m2"}
 _MOTIONS = {"screw": LINEAR, "gear": ROTARY}
 
@@ -170,7 +165,7 @@ class Parts(NamedTuple):
 def read_parts(table: Table, folder: Path, tuned: bool = True) -> Parts:
     """Read the parts of an axis from its file's table, to the last key; paths are relative to `folder`.
 
-    Where the axis is not `tuned` yet, the controller or its gains may be missing: `UNTUNED` stands for them.
+    Where the axis is not `tuned` yet, the controller or its gains may be missing.
 
     Raises
     ------
@@ -209,9 +204,16 @@ def _read_controller(table: Table, folder: Path, unit: str, motion: str, ratio: 
     controller = table.in_units(units)
     controller.known("kind")
     own = {"ratio": ratio} if kind != FILTERED_PID and units.key("travel_m_per_rad") not in controller.values else {}
-    law: AnyController = read(controller, LAWS[kind], folder, None if tuned else UNTUNED.get(kind), **own)
+    law: AnyController = read(controller, LAWS[kind], folder, None if tuned else _untuned(kind, unit), **own)
     controller.done()
     return law
+
+
+def _untuned(kind: str, unit: str) -> AnyController | None:
+    """A controller whose gains stand for those that a file to be tuned may lack; None: of this kind none is tuned."""
+    if kind == CASCADE:
+        return Cascade(0.0, 1.0, velocity_gain=None if unit == "rad/s" else 1.0)
+    return Controller(0.0, 0.0, 0.0, 1.0) if kind == FILTERED_PID else None
 
 
 def units_of(command: str, motion: str) -> OwnUnits:

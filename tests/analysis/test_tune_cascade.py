@@ -61,8 +61,33 @@ def test_a_margin_that_no_pi_reaches_is_refused_with_what_can_be() -> None:
 
 
 def test_other_controllers_are_refused() -> None:
-    with pytest.raises(st.InvalidInput, match="must be a cascade with a velocity_gain"):
+    with pytest.raises(st.InvalidInput, match="must be a cascade to be tuned as one"):
         tune_cascade(SCREW, 300.0, 1.0)
+
+
+STAGE = st.Axis(
+    st.VelocityDrive(2e-3), st.Transmission(1e-3), st.Load(m=(1.0,), k=(0.0,), c=(1.0,)), st.Cascade(0.0, ratio=1e-3)
+)
+
+
+def test_a_drive_that_closes_the_velocity_loop_leaves_the_position_loop() -> None:
+    """Position gain over s (1 + 2 ms s)."""
+    tuned = tune_cascade(STAGE, 100.0, math.radians(70.0))
+    assert tuned.controller.position_gain == pytest.approx(100.0 * math.hypot(1.0, 0.2))
+    assert tuned.controller.replace(position_gain=0.0) == STAGE.controller
+    assert tuned.position_margin == pytest.approx(0.5 * math.pi - math.atan(0.2))
+    assert tuned.position_crossover == 100.0
+    with pytest.raises(st.InvalidInput, match=r"phase margin = 80 deg: the position loop has 78\.7 deg at 100 rad/s"):
+        tune_cascade(STAGE, 100.0, math.radians(80.0))
+
+
+def test_its_file_needs_no_gain_to_be_tuned(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "axis.toml"
+    path.write_text(without(STAGE.dumps(), *GAINS))
+    print_tuning(TuneOptions(str(path), "PIDF", 100.0, 70.0, math.inf, "Ms", 0.0, 1.0, None), as_json=False)
+    shown = capsys.readouterr().out
+    assert "position_gain_per_s  101.98" in shown
+    assert "velocity loop" not in shown
 
 
 def test_an_unstable_result_names_the_gains_as_the_file_does() -> None:

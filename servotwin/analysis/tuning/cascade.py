@@ -53,9 +53,9 @@ def tune_cascade(
     axis : Axis
         Its cascade gives filters, notch, feedforwards, limits and rate of the result.
     crossover : float
-        rad/s, of the velocity loop (abs = 1).
+        rad/s, of the velocity loop (abs = 1); of the position loop where the drive closes the velocity loop.
     phase_margin : float
-        rad, of the velocity loop there; without integral action the least.
+        rad, of that loop there; without integral action the least.
     position_crossover : float, optional
         rad/s, of the position loop; a fifth of `crossover` by default.
     integral : bool
@@ -66,22 +66,35 @@ def tune_cascade(
     Raises
     ------
     InvalidInput
-        The controller is no cascade with a velocity loop, a value is out of its range, the margin cannot be reached at
-        this crossover, or the whole loop is unstable.
+        The controller is no cascade, a value is out of its range, the margin cannot be reached at this crossover, or
+        the whole loop is unstable.
     """
     own = axis.controller
-    if not isinstance(own, Cascade) or own.velocity_gain is None:
-        raise InvalidInput(f"controller = {own!r}: must be a cascade with a velocity_gain to be tuned as one")
+    if not isinstance(own, Cascade):
+        raise InvalidInput(f"controller = {own!r}: must be a cascade to be tuned as one")
+    if own.velocity_gain is None:
+        _check(crossover, crossover, phase_margin, delay)
+        tuned = _position_loop(axis, own, crossover, delay)
+        if tuned.position_margin < phase_margin:
+            raise InvalidInput(
+                f"phase margin = {math.degrees(phase_margin):g} deg: the position loop has "
+                f"{math.degrees(tuned.position_margin):.3g} deg at {crossover:g} rad/s; lower one of them"
+            )
+        return tuned
     outer = crossover / _APART if position_crossover is None else position_crossover
     _check(crossover, outer, phase_margin, delay)
-    law = _velocity_loop(axis, own, crossover, phase_margin, integral, delay)
-    forward = _position_response(axis, law, outer, delay)
+    return _position_loop(axis, _velocity_loop(axis, own, crossover, phase_margin, integral, delay), outer, delay)
+
+
+def _position_loop(axis: Axis, law: Cascade, crossover: float, delay: float) -> CascadeTuning:
+    """The cascade with the position gain for a crossover, where the loop is stable."""
+    forward = _position_response(axis, law, crossover, delay)
     law = law.replace(position_gain=1.0 / abs(forward))
     axis.check_loop(law)
     running = law.linear()
     whole = axis.margins(running if running.sample_rate is None else running.held())
     # The angle of -L.
-    return CascadeTuning(law, outer, cmath.phase(-forward), whole)
+    return CascadeTuning(law, crossover, cmath.phase(-forward), whole)
 
 
 def _check(crossover: float, outer: float, phase_margin: float, delay: float) -> None:
