@@ -12,7 +12,7 @@ export function chainTable(traces, gaps, unit) {
   const steps = traces.flatMap((trace) => trace.steps.map((step) => ({ trace, step })));
   const open = element("p", { class: "soft" }, newestDecision(gaps, steps.length > 0));
   if (!steps.length) return open;
-  const heads = ["Version", "Sent", "Window", "Gap, deg (95 %)", "Setting", "Verified on", "The edge", `Error at the end, before → after (${unit.name})`];
+  const heads = ["Version", "Sent", "Window", "Gap, deg (95 %)", "Setting", "Verified on", "The edge", `End error, before → after (${unit.name})`];
   const table = element("table", {},
     element("thead", {}, element("tr", {}, heads.map((head) => element("th", { scope: "col" }, head)))),
     element("tbody", {}, steps.sort((a, b) => b.step.update.version - a.step.update.version).map(({ trace, step }) => row(trace, step, unit, gaps.machine))));
@@ -32,7 +32,7 @@ function row(trace, step, unit, machine) {
   const half = body.interval && body.interval[0] !== null ? body.interval : null;
   return element("tr", {},
     cell(String(step.update.version), true), cell(stamp(step.update.created), true), cell(`${trace.window.sequence}`, true),
-    cell(gapText(body.gap ?? null, half), true), cell(settingText(body.setting ?? {}, unit, machine)),
+    cell(gapText(body.gap ?? null, half), true), element("td", { class: "setting" }, settingText(body.setting ?? {}, unit, machine)),
     cell(verification ? `${verification.members} simulated machines` : "not simulated"),
     cell(answerText(step)), cell(refused(step) ? "" : effectText(step.effect, unit), true));
 }
