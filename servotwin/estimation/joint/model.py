@@ -25,6 +25,7 @@ from servotwin.plant.signals import Array
 Reduce: TypeAlias = Callable[[Array], Array]
 MOTOR_START = ("speed0", "current0")  # rad/s and A at the first sample, when only the voltage is known
 JUMP = "jump "  # V s: what a jump of the voltage between two samples adds to the area of the line between them
+_DRAWS = 40  # of the encoders' rounding: standard deviations are known to a tenth
 _EDGE = 2  # samples that interpolation needs beyond the shift
 _ROUNDING = 1e-9  # of a derivative: a smaller remainder beside the nuisances is rounding
 _MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0  # jumps; least size of one: of the range, over the usual difference
@@ -189,6 +190,21 @@ class JointModel:
             **dict(zip(tangents, moved, strict=True)),
         }
 
+    def rounding(self, values: Mapping[str, float], seed: int) -> Array:
+        """(e, n - 2 margin) changes of the position by the encoders' rounding, drawn; none where counts are unknown.
+
+        Samples that show the same count have the same error: it averages out less than noise does.
+        """
+        servo, theta_m, at = self.screw(values)
+        random = np.random.default_rng(seed)
+        if self.window.theta_m is None or not (servo.encoder_resolution or servo.position_resolution):
+            return np.empty((0, self.measured.size))
+        of_motor = _dither(theta_m, servo.encoder_resolution, random)
+        of_position = _dither(self.window.position, servo.position_resolution, random)
+        structure = structure_family(servo).select(()).sampled(self.rate)
+        moved = structure.plain(through_gap(of_motor, theta_m, at))
+        return self.delayed(moved, values.get("delay", 0.0) * self.rate) + self.delayed(of_position, 0.0)
+
     def _row(self, row: Array, name: str, shift: float) -> Array:
         if name != "delay":
             return self.delayed(row[None], shift)[0]
@@ -208,6 +224,14 @@ class JointModel:
             (weight * rows[:, first + j : first + j + size] for j, weight in enumerate(weights)),
             start=np.zeros((len(rows), size)),
         )
+
+
+def _dither(channel: Array, count: float, random: np.random.Generator) -> Array:
+    """(e, n) errors of a channel (n,) that comes in counts, equally likely: one for each run of equal counts."""
+    if count == 0.0:
+        return np.zeros((_DRAWS, channel.size))
+    runs = np.cumsum(np.append(0, np.diff(np.round(channel / count)) != 0.0))
+    return count * random.uniform(-0.5, 0.5, (_DRAWS, int(runs[-1]) + 1))[:, runs]
 
 
 def jumps(voltage: Array) -> tuple[int, ...]:
