@@ -34,6 +34,9 @@ WIDE = OutputErrorSettings(stiffness=0.2, damping=1.0, mass_ratio=0.1, ratio=0.0
 """Spreads of a joint estimate: a stiffness may be off by two thirds, a ratio by 7 %, a damping by any factor."""
 
 _DOUBT = 2.0  # the noise's spectrum and the contacts come from the same window: tails are longer than normal
+# Standard deviations of what the model leaves out, of logarithms by the unknown's unit: no window tells a stiffness, a
+# friction or a damping better.
+_UNMODELLED = {"factor": 1e-2, "damping": 2e-2}
 _PRIOR = 0.9  # of what was known: where no less is left, the window tells nothing
 
 
@@ -107,13 +110,18 @@ class AxisFit:
         if search is None:
             return {}
         scale = self.settings.calibration
-        found = {name: scale * std for name, std in zip(self.places, _spreads(search, self.places), strict=True)}
+        computed = zip(self.places, _spreads(search, self.places), strict=True)
+        found = {name: math.hypot(scale * std, self._unmodelled(name)) for name, std in computed}
         if possible is not None:
             found["ratio"] = scale * math.hypot(possible.ratio_std, moved_by_growth(search))
         elif self.reading is not None:
             spreads = np.sqrt(np.array(self.reading.covariance).reshape(4, 4).diagonal()).tolist()
             found.update((name, spreads[at]) for name, at in LEARNT.items() if name in found)
         return found
+
+    def _unmodelled(self, name: str) -> float:
+        """Standard deviation of a number by what the model leaves out."""
+        return 0.0 if name == "ratio" else _UNMODELLED.get(self.unknown(name).unit, 0.0)
 
     def parameters(self) -> dict[str, Parameter]:
         """The fitted numbers in their own units."""

@@ -32,6 +32,7 @@ from servotwin.estimation.joint.fit import (
     descend,
     gap_of,
     searched,
+    spread_by_rounding,
     tolerance_of,
     unsearched,
 )
@@ -122,11 +123,9 @@ class SharedFit:
         prior, slope = (point - known.mean) / known.spread, np.diag(1.0 / known.spread)
         return FitPoint(point, np.concatenate([*residuals, prior]), np.hstack([*blocks, slope]))
 
-    def rounding(self, point: Array) -> Array:
-        """(e, M) errors of the residual that the encoders' rounding makes; none where counts are unknown."""
-        parts = zip(self.fits, self.places, strict=True)
-        each = [fit.rounding(point[place], seed) for seed, (fit, place) in enumerate(parts)]
-        return np.hstack([*each, np.zeros((len(each[0]), self.size))])
+    def shaken(self, random: np.random.Generator) -> SharedFit:
+        """The windows with other errors of rounding."""
+        return replace(self, fits=tuple(fit.shaken(random) for fit in self.fits))
 
     def solved(self) -> tuple[FitPoint, tuple[tuple[float, ...], ...]]:
         """Find the best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
@@ -217,7 +216,7 @@ def _of_axis(
     hold = InputHold.LINEAR if axis.controller.sample_rate is None else InputHold.CONSTANT
     driven = [window.driven(axis.command_limit) for window in windows]
     found = _of_servo(driven, servo_of(axis), free, prior, replace(chosen, hold=chosen.hold or hold))
-    return of_servos_axis(found, axis)
+    return of_servos_axis(found, axis, windows[0].sample_rate)
 
 
 def _checked_settings(settings: JointSettings | OutputErrorSettings | None, kind: type[Settings]) -> Settings | None:
@@ -336,8 +335,10 @@ def _alone(fit: WindowMinima) -> JointFit:
     best = fit.best
     rivals = tuple(float(one.point[0]) for one in fit.minima[1:] if one.cost < best.cost + RIVAL)
     objection = fit.blocked or _doubt(best.converged, float(best.point[0]), rivals)
-    rounding = fit.rounding(best.point)
-    covariance = best.covariance() + best.spread_by(np.hstack([rounding, np.zeros((len(rounding), best.point.size))]))
+    rounding = spread_by_rounding(
+        fit.model.servo, best, lambda random: fit.shaken(random).evaluated(fit.known)(best.point)
+    )
+    covariance = best.covariance() + rounding
     return JointFit(fit.model, best.point, covariance, fit.evaluations, objection)
 
 
@@ -345,7 +346,8 @@ def _joined(fits: Sequence[WindowMinima], alone: Sequence[JointFit], settings: J
     """Fit the windows together; one whose gap moves by more than its spread contradicts the others."""
     whole = SharedFit.of(fits)
     best, rivals = whole.solved()
-    covariance, results = best.covariance() + best.spread_by(whole.rounding(best.point)), []
+    rounding = spread_by_rounding(fits[0].model.servo, best, lambda random: whole.shaken(random).evaluate(best.point))
+    covariance, results = best.covariance() + rounding, []
     for before, place, others in zip(alone, whole.places, rivals, strict=True):
         point = best.point[place]
         objection = _doubt(best.converged, float(point[0]), others)

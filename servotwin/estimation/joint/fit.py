@@ -73,13 +73,12 @@ class FitPoint:
         np.fill_diagonal(covariance, self.deviations() ** 2)
         return covariance
 
-    def spread_by(self, errors: Array) -> Array:
-        """(P, P) covariance of the minimum by errors (e, m + P) of the residual, each as likely; none without any."""
+    def step(self) -> Array:
+        """(P,) Gauss-Newton step."""
         scale = np.linalg.norm(self.jacobian, axis=1)
         scale[scale == 0.0] = 1.0
         scaled = self.jacobian / scale[:, None]
-        moved = np.linalg.pinv(scaled @ scaled.T, hermitian=True) @ (scaled @ errors.T) / scale[:, None]
-        return np.asarray(moved @ moved.T / max(1, len(errors)))
+        return -np.linalg.pinv(scaled @ scaled.T, hermitian=True) @ (scaled @ self.residual) / scale
 
 
 Evaluate: TypeAlias = Callable[[Array], FitPoint]
@@ -249,6 +248,7 @@ RIVAL, APART = 12.0, math.radians(0.3)  # a rival's cost is as near; minima clos
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
 _WIDER = 1.25  # factor between wider gaps, where the largest is beyond the paper's
 _STARTS = 3
+_DRAWS = 16  # of rounding: standard deviations are known to a fifth
 # Rate after decimation, in the servo's own seconds: at a lower one the noise model fits itself to the residual.
 _SAMPLES_HZ = 250.0
 
@@ -287,14 +287,26 @@ class WindowMinima:
         """Whitened residual and derivatives as a function of the point."""
         return lambda point: _evaluate_at(self.model, point, known, self.whitened)
 
-    def rounding(self, point: Array, seed: int = 0) -> Array:
-        """(e, m) errors of the residual, whitened, that the encoders' rounding makes; none where counts are unknown."""
-        values = dict(zip(self.model.names, point.tolist(), strict=True))
-        return self.whitened(self.model.rounding(values, seed))
+    def shaken(self, random: np.random.Generator) -> WindowMinima:
+        """The window with other errors of rounding."""
+        return replace(self, model=self.model.shaken(random))
 
     def whitened(self, rows: Array) -> Array:
         """(k, m) reduced and whitened rows (k, n)."""
         return self.noise.whiten(self.reduce.rows(rows))
+
+
+def spread_by_rounding(servo: Servo, best: FitPoint, shaken: Callable[[np.random.Generator], FitPoint]) -> Array:
+    """(P, P) covariance of a minimum by the rounding of encoders with known counts; 0 without any.
+
+    A step from the minimum in windows whose errors of rounding are others, which `shaken` draws and evaluates: also in
+    these the errors bend the derivatives, so that the covariance contains the bias that rounding makes.
+    """
+    if not (servo.encoder_resolution or servo.position_resolution):
+        return np.zeros((best.point.size, best.point.size))
+    random, own = np.random.default_rng(0), best.step()
+    moves = np.array([shaken(random).step() - own for _ in range(_DRAWS)])
+    return np.asarray(moves.T @ moves / _DRAWS)
 
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, through_gap
+from servotwin.estimation.core.counts import errors_between, errors_of_counts
 from servotwin.estimation.core.family import STRUCTURE, InputHold, Sampled, motor_family, structure_family
 from servotwin.estimation.core.least_squares import orthonormal, project_out
 from servotwin.estimation.window import Window
@@ -25,7 +26,6 @@ from servotwin.plant.signals import Array
 Reduce: TypeAlias = Callable[[Array], Array]
 MOTOR_START = ("speed0", "current0")  # rad/s and A at the first sample, when only the voltage is known
 JUMP = "jump "  # V s: what a jump of the voltage between two samples adds to the area of the line between them
-_DRAWS = 40  # of the encoders' rounding: standard deviations are known to a tenth
 _EDGE = 2  # samples that interpolation needs beyond the shift
 _ROUNDING = 1e-9  # of a derivative: a smaller remainder beside the nuisances is rounding
 _MOST_JUMPS, _TELLING, _USUAL = 16, 1e-3, 10.0  # jumps; least size of one: of the range, over the usual difference
@@ -190,20 +190,17 @@ class JointModel:
             **dict(zip(tangents, moved, strict=True)),
         }
 
-    def rounding(self, values: Mapping[str, float], seed: int) -> Array:
-        """(e, n - 2 margin) changes of the position by the encoders' rounding, drawn; none where counts are unknown.
-
-        Samples that show the same count have the same error: it averages out less than noise does.
-        """
-        servo, theta_m, at = self.screw(values)
-        random = np.random.default_rng(seed)
-        if self.window.theta_m is None or not (servo.encoder_resolution or servo.position_resolution):
-            return np.empty((0, self.measured.size))
-        of_motor = _dither(theta_m, servo.encoder_resolution, random)
-        of_position = _dither(self.window.position, servo.position_resolution, random)
-        structure = structure_family(servo).select(()).sampled(self.rate)
-        moved = structure.plain(through_gap(of_motor, theta_m, at))
-        return self.delayed(moved, values.get("delay", 0.0) * self.rate) + self.delayed(of_position, 0.0)
+    def shaken(self, random: np.random.Generator) -> JointModel:
+        """The model of a window that has other errors of the encoders' rounding as well, equally likely."""
+        window, servo = self.window, self.servo
+        channels = {}
+        if servo.encoder_resolution > 0.0 and window.theta_m is not None:
+            channels["theta_m"] = window.theta_m + errors_between(window.theta_m, servo.encoder_resolution, random)
+        if servo.position_resolution > 0.0:
+            channels["position"] = window.position + errors_of_counts(
+                window.position, servo.position_resolution, random
+            )
+        return replace(self, window=window.replace(**channels))
 
     def _row(self, row: Array, name: str, shift: float) -> Array:
         if name != "delay":
@@ -224,14 +221,6 @@ class JointModel:
             (weight * rows[:, first + j : first + j + size] for j, weight in enumerate(weights)),
             start=np.zeros((len(rows), size)),
         )
-
-
-def _dither(channel: Array, count: float, random: np.random.Generator) -> Array:
-    """(e, n) errors of a channel (n,) that comes in counts, equally likely: one for each run of equal counts."""
-    if count == 0.0:
-        return np.zeros((_DRAWS, channel.size))
-    runs = np.cumsum(np.append(0, np.diff(np.round(channel / count)) != 0.0))
-    return count * random.uniform(-0.5, 0.5, (_DRAWS, int(runs[-1]) + 1))[:, runs]
 
 
 def jumps(voltage: Array) -> tuple[int, ...]:
