@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapEstimate, MachineReading
+from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.joint.axis_numbers import adapted, own_number
 from servotwin.estimation.joint.verdict import METHOD, JointEstimate, Parameter
 from servotwin.estimation.output_error.estimator import FittedWindow, fitted
@@ -37,6 +37,7 @@ _DOUBT = 2.0  # the noise's spectrum and the contacts come from the same window:
 # Standard deviations of what the model leaves out, of logarithms by the unknown's unit: no window tells a stiffness, a
 # friction or a damping better.
 _UNMODELLED = {"factor": 1e-2, "damping": 2e-2}
+_COUNTS, _LATE = 0.5, 0.1  # the same of the travel that shows the ratio, in counts, and of a delay, in samples
 _PRIOR = 0.9  # of what was known: where no less is left, the window tells nothing
 
 
@@ -52,17 +53,24 @@ class AxisFit:
     known : FactorPrior, optional
         None: of this kind of axis windows tell each other nothing.
     settings : OutputErrorSettings
+    others : bool
+        True where what was known is of another window.
     """
 
     axis: Axis
     fit: FittedWindow
     known: FactorPrior | None
     settings: OutputErrorSettings
+    others: bool = False
 
-    @property
+    @cached_property
     def gap(self) -> GapEstimate:
         """The window's estimate; the model is the axis as stated."""
-        return replace(self.fit.estimate, method=METHOD, model_version=self.axis.version, machine=None)
+        found = self.fit.estimate
+        reasons = found.reasons
+        if self.others and found.status is GapStatus.MODEL_MISMATCH:
+            reasons = tuple(f"fitted with what another window tells of the machine, {reason}" for reason in reasons)
+        return replace(found, method=METHOD, model_version=self.axis.version, machine=None, reasons=reasons)
 
     @property
     def reading(self) -> MachineReading | None:
@@ -120,8 +128,12 @@ class AxisFit:
         return found
 
     def _unmodelled(self, name: str) -> float:
-        """Standard deviation of a number by what the model leaves out."""
-        return 0.0 if name == "ratio" else _UNMODELLED.get(self.unknown(name).unit, 0.0)
+        """Standard deviation of a number by what does not average out."""
+        assert self.fit.search is not None
+        problem, unit = self.fit.search.problem, self.unknown(name).unit
+        if name == "ratio":
+            return _COUNTS * problem.count / float(np.ptp(problem.position))
+        return _LATE * problem.interval if unit == "time" else _UNMODELLED[unit]
 
     def parameters(self) -> dict[str, Parameter]:
         """The fitted numbers in their own units."""
@@ -224,4 +236,4 @@ def _with_others(fits: Sequence[AxisFit], place: int, window: Window) -> AxisFit
     # Windows alike tell no more than one of them: what the model leaves out does not average.
     best = min(readings, key=lambda reading: float(np.linalg.slogdet(reading.covariance)[1]))
     again = fitted(window, own.axis, own.gap if own.gap.ok else None, own.settings, best)
-    return AxisFit(own.axis, again, best, own.settings)
+    return AxisFit(own.axis, again, best, own.settings, others=True)

@@ -124,8 +124,9 @@ class SharedFit:
         return FitPoint(point, np.concatenate([*residuals, prior]), np.hstack([*blocks, slope]))
 
     def shaken(self, random: np.random.Generator) -> SharedFit:
-        """The windows with other errors of rounding."""
-        return replace(self, fits=tuple(fit.shaken(random) for fit in self.fits))
+        """The windows with other errors of rounding, which repeat with a motion that repeats."""
+        seed = int(random.integers(2**32))
+        return replace(self, fits=tuple(fit.shaken(np.random.default_rng(seed)) for fit in self.fits))
 
     def solved(self) -> tuple[FitPoint, tuple[tuple[float, ...], ...]]:
         """Find the best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
