@@ -73,6 +73,7 @@ def test_an_axis_s_angle_is_computed_from_the_voltage_of_the_paper_s_motor() -> 
     assert found.servo.actuator.k_B == pytest.approx(PAPER.k_B, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_free_shaft_s_numbers_are_found_where_the_gap_s_own_fit_refuses_them() -> None:
     window, gap = ball_screw(stiffness=1.5, friction=1.3), 4.0 * GAP
     refused = st.estimate_gap(window, BALL_SCREW)
@@ -91,6 +92,7 @@ def test_a_free_shaft_s_numbers_are_found_where_the_gap_s_own_fit_refuses_them()
     assert math.sqrt(found.covariance[0, 0]) == pytest.approx(found.gap.std)
 
 
+@pytest.mark.slow
 def test_an_axis_with_the_fitted_numbers_needs_no_other_ones() -> None:
     window = ball_screw(stiffness=0.7)
     first = st.estimate_jointly(window, BALL_SCREW)
@@ -101,6 +103,7 @@ def test_an_axis_with_the_fitted_numbers_needs_no_other_ones() -> None:
         assert again.parameters[name].factor == pytest.approx(1.0, abs=3e-3)
 
 
+@pytest.mark.slow
 def test_the_settings_of_a_free_shaft_s_fit_say_what_is_known() -> None:
     narrow = dataclasses.replace(WIDE, stiffness=0.05)
     found = st.estimate_jointly(ball_screw(stiffness=1.5), BALL_SCREW, settings=narrow)
@@ -108,15 +111,20 @@ def test_the_settings_of_a_free_shaft_s_fit_say_what_is_known() -> None:
     assert "stiffness" in found.gap.reasons[0]
 
 
-def test_windows_of_one_free_shaft_agree_and_of_two_contradict() -> None:
-    one, same, other = ball_screw(), ball_screw(worn=8.0), ball_screw(stiffness=0.8)
-    agreeing = st.estimate_jointly([one, same], BALL_SCREW)
-    assert [gap.gap / GAP for gap in agreeing.gaps] == pytest.approx([4.0, 8.0], rel=0.01)
-    contradicting = st.estimate_jointly([one, other], BALL_SCREW)
-    assert all(gap.status is GapStatus.MODEL_MISMATCH for gap in contradicting.gaps)
-    assert "fitted with what another window tells of the machine, " in contradicting.gap.reasons[0]
+@pytest.mark.slow
+def test_windows_of_one_free_shaft_agree() -> None:
+    found = st.estimate_jointly([ball_screw(), ball_screw(worn=8.0)], BALL_SCREW)
+    assert [gap.gap / GAP for gap in found.gaps] == pytest.approx([4.0, 8.0], rel=0.01)
 
 
+@pytest.mark.slow
+def test_windows_of_two_shafts_contradict() -> None:
+    found = st.estimate_jointly([ball_screw(), ball_screw(stiffness=0.8)], BALL_SCREW)
+    assert all(gap.status is GapStatus.MODEL_MISMATCH for gap in found.gaps)
+    assert "fitted with what another window tells of the machine, " in found.gap.reasons[0]
+
+
+@pytest.mark.slow
 def test_a_window_without_information_does_not_disturb_the_others() -> None:
     good = ball_screw()
     still = Window(np.zeros(800), np.zeros(800), sample_rate=2000.0)
@@ -146,6 +154,7 @@ def stage(places: list[float], worn: float) -> Window:
     )
 
 
+@pytest.mark.slow
 def test_moves_of_different_lengths_tell_the_ratio_to_a_window_of_equal_ones() -> None:
     axis, gap = Axis.preset("stepper-stage"), 0.05
     different, equal = stage([0.2, -0.3, 0.6, -0.1, 0.9, 0.0], gap), stage([0.4, 0.0, 0.4, 0.0, 0.4, 0.0], gap)
@@ -160,6 +169,7 @@ def test_moves_of_different_lengths_tell_the_ratio_to_a_window_of_equal_ones() -
     assert found.servo.p == pytest.approx(1.002 * axis.p, rel=5e-4)
 
 
+@pytest.mark.slow
 def test_friction_of_a_load_that_the_gap_holds_is_found_and_its_windows_are_fitted_one_at_a_time() -> None:
     load = st.Load(tuple(PAPER.masses), (0.0, *PAPER.stiffnesses[1:]), tuple(PAPER.dampings), friction=0.05)
     axis = PARTS.replace(load=load)

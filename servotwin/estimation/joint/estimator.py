@@ -124,9 +124,8 @@ class SharedFit:
         return FitPoint(point, np.concatenate([*residuals, prior]), np.hstack([*blocks, slope]))
 
     def shaken(self, random: np.random.Generator) -> SharedFit:
-        """The windows with other errors of rounding, which repeat with a motion that repeats."""
-        seed = int(random.integers(2**32))
-        return replace(self, fits=tuple(fit.shaken(np.random.default_rng(seed)) for fit in self.fits))
+        """The windows with other errors of rounding."""
+        return replace(self, fits=tuple(fit.shaken(random) for fit in self.fits))
 
     def solved(self) -> tuple[FitPoint, tuple[tuple[float, ...], ...]]:
         """Find the best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
@@ -347,8 +346,10 @@ def _joined(fits: Sequence[WindowMinima], alone: Sequence[JointFit], settings: J
     """Fit the windows together; one whose gap moves by more than its spread contradicts the others."""
     whole = SharedFit.of(fits)
     best, rivals = whole.solved()
-    rounding = spread_by_rounding(fits[0].model.servo, best, lambda random: whole.shaken(random).evaluate(best.point))
-    covariance, results = best.covariance() + rounding, []
+    servo = fits[0].model.servo
+    rounding = spread_by_rounding(servo, best, lambda random: whole.shaken(random).evaluate(best.point))
+    # Rounding repeats with the motion: windows alike may err alike, so that they tell no more than one of them.
+    covariance, results = best.covariance() + len(fits) * rounding, []
     for before, place, others in zip(alone, whole.places, rivals, strict=True):
         point = best.point[place]
         objection = _doubt(best.converged, float(point[0]), others)
