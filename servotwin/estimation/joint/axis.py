@@ -17,9 +17,10 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus, MachineReading
 from servotwin.estimation.joint.axis_numbers import adapted, own_number
 from servotwin.estimation.joint.verdict import METHOD, JointEstimate, Parameter
 from servotwin.estimation.output_error.estimator import FittedWindow, fitted
-from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.fit import Search, only_rounding
 from servotwin.estimation.output_error.held_chain import follows
 from servotwin.estimation.output_error.models import HALF, LEARNT, Unknown
+from servotwin.estimation.output_error.possible import INDEPENDENT
 from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.taught import moved_by_growth
@@ -117,9 +118,13 @@ class AxisFit:
         search, possible = self.fit.search, self.fit.possible
         if search is None:
             return {}
-        scale = self.settings.calibration
+        scale, known = self.settings.calibration, {name: self.unknown(name).std for name in self.places}
         computed = zip(self.places, _spreads(search, self.places), strict=True)
         found = {name: math.hypot(scale * std, self._unmodelled(name)) for name, std in computed}
+        if only_rounding(search.problem, search.best):
+            # However many samples there are, they hold a few independent errors.
+            fewer = math.sqrt(max(1.0, search.best.raw.size / INDEPENDENT))
+            found = {name: min(fewer * std, known[name]) for name, std in found.items()}
         if possible is not None:
             found["ratio"] = scale * math.hypot(possible.ratio_std, moved_by_growth(search))
         elif self.reading is not None:

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo, servo_of
-from servotwin.estimation.core.counts import between_counts
 from servotwin.estimation.core.decimation import shortest_for
 from servotwin.estimation.core.family import InputHold
 from servotwin.estimation.joint.axis import WIDE, estimate_axis
@@ -37,7 +36,7 @@ from servotwin.estimation.joint.fit import (
     unsearched,
 )
 from servotwin.estimation.joint.held_axis import check_channels, in_counts, of_servos_axis
-from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, jumps, margin_for
+from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, between_its_counts, jumps, margin_for
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
 from servotwin.estimation.joint.verdict import (
     JointEstimate,
@@ -321,9 +320,9 @@ def _fit(
     broken = "; ".join(_faults(window))
     if window.theta_m is not None and not broken:
         if servo.encoder_resolution > 0.0:
-            window = window.replace(theta_m=between_counts(window.theta_m, servo.encoder_resolution))
-        angle = motor_angle(window, servo.encoder_resolution, WhitenedSettings(), scales(servo).time)
-        model = replace(model, window=window.replace(theta_m=angle))
+            model = between_its_counts(model)
+        angle = motor_angle(model.window, servo.encoder_resolution, WhitenedSettings(), scales(servo).time)
+        model = replace(model, window=model.window.replace(theta_m=angle))
     silence = "the voltage is constant: nothing shows how the motor moved" if _still(window) else ""
     if broken or silence:
         return unsearched(model, prior, settings, blocked=broken or silence)
