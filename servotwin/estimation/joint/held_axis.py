@@ -18,10 +18,11 @@ from servotwin.plant.actuator import Actuator, DcMotor
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
 
-# Standard deviations, of logarithms, of what the sampled model leaves out: errors without noise and counts. Several
-# stiffnesses of a stiff screw explain its first mass's ringing alike; the fit finds one of them.
-_UNMODELLED = {"k/m": 1e-4, "c/m": 1e-3, "pitch": 3e-5, "k_d": 0.2}
-_LATE = 0.02  # samples: the same of the delay
+# Standard deviations, of logarithms, of what counts leave beyond the draws of their rounding (delay: samples).
+_IN_COUNTS = {"k/m": 2e-3, "c/m": 2e-2, "pitch": 3e-5}
+_LATE = 0.02
+# Several stiffnesses of a stiff screw explain its first mass's ringing alike; the fit finds one of them.
+_STIFF_SCREW = 0.2
 
 
 def check_channels(window: Window, axis: Axis) -> None:
@@ -70,7 +71,10 @@ def of_servos_axis(found: JointEstimate, axis: Axis, sample_rate: float) -> Join
     plain = {"k/m": "k", "c/m": "c", "pitch": "p", "k_B": "k_B"}
     made = axis.scaled({plain[name]: factor for name, factor in factors.items() if name in plain})
     screw = replace(made.transmission, k_d=factors.get("k_d", 1.0) * axis.transmission.k_d)
-    covariance = found.covariance + _unmodelled(found, sample_rate)
+    covariance = found.covariance + _of_stiff_screw(found)
+    if axis.encoder_resolution or axis.sensors.position_resolution:
+        left_out = {**_IN_COUNTS, "delay": _LATE / sample_rate}
+        covariance += np.diag([left_out.get(name, 0.0) ** 2 for name in found.names])
     stds = dict(zip(found.names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     return replace(
         found,
@@ -81,15 +85,14 @@ def of_servos_axis(found: JointEstimate, axis: Axis, sample_rate: float) -> Join
     )
 
 
-def _unmodelled(found: JointEstimate, sample_rate: float) -> Array:
-    """(P, P) covariance of what neither noise nor rounding explains: where it moves a parameter the others follow."""
-    total, known = np.zeros_like(found.covariance), np.diag(found.covariance)
-    for place, name in enumerate(found.names):
-        std = _LATE / sample_rate if name == "delay" else _UNMODELLED.get(name, 0.0)
-        if std > 0.0 and 0.0 < known[place] < math.inf:
-            moved = std * found.covariance[place] / known[place]
-            total += np.outer(moved, moved)
-    return total
+def _of_stiff_screw(found: JointEstimate) -> Array:
+    """(P, P) covariance by a screw's stiffness that may be another: where it moves the others follow."""
+    total = np.zeros_like(found.covariance)
+    place = found.names.index("k_d") if "k_d" in found.names else -1
+    if place < 0 or not 0.0 < found.covariance[place, place] < math.inf:
+        return total
+    moved = _STIFF_SCREW * found.covariance[place] / found.covariance[place, place]
+    return total + np.outer(moved, moved)
 
 
 def _with_std(one: Parameter, std: float) -> Parameter:
