@@ -75,6 +75,24 @@ def test_an_axis_s_angle_is_computed_from_the_voltage_of_the_paper_s_motor() -> 
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("noise", [0.0, 1.5])
+def test_the_spreads_of_numbers_contain_what_counts_and_their_noise_do(noise: float) -> None:
+    count, random, away = 2.0 * math.pi / 2000.0, np.random.default_rng(4), []
+    axis = PARTS.replace(sensors=st.Sensors(encoder_resolution=count))
+    for gap in np.linspace(0.15, 0.25, 8):
+        seen = paper_window(float(gap))
+        angle = count * np.round(seen.theta_m / count + noise * random.standard_normal(seen.samples))
+        found = st.estimate_jointly(Window(seen.position, angle, sample_rate=1000.0), axis)
+        assert found.gap.ok, found.gap.reasons
+        assert found.gap.interval[0] < gap < found.gap.interval[1]
+        away.append(
+            [(one.factor - 1.0) / (one.std / one.value) for one in map(found.parameters.get, ("k/m", "c/m", "pitch"))]
+        )
+    assert np.abs(away).max() < 4.0
+    assert np.all(np.sqrt(np.mean(np.square(away), axis=0)) < 2.0)
+
+
+@pytest.mark.slow
 def test_a_free_shaft_s_numbers_are_found_where_the_gap_s_own_fit_refuses_them() -> None:
     window, gap = ball_screw(stiffness=1.5, friction=1.3), 4.0 * GAP
     refused = st.estimate_gap(window, BALL_SCREW)

@@ -206,7 +206,7 @@ def estimate_axis(
     if known is None and len(windows) > 1:
         raise InvalidInput(
             f"{len(windows)} windows of a load that the gap holds, before friction or nothing but an elastic screw: "
-            "the joint estimator fits one window of such an axis at a time"
+            "the joint estimator fits one window of such an axis at a time, because what friction hides is alike in all"
         )
     fits = [
         AxisFit(axis, fitted(window, axis, None if place else prior, settings, known), known, settings)
