@@ -236,7 +236,7 @@ def _with_others(fits: Sequence[AxisFit], place: int, window: Window) -> AxisFit
     """The window fitted with the machine as the best of the others tells it; as it was where none does."""
     own, others = fits[place], [fit.reading for fit in fits if fit is not fits[place]]
     readings = [FactorPrior.of_reading(reading) for reading in others if reading is not None]
-    if not readings:
+    if not readings or own.fit.search is None:
         return own
     # Windows alike tell no more than one of them: what the model leaves out does not average.
     best = min(readings, key=lambda reading: float(np.linalg.slogdet(reading.covariance)[1]))
