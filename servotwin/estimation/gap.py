@@ -44,7 +44,7 @@ METHODS: Mapping[str, Method] = {
 }
 """The methods for a servo, those of a twin."""
 
-_ALLOWED, _ROUNDED = 0.6, 0.5  # of a count
+ALLOWED, ROUNDED = 0.6, 0.5  # of a count: largest spread of a coarse encoder that is accepted, its own error
 _ALL = {
     **METHODS,
     **{
@@ -146,9 +146,9 @@ def _in_counts(settings: whitened.WhitenedSettings, count: float) -> whitened.Wh
     """The settings with a spread that one count (rad) of a coarse encoder allows, and causes."""
     return replace(
         settings,
-        largest_std=max(settings.largest_std, _ALLOWED * count),
-        largest_shift=max(settings.largest_shift, _ROUNDED * count),
-        model_error=max(settings.model_error, _ROUNDED * count),
+        largest_std=max(settings.largest_std, ALLOWED * count),
+        largest_shift=max(settings.largest_shift, ROUNDED * count),
+        model_error=max(settings.model_error, ROUNDED * count),
     )
 
 

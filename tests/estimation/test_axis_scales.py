@@ -12,6 +12,7 @@ from scaling import AxisUnits, scaled_axis
 
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.joint.estimator import estimate_jointly
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import SquareWave
@@ -63,3 +64,23 @@ def test_an_axis_in_other_units_moves_and_is_estimated_alike(name: str, units: A
     assert other.std_total == pytest.approx(gap.std_total, rel=1e-5)
     assert gap.gap == pytest.approx(MOVES[name][0] / Axis.preset(name).p, rel=0.01)
     assert math.isfinite(gap.std_total)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", MOVES)
+@pytest.mark.parametrize("units", UNITS)
+def test_an_axis_in_other_units_has_the_same_numbers(name: str, units: AxisUnits) -> None:
+    (here, _), (there, _) = estimated(name, AxisUnits()), estimated(name, units)
+    half = MOVES[name][1]
+    first, second = (
+        estimate_jointly(Window.from_run(run, half * unit, 2.0 * half * unit), scaled_axis(Axis.preset(name), own))
+        for run, unit, own in ((here, 1.0, AxisUnits()), (there, units.time, units))
+    )
+    assert second.gap.status is first.gap.status
+    assert second.gap.gap == pytest.approx(first.gap.gap, rel=1e-6)
+    assert second.gap.std == pytest.approx(first.gap.std, rel=1e-3)
+    for number, one in first.parameters.items():
+        other = second.parameters[number]
+        if not math.isnan(one.factor):
+            assert other.factor == pytest.approx(one.factor, rel=1e-5)
+            assert other.std / other.value == pytest.approx(one.std / one.value, rel=1e-2)

@@ -75,12 +75,6 @@ def test_what_does_not_fit_is_refused_in_a_sentence(make: object, words: str) ->
     assert "\n" not in str(error.value)
 
 
-def test_the_joint_estimator_names_the_one_for_axes() -> None:
-    window = st.Window(np.zeros(400), np.zeros(400), sample_rate=1000.0)
-    with pytest.raises(InvalidInput, match="this is an axis made of parts; estimate_gap fits the shaft"):
-        st.estimate_jointly(window, BALL_SCREW)  # type: ignore[arg-type]
-
-
 def test_a_version_does_not_depend_on_how_a_number_is_typed() -> None:
     versions = set()
     for inertia in (1, 1.0, np.float64(1.0)):

@@ -10,13 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.axis_model import has_servo, servo_of
 from servotwin.estimation.core.decimation import shortest_for
 from servotwin.estimation.core.family import InputHold
+from servotwin.estimation.joint.axis import WIDE, estimate_axis
 from servotwin.estimation.joint.fit import (
     APART,
     RIVAL,
@@ -26,11 +29,14 @@ from servotwin.estimation.joint.fit import (
     WindowMinima,
     decimation_factor,
     descend,
+    gap_of,
     searched,
+    spread_by_rounding,
     tolerance_of,
     unsearched,
 )
-from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, jumps, margin_for
+from servotwin.estimation.joint.held_axis import check_channels, in_counts, of_servos_axis
+from servotwin.estimation.joint.model import JUMP, MOTOR_START, JointModel, between_its_counts, jumps, margin_for
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
 from servotwin.estimation.joint.verdict import (
     JointEstimate,
@@ -41,15 +47,19 @@ from servotwin.estimation.joint.verdict import (
     window_estimate,
 )
 from servotwin.estimation.learning.trend import Prior
+from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.whitened.channels import faults, motor_angle
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
 __all__ = ["JointEstimate", "JointSettings", "SharedFit", "estimate_jointly"]
 
+Settings = TypeVar("Settings", JointSettings, OutputErrorSettings)
 _SHARED = ("k/m", "c/m", "pitch", "k_d", "k_B")
 
 
@@ -112,6 +122,10 @@ class SharedFit:
         prior, slope = (point - known.mean) / known.spread, np.diag(1.0 / known.spread)
         return FitPoint(point, np.concatenate([*residuals, prior]), np.hstack([*blocks, slope]))
 
+    def shaken(self, random: np.random.Generator) -> SharedFit:
+        """The windows with other errors of rounding."""
+        return replace(self, fits=tuple(fit.shaken(random) for fit in self.fits))
+
     def solved(self) -> tuple[FitPoint, tuple[tuple[float, ...], ...]]:
         """Find the best minimum, and for each window the other gaps (rad) that explain all windows nearly as well."""
         tolerance = self.joined([tolerance_of(fit.model) for fit in self.fits])
@@ -145,10 +159,10 @@ _SIGMAS = 4.0  # by how many standard deviations a gap may move when its window 
 
 def estimate_jointly(
     window: Window | Sequence[Window],
-    servo: Servo,
+    servo: Plant,
     free: tuple[str, ...] | None = None,
     prior: AnyPrior = None,
-    settings: JointSettings | None = None,
+    settings: JointSettings | OutputErrorSettings | None = None,
 ) -> JointEstimate:
     """Estimate the total gap with the model's numbers, from windows with or without the motor's angle.
 
@@ -157,28 +171,65 @@ def estimate_jointly(
     window : Window, or several
         Position and theta_m, or position and voltage: the angle is then computed from the voltage. Several windows are
         fitted together: each has its own gap and delay, k/m, c/m, pitch, k_d and k_B are the same in all.
-    servo : Servo
+    servo : Servo or Axis
         The model to start from.
     free : tuple of str, optional
         Of "k/m", "c/m", "pitch", "k_d", "k_B", "gap rate". By default k/m, c/m and the pitch, and k_d of an elastic
-        screw; without the motor's angle k_B in place of the pitch, because the position shows only their ratio.
+        screw; without the motor's angle k_B in place of the pitch, because the position shows only their ratio. An axis
+        whose gap `estimate_gap` finds by "output_error" has all of its numbers free.
     prior : number, GapEstimate or Prior, optional
-        A gap (rad) to search from as well; a `Prior`'s spread counts as information, on the first window.
-    settings : JointSettings, optional
+        A gap (rad) to search from as well; a `Prior`'s spread counts as information, on the first window of a servo.
+    settings : JointSettings or OutputErrorSettings, optional
+        The latter of such an axis, by default `servotwin.estimation.joint.axis.WIDE`.
 
     Raises
     ------
     InvalidInput
-        An axis made of parts; unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short;
-        an elastic screw without the motor's angle; no window at all, or some with theta_m and some without.
+        Unknown, inseparable or unseen parameters; neither angle nor voltage; a window too short; an elastic screw
+        without the motor's angle; no window at all, or some with theta_m and some without; settings of another fit; an
+        axis whose angle cannot be computed from the command; several windows of a load with friction that the gap
+        holds.
     """
-    if not isinstance(servo, Servo):
-        raise InvalidInput(
-            "the joint estimator knows the combination of the paper (Servo), and this is an axis made of parts; "
-            "estimate_gap fits the shaft of an axis together with its gap"
-        )
-    given = (settings or JointSettings()).on(scales(servo).time)
     windows = _windows(window)
+    if isinstance(servo, Axis):
+        return _of_axis(windows, servo, free, prior, settings)
+    return _of_servo(windows, servo, free, prior, _checked_settings(settings, JointSettings) or JointSettings())
+
+
+def _of_axis(
+    windows: Sequence[Window],
+    axis: Axis,
+    free: tuple[str, ...] | None,
+    prior: AnyPrior,
+    settings: JointSettings | OutputErrorSettings | None,
+) -> JointEstimate:
+    """Fit an axis as the servo that stands for it, or by its output error."""
+    for window in windows:
+        check_channels(window, axis)
+    if not has_servo(axis):
+        if free is not None:
+            raise InvalidInput(f"free = {free!r}: the fit of this axis has all of its numbers free; leave it out")
+        wide = _checked_settings(settings, OutputErrorSettings) or WIDE
+        return estimate_axis(windows, axis, gap_of(prior), wide)
+    chosen = _checked_settings(settings, JointSettings) or in_counts(windows, axis)
+    hold = InputHold.LINEAR if axis.controller.sample_rate is None else InputHold.CONSTANT
+    driven = [window.driven(axis.command_limit) for window in windows]
+    found = _of_servo(driven, servo_of(axis), free, prior, replace(chosen, hold=chosen.hold or hold))
+    return of_servos_axis(found, axis, windows[0].sample_rate)
+
+
+def _checked_settings(settings: JointSettings | OutputErrorSettings | None, kind: type[Settings]) -> Settings | None:
+    """The settings, of the kind that the fit takes."""
+    if settings is None or isinstance(settings, kind):
+        return settings
+    raise InvalidInput(f"settings {settings!r} do not belong to the fit of this machine: give {kind.__name__}")
+
+
+def _of_servo(
+    windows: Sequence[Window], servo: Servo, free: tuple[str, ...] | None, prior: AnyPrior, settings: JointSettings
+) -> JointEstimate:
+    """Fit a servo."""
+    given = settings.on(scales(servo).time)
     names = _free(windows[0], servo, free)
     fits = [_fit(one, servo, names, prior if one is windows[0] else _start_of(prior), given) for one in windows]
     results = [_alone(fit) for fit in fits]
@@ -268,8 +319,10 @@ def _fit(
     model = _model(window, servo, names, settings)
     broken = "; ".join(_faults(window))
     if window.theta_m is not None and not broken:
-        angle = motor_angle(window, servo.encoder_resolution, WhitenedSettings(), scales(servo).time)
-        model = replace(model, window=window.replace(theta_m=angle))
+        if servo.encoder_resolution > 0.0:
+            model = between_its_counts(model)
+        angle = motor_angle(model.window, servo.encoder_resolution, WhitenedSettings(), scales(servo).time)
+        model = replace(model, window=model.window.replace(theta_m=angle))
     silence = "the voltage is constant: nothing shows how the motor moved" if _still(window) else ""
     if broken or silence:
         return unsearched(model, prior, settings, blocked=broken or silence)
@@ -281,14 +334,21 @@ def _alone(fit: WindowMinima) -> JointFit:
     best = fit.best
     rivals = tuple(float(one.point[0]) for one in fit.minima[1:] if one.cost < best.cost + RIVAL)
     objection = fit.blocked or _doubt(best.converged, float(best.point[0]), rivals)
-    return JointFit(fit.model, best.point, best.covariance(), fit.evaluations, objection)
+    rounding = spread_by_rounding(
+        fit.model.servo, best, lambda random: fit.shaken(random).evaluated(fit.known)(best.point)
+    )
+    covariance = best.covariance() + rounding
+    return JointFit(fit.model, best.point, covariance, fit.evaluations, objection)
 
 
 def _joined(fits: Sequence[WindowMinima], alone: Sequence[JointFit], settings: JointSettings) -> list[JointFit]:
     """Fit the windows together; one whose gap moves by more than its spread contradicts the others."""
     whole = SharedFit.of(fits)
     best, rivals = whole.solved()
-    covariance, results = best.covariance(), []
+    servo = fits[0].model.servo
+    rounding = spread_by_rounding(servo, best, lambda random: whole.shaken(random).evaluate(best.point))
+    # Rounding repeats with the motion: windows alike may err alike, so that they tell no more than one of them.
+    covariance, results = best.covariance() + len(fits) * rounding, []
     for before, place, others in zip(alone, whole.places, rivals, strict=True):
         point = best.point[place]
         objection = _doubt(best.converged, float(point[0]), others)

@@ -73,6 +73,13 @@ class FitPoint:
         np.fill_diagonal(covariance, self.deviations() ** 2)
         return covariance
 
+    def step(self) -> Array:
+        """(P,) Gauss-Newton step."""
+        scale = np.linalg.norm(self.jacobian, axis=1)
+        scale[scale == 0.0] = 1.0
+        scaled = self.jacobian / scale[:, None]
+        return -np.linalg.pinv(scaled @ scaled.T, hermitian=True) @ (scaled @ self.residual) / scale
+
 
 Evaluate: TypeAlias = Callable[[Array], FitPoint]
 
@@ -153,13 +160,13 @@ def _prior_of(model: JointModel, prior: AnyPrior, settings: JointSettings) -> Pa
 def start_of(model: JointModel, prior: AnyPrior) -> Array:
     """(P,) start of the search; the gap and the place are scanned besides."""
     values = dict.fromkeys(model.names, 0.0)
-    values["gap"] = _gap_of(prior) or 0.0
+    values["gap"] = gap_of(prior) or 0.0
     if "speed0" in values and model.window.voltage is not None:
         values["speed0"] = float(model.window.voltage[0]) / model.servo.k_B
     return np.array(list(values.values()))
 
 
-def _gap_of(prior: AnyPrior) -> float | None:
+def gap_of(prior: AnyPrior) -> float | None:
     """Gap (rad) of a prior; None without one."""
     gap = prior if prior is None or isinstance(prior, int | float) else prior.gap
     if isinstance(prior, GapEstimate) and not prior.ok:
@@ -239,7 +246,9 @@ def _without_motor_start(model: JointModel, table: Array) -> Array:
 
 RIVAL, APART = 12.0, math.radians(0.3)  # a rival's cost is as near; minima closer than this (rad) are one
 _GRID = np.radians([0.0, 1.0, 2.0, 4.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0, 50.0])
+_WIDER = 1.25  # factor between wider gaps, where the largest is beyond the paper's
 _STARTS = 3
+_DRAWS = 16  # of rounding: standard deviations are known to a fifth
 # Rate after decimation, in the servo's own seconds: at a lower one the noise model fits itself to the residual.
 _SAMPLES_HZ = 250.0
 
@@ -278,9 +287,26 @@ class WindowMinima:
         """Whitened residual and derivatives as a function of the point."""
         return lambda point: _evaluate_at(self.model, point, known, self.whitened)
 
+    def shaken(self, random: np.random.Generator) -> WindowMinima:
+        """The window with other errors of rounding."""
+        return replace(self, model=self.model.shaken(random))
+
     def whitened(self, rows: Array) -> Array:
         """(k, m) reduced and whitened rows (k, n)."""
         return self.noise.whiten(self.reduce.rows(rows))
+
+
+def spread_by_rounding(servo: Servo, best: FitPoint, shaken: Callable[[np.random.Generator], FitPoint]) -> Array:
+    """(P, P) covariance of a minimum by the rounding of encoders with known counts; 0 without any.
+
+    A step from the minimum in windows whose errors of rounding are others, which `shaken` draws and evaluates: also in
+    these the errors bend the derivatives, so that the covariance contains the bias that rounding makes.
+    """
+    if not (servo.encoder_resolution or servo.position_resolution):
+        return np.zeros((best.point.size, best.point.size))
+    random, own = np.random.default_rng(0), best.step()
+    moves = np.array([shaken(random).step() - own for _ in range(_DRAWS)])
+    return np.asarray(moves.T @ moves / _DRAWS)
 
 
 def unsearched(model: JointModel, prior: AnyPrior, settings: JointSettings, blocked: str = "") -> WindowMinima:
@@ -308,7 +334,7 @@ def _unwhitened(fit: WindowMinima, settings: JointSettings) -> WindowMinima:
     """
     model, fine = fit.model, np.array([name in MOTOR_START or name.startswith(JUMP) for name in fit.model.names])
     values = dict(zip(model.names, fit.best.point.tolist(), strict=True))
-    gaps = np.unique(np.append(_GRID[settings.largest_gap_rad >= _GRID], values["gap"]))
+    gaps = np.unique(np.append(_grid(settings.largest_gap_rad), values["gap"]))
     bounds, tolerance = fit.known.without_prior(~fine), 30.0 * tolerance_of(model)
     starts = scan(model, values, gaps, _STARTS, fit.reduce.rows)
     coarse = [descend(fit.evaluated(bounds), begin, bounds, tolerance) for begin in starts]
@@ -318,6 +344,12 @@ def _unwhitened(fit: WindowMinima, settings: JointSettings) -> WindowMinima:
         if fine.any()
         else searched_fit
     )
+
+
+def _grid(largest: float) -> Array:
+    """Gaps (g,) of the scan, rad, up to the largest."""
+    more = max(0, math.floor(math.log(largest / _GRID[-1]) / math.log(_WIDER))) if largest > 0.0 else 0
+    return np.append(_GRID[largest >= _GRID], _GRID[-1] * _WIDER ** np.arange(1, more + 1))
 
 
 def _descended(fit: WindowMinima, known: ParameterPrior, starts: Sequence[FitPoint]) -> WindowMinima:

@@ -9,15 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
 
 from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW, Gap, contacts, through_gap
+from servotwin.estimation.core.counts import between_counts, errors_between, errors_of_counts
 from servotwin.estimation.core.family import STRUCTURE, InputHold, Sampled, motor_family, structure_family
 from servotwin.estimation.core.least_squares import orthonormal, project_out
+from servotwin.estimation.output_error.motor_angle import noise_of, without_noise
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
@@ -58,6 +60,8 @@ class JointModel:
         Samples left out at either end, so that any allowed delay finds its samples.
     jumps : tuple of int
         Samples after which the voltage jumps at a time unknown.
+    noise : float
+        rad, of an angle that came in counts with more noise than that, and was smoothed; otherwise 0.
     """
 
     window: Window
@@ -66,6 +70,7 @@ class JointModel:
     hold: InputHold
     margin: int
     jumps: tuple[int, ...] = ()
+    noise: float = 0.0
 
     @property
     def rate(self) -> float:
@@ -189,6 +194,25 @@ class JointModel:
             **dict(zip(tangents, moved, strict=True)),
         }
 
+    def shaken(self, random: np.random.Generator) -> JointModel:
+        """The model of a window that has other errors of the encoders' rounding as well, equally likely."""
+        window, servo = self.window, self.servo
+        channels = {}
+        if servo.encoder_resolution > 0.0 and window.theta_m is not None:
+            channels["theta_m"] = self._other_angle(window.theta_m, random)
+        if servo.position_resolution > 0.0:
+            channels["position"] = window.position + errors_of_counts(
+                window.position, servo.position_resolution, random
+            )
+        return replace(self, window=window.replace(**channels))
+
+    def _other_angle(self, angle: Array, random: np.random.Generator) -> Array:
+        """(n,) angle with other errors, as large as it has already."""
+        count = self.servo.encoder_resolution
+        if self.noise == 0.0:
+            return angle + errors_between(angle, count, random)
+        return without_noise(angle + self.noise * random.standard_normal(angle.size), count).angle
+
     def _row(self, row: Array, name: str, shift: float) -> Array:
         if name != "delay":
             return self.delayed(row[None], shift)[0]
@@ -208,6 +232,16 @@ class JointModel:
             (weight * rows[:, first + j : first + j + size] for j, weight in enumerate(weights)),
             start=np.zeros((len(rows), size)),
         )
+
+
+def between_its_counts(model: JointModel) -> JointModel:
+    """The model of a window whose angle, which comes in counts, has no staircase, and no noise beyond the counts."""
+    angle, count = model.window.theta_m, model.servo.encoder_resolution
+    assert angle is not None
+    quiet = without_noise(angle, count).angle
+    if quiet is not angle:
+        return replace(model, window=model.window.replace(theta_m=quiet), noise=noise_of(angle))
+    return replace(model, window=model.window.replace(theta_m=between_counts(angle, count)))
 
 
 def jumps(voltage: Array) -> tuple[int, ...]:

@@ -15,6 +15,7 @@ from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
 from servotwin.estimation.joint.model import JointModel
 from servotwin.estimation.joint.settings import SPREADS, JointSettings
+from servotwin.plant.plants import Plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -23,10 +24,14 @@ METHOD = "joint"
 
 @dataclass(frozen=True)
 class Parameter:
-    """A free parameter: value and standard deviation in its own unit, and its factor over the servo's.
+    """A free parameter: value and standard deviation in its own unit, and its factor over the model's.
 
     "k/m" in 1/s^2 and "c/m" in 1/s are those of the last mass, "pitch" in m/rad, "k_B" in V s/rad, "delay" in s,
-    "gap rate" in rad/s; the last two have no factor (NaN).
+    "gap rate" in rad/s; the last two have no factor (NaN). Of an axis that is fitted by its output error they have the
+    names of that fit: "shaft stiffness" and "shaft damping" of a free shaft, "stiffness" and "damping" of the chain
+    behind a screw that the gap holds (of its first link), "ratio" of the transmission, "mass ratio" of last and first
+    mass, "load stiffness", "load damping", "load friction", "load force", and "delay" and "lag" in s without a factor.
+    The masses are as stated: the motion shows stiffnesses, dampings, friction and force over them.
     """
 
     value: float
@@ -43,12 +48,14 @@ class JointEstimate:
     gaps : tuple of GapEstimate
         One for each window.
     parameters : mapping
-        Name -> `Parameter`; "delay" and "gap rate" are those of the last window that counted.
+        Name -> `Parameter`; "delay" and "gap rate" are those of the last window that counted. Empty where an axis's
+        window was refused before any fit.
     names : tuple of str
-        Order of `covariance`: "gap" (rad), "place", then the parameters; logarithms where they have a factor.
+        Order of `covariance`: "gap" (rad), of a servo "place", then the parameters; logarithms where they have a
+        factor.
     covariance : (P, P) array
         Of the last window that counted, with all that the others say of the parameters they share.
-    servo : Servo
+    servo : Servo or Axis
         With the fitted numbers.
     reasons : tuple of str
         What to know about the parameters, one sentence each.
@@ -58,7 +65,7 @@ class JointEstimate:
     parameters: Mapping[str, Parameter]
     names: tuple[str, ...]
     covariance: Array
-    servo: Servo
+    servo: Plant
     reasons: tuple[str, ...]
 
     def __repr__(self) -> str:

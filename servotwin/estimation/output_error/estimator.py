@@ -7,7 +7,7 @@ measured position with the axis's numbers free within what is known of them. doc
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
 from servotwin.estimation.output_error.play_model import PlayModel
-from servotwin.estimation.output_error.possible import possible_half
+from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.sampling import too_slow
 from servotwin.estimation.output_error.search import search
@@ -39,7 +39,7 @@ from servotwin.plant.basis import BacklashKind
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-__all__ = ["METHOD", "OutputErrorSettings", "estimate", "fit", "shortest_window"]
+__all__ = ["METHOD", "FittedWindow", "OutputErrorSettings", "estimate", "fit", "fitted", "shortest_window"]
 
 METHOD = "output_error"
 SHORTEST = 400  # samples
@@ -82,24 +82,63 @@ def estimate(
     InvalidInput
         Another kind of axis, no theta_m, a window too short.
     """
-    settings = settings or OutputErrorSettings()
+    return fitted(window, axis, prior, settings or OutputErrorSettings(), machine).estimate
+
+
+@dataclass(frozen=True, eq=False)
+class FittedWindow:
+    """A window's estimate with the fit behind it.
+
+    Attributes
+    ----------
+    estimate : GapEstimate
+    search : Search, optional
+        None: the window was refused before any fit.
+    possible : PossibleHalf, optional
+        What the window leaves possible of a motion without dynamics.
+    """
+
+    estimate: GapEstimate
+    search: Search | None = None
+    possible: PossibleHalf | None = None
+
+
+def fitted(
+    window: Window,
+    axis: Axis | Servo,
+    prior: float | GapEstimate | None,
+    settings: OutputErrorSettings,
+    machine: FactorPrior | None = None,
+) -> FittedWindow:
+    """Estimate as `estimate` does, and keep the fit; raises InvalidInput as it does."""
     theta_m = _checked(window, axis)
     assert isinstance(axis, Axis)
     axis, settings = _known(axis, settings, machine)
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     if slow := too_slow(axis, window.sample_rate):
-        return replace(blank, reasons=(slow,))
+        return FittedWindow(replace(blank, reasons=(slow,)))
     if broken := _broken(window, axis):
-        return refused(blank, broken)
+        return FittedWindow(refused(blank, broken))
     if window.follows_motor(axis.p):
         words = "position is the motor's angle times the ratio, exactly: there is no gap, or it is not the load's own"
-        return replace(blank, reasons=(words,))
+        return FittedWindow(replace(blank, reasons=(words,)))
     found, noise = _fit(window, theta_m, axis, prior, settings, machine)
     unit, possible = 2.0 / lever(axis), possible_half(found)
     verdict = judge(found, settings, unit, possible, axis.p * noise)
     if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
     stated = _stated(blank, found, verdict, unit)
+    return FittedWindow(_with_machine(stated, found, possible, settings, machine), found, possible)
+
+
+def _with_machine(
+    stated: GapEstimate,
+    found: Search,
+    possible: PossibleHalf | None,
+    settings: OutputErrorSettings,
+    machine: FactorPrior | None,
+) -> GapEstimate:
+    """The estimate with what the window tells of the machine."""
     if machine is None or not stated.ok:
         return stated
     if possible is None:
