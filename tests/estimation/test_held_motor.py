@@ -11,6 +11,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.motor_side.held_motion import HeldShaft
 from servotwin.estimation.motor_side.problem import MotorModel, MotorProblem
 from servotwin.estimation.output_error.models import HALF, Priors
@@ -18,11 +19,15 @@ from servotwin.estimation.window import Window
 from servotwin.plant.actuator import Actuator, DcMotor, TorqueDrive
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
+from servotwin.plant.plants import check_gap_in_loop
 from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Run, simulate
+from servotwin.twin.estimating import estimator_of
+from servotwin.twin.quick_fits import Known, quick_fits_of
+from servotwin.twin.settings import TwinSettings
 
 RATE, INERTIA, PITCH, GAP = 1000.0, 1e-4, 1e-3, 0.3
 BEGIN, LENGTH, SWING = 0.9, 0.8, 2.0 * math.pi * 30.0
@@ -184,6 +189,38 @@ def test_a_motor_that_stays_on_its_flank_shows_no_gap() -> None:
     estimate = estimate_gap(Window(theta_m=seen.theta_m, voltage=seen.voltage, sample_rate=RATE), axis)
     assert not estimate.ok
     assert math.isnan(estimate.gap)
+
+
+def test_a_fit_that_leaves_more_than_noise_is_not_believed() -> None:
+    """A wrong minimum was 40 % off and left 2 % of the gap, where the true one leaves a count."""
+    window = at_motor(swung(AXES["one mass"]))
+    assert window.theta_m is not None
+    wobble = 0.05 * GAP * np.sin(20.0 * math.pi * np.arange(window.samples) / RATE)
+    estimate = estimate_gap(window.replace(theta_m=window.theta_m + wobble), AXES["one mass"])
+    assert not estimate.ok
+    assert any("more than noise" in reason for reason in estimate.reasons)
+
+
+def test_the_twin_estimates_the_gap_and_verifies_no_setting() -> None:
+    """The edge records the motor's angle as the position; what such a loop leaves of the load was never measured."""
+    axis = AXES["one mass"]
+    window = at_motor(swung(axis))
+    recorded = window.replace(position=PITCH * np.asarray(window.theta_m))
+    estimate = estimator_of(axis, TwinSettings(policy="paper", k_dz=0.0))(recorded, Expectation(0.8 * GAP))
+    assert estimate.method == motor_side.METHOD
+    assert estimate.ok, estimate.reasons
+    assert estimate.interval[0] < GAP < estimate.interval[1]
+    with pytest.raises(InvalidInput, match="verified for shafts that are free in the gap only"):
+        check_gap_in_loop(axis)
+
+
+def test_a_quick_fit_tells_whether_the_gap_moved() -> None:
+    axis = AXES["one mass"]
+    fits, window = quick_fits_of(axis), at_motor(swung(axis))
+    known = Known(GAP, fits.unknowns_at(window, Known(GAP)))
+    found = fits.beside(at_motor(swung(axis, 1.06 * GAP)), known)
+    assert found is not None
+    assert found.gap == pytest.approx(1.06 * GAP, abs=0.02 * GAP)
 
 
 def test_a_motor_that_stands_shows_nothing() -> None:
