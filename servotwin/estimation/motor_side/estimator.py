@@ -34,7 +34,7 @@ METHOD = "motor_side"
 SHORTEST = 400  # samples
 _LATE = 0.5  # samples: usual delay of the command
 # Of the motor's inertia: least inertia of the load as the motor feels it. Of five accepted windows of the ball screw, a
-# tenth, two were wrong by 5 and 28 %.
+# tenth, two were wrong by 5 and 28 %; behind a screw that the gap holds one of 20 between 0.03 and a third, by 6 %.
 _FELT = 1.0 / 3.0
 
 
