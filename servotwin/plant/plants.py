@@ -86,18 +86,23 @@ def check_homogeneous(plant: Plant, described: str) -> None:
 
 
 def check_gap_in_loop(plant: Plant) -> None:
-    """Refuse an axis whose loop does not depend on the gap, for the verification of settings.
+    """Refuse an axis whose loop does not depend on the gap, or not in a known way, for the verification of settings.
 
     Raises
     ------
     InvalidInput
-        Its controller reads the motor's encoder, and no load acts back on the motor.
+        Its controller reads the motor's encoder, and the gap holds the driven end.
     """
     if plant.at_motor and plant.backlash_kind is not BacklashKind.FREE:
+        why = "and settings of such a loop are verified for shafts that are free in the gap only"
+        if plant.rigid:
+            why = (
+                "on which no load acts back in this model, so that its loop does not depend on the gap and there is "
+                "nothing to verify"
+            )
         raise InvalidInput(
-            'sensors.feedback = "motor": the controller reads the motor, on which no load acts back in this model, so '
-            "that its loop does not depend on the gap and there is nothing to verify; the feedback must be "
-            '"load", or the transmission free in the gap'
+            f'sensors.feedback = "motor": the controller reads the motor, {why}; the feedback must be "load", or the '
+            "transmission free in the gap"
         )
 
 

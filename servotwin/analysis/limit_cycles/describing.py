@@ -56,9 +56,9 @@ def predictions(servo: Plant, gap: float, controller: AnyController | None = Non
     Raises
     ------
     InvalidInput
-        The screw is elastic and held in the gap (its load on the motor is no function of theta_d alone), there is
-        friction or a constant force, the controller is sampled or
-        saturates or, with rigid parts, is no filtered PID, or the gap is not a number above 0.
+        The screw is elastic and held in the gap (its load makes the motor rest on a flank), there is friction or a
+        constant force, the controller is sampled or saturates or, with rigid parts, is no filtered PID, or the gap is
+        not a number above 0.
     """
     law = law_of(servo.controller if controller is None else controller)
     _check(servo, law, gap)
@@ -88,7 +88,7 @@ def _check(servo: Plant, law: Law, gap: float) -> None:
     if servo.backlash_kind is BacklashKind.HELD:
         raise InvalidInput(
             "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), or a shaft that is free in "
-            "the gap, since a held load that acts back only in contact is no function of the screw's angle"
+            "the gap, since behind a held elastic screw the motor rests on its flank, which is no harmonic motion"
         )
     if servo.at_motor and servo.rigid:
         raise InvalidInput(

@@ -1,4 +1,4 @@
-"""Estimator of the gap from the motor's encoder and the command alone, of axes whose shaft is free in the gap."""
+"""Estimator of the gap from the motor's encoder and the command alone, of axes with an elastic transmission."""
 
 from servotwin.estimation.motor_side.estimator import (
     METHOD,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 
 import numpy as np
 
-from servotwin.estimation.motor_side.motor import LoadStep, MotorStep, run_motor
+from servotwin.estimation.motor_side.drive import MotorDrive, observer_gains, states_at
+from servotwin.estimation.motor_side.free_motion import free_motion
+from servotwin.estimation.motor_side.held_motion import HeldShaft, held_motion
 from servotwin.estimation.output_error.models import (
     HALF,
     Flags,
@@ -18,25 +20,18 @@ from servotwin.estimation.output_error.models import (
     usual_sizes,
 )
 from servotwin.estimation.output_error.problem import LARGEST, delayed
-from servotwin.hybrid.exponential import expm1
-from servotwin.plant.actuator import Actuator
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
-from servotwin.plant.structure import chain
 
 _HALVES = (0.4, 0.28, 0.2, 0.14, 0.1, 0.07, 0.05, 0.035, 0.025, 0.017, 0.012, 0.008, 0.005)  # of the motor's travel
 _PLACES = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of the half gap
 _WIDE = 5.0  # of the motor's travel
-_DOUBLINGS = 24  # of the Riccati equation: 2^24 samples
 _MOVED = 0.02  # of the window: what shows the first speed
 _FIXED = ("offset", "delay", "ratio", "position offset")
 _MOTOR = (
     *("load inertia", "torque per command", "motor damping", "motor friction"),
     *("input bias", "command's delay", "motor's first speed"),
 )
-# Of a sample: the motor's speed is constant within each. A model with the true numbers left 7 to 15 counts of the
-# encoder with one part, 0.4 to 2.4 with eight, and gaps were off by up to 5 %.
-PARTS = 8
 
 
 @dataclass(frozen=True)
@@ -46,14 +41,14 @@ class MotorModel:
     Attributes
     ----------
     axis : Axis
-    shaft : ShaftModel
+    shaft : ShaftModel or HeldShaft
     load, torque, damping, delay : float
         Standard deviations beforehand: of the load's inertia, the torque per command and the motor's friction,
         relative, and of the command's delay, s.
     """
 
     axis: Axis
-    shaft: ShaftModel
+    shaft: ShaftModel | HeldShaft
     load: float
     torque: float
     damping: float
@@ -137,47 +132,20 @@ class MotorProblem:
 
     def simulate(self, values: Array, rate: float) -> tuple[Array, Array]:
         """(N,) angle of the motor as predicted by an observer of a rate (1/s), and driven end, both at the load."""
-        axis, at = self.model.axis, self.first_speed()
-        inertia, torque, damping, friction, bias, late, off = values[-len(_MOTOR) :].tolist()
-        actuator = axis.actuator.scaled(math.exp(torque), math.exp(damping))
-        step, by_command, by_torque, direct = _steps(actuator, axis.p, self.interval / PARTS)
-        by = MotorStep(
-            step,
-            by_command,
-            math.exp(inertia) * by_torque,
-            math.exp(friction) * axis.motor_friction / axis.p * by_torque[-2],
-        )
-        # The load follows the simulated motor: of the measured one nothing is prepared.
-        load = self.model.shaft.prepared(self.position[:1], self.interval / PARTS, values[: -len(_MOTOR)])
-        command = delayed(self.command, late / self.interval) + bias
-        motor = direct * command[0]
-        motor[-2:] = at + off, self.position[0]
-        predicted, driven = np.empty((2, self.position.size))
-        run_motor(
-            self.position,
-            command,
-            PARTS,
-            by,
-            LoadStep(load.parts, load.interval, load.half, *load.matrices, load.friction, *self._momentum(values)),
-            _gains(axis, self.interval, rate),
-            np.empty((len(load.scratch()) + 1, load.state.size)),
-            motor,
-            load.state,
-            predicted,
-            driven,
-        )
-        return predicted, driven
+        shaft, of_load = self.model.shaft, values[: -len(_MOTOR)]
+        gains = observer_gains(self.model.axis, self.interval, rate)
+        if isinstance(shaft, HeldShaft):
+            return held_motion(shaft, self._drive(values), of_load, gains)
+        return free_motion(shaft, self._drive(values), of_load, gains)
 
-    def _momentum(self, values: Array) -> tuple[Array, tuple[float, float]]:
-        """Rows of the load's momentum (2 n + 3,), stiffness to the ground, and constant force, for unknowns (u,)."""
-        load, n = self.model.axis.load, self.model.axis.n
-        known = zip(self.model.unknowns, values.tolist(), strict=True)
-        factor = {unknown.name: math.exp(value) for unknown, value in known if unknown.unit in ("factor", "damping")}
-        row = np.zeros(2 * n + 3)
-        row[0] = factor.get("load damping", 1.0) * load.c[0]
-        row[n : 2 * n] = load.m
-        row[2 * n - 1] *= factor.get("mass ratio", 1.0)
-        return row, (factor.get("load stiffness", 1.0) * load.k[0], factor.get("load force", 1.0) * load.force)
+    def _drive(self, values: Array) -> MotorDrive:
+        """Motor and command for unknowns (u,)."""
+        inertia, torque, damping, friction, bias, late, off = values[-len(_MOTOR) :].tolist()
+        actuator = self.model.axis.actuator.scaled(math.exp(torque), math.exp(damping))
+        command = delayed(self.command, late / self.interval) + bias
+        first = states_at(actuator, float(command[0]), self.first_speed() + off, float(self.position[0]))
+        rubs = math.exp(friction) * self.model.axis.motor_friction
+        return MotorDrive(actuator, math.exp(inertia), rubs, command, first, self.position, self.interval)
 
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(N,) angle of the motor as predicted by an observer of a rate (1/s) less the measured one, at the load."""
@@ -211,73 +179,13 @@ class MotorProblem:
 
     def on_one_flank(self, values: Array) -> list[list[Array]]:
         """Unknowns (u,) of a gap whose other flank is out of reach, a list for each flank, the lower one first."""
-        wide, n = _WIDE * self.range, self.model.axis.n
-        own = len(self.model.shaft.unknowns)
+        wide = _WIDE * self.range
+        places = [unknown.first and unknown.unit == "load" for unknown in self.model.unknowns]
         tables = []
         for side in (-1.0, 1.0):
-            tried = [values.copy() for _ in _PLACES]
-            for each, place in zip(tried, _PLACES, strict=True):
+            off = [(1.0 + place) * abs(float(values[HALF])) for place in _PLACES]
+            tried = [np.where(places, self.start(wide, side * (each / wide - 1.0)), values) for each in off]
+            for each in tried:
                 each[HALF] = wide
-                off = 0.5 * (1.0 + place) * 2.0 * abs(values[HALF])
-                each[own - 2 * n : own - n] = self.position[0] - side * (wide - off)
             tables.append(tried)
         return tables
-
-
-@lru_cache(maxsize=64)
-def _steps(motor: Actuator, p: float, interval: float) -> tuple[Array, Array, Array, Array]:
-    """Step (d, d) of the actuator over an interval (s), speed and angle at the load (ratio p), columns (d,) of a held
-    command and of a force at the load, and states per command of a motor that is held."""
-    shaft = motor.matrices()
-    size = len(shaft.names)
-    unit = np.ones(size)
-    unit[-2:] = p
-    flow = np.zeros((size + 2, size + 2))
-    flow[:size, :size] = unit[:, None] * shaft.A / unit
-    flow[:size, size], flow[:size, size + 1] = unit * shaft.B, p * unit * shaft.E
-    step = np.eye(len(flow)) + expm1(flow, interval)
-    held = np.zeros(size)
-    if size > 2:
-        held[:-2] = -np.linalg.solve(shaft.A[:-2, :-2], shaft.B[:-2])
-    return step[:size, :size].copy(), step[:size, size].copy(), step[:size, size + 1].copy(), held
-
-
-@lru_cache(maxsize=64)
-def _gains(axis: Axis, interval: float, rate: float) -> Array:
-    """(2, 2 n + 2) gains of the observer in the gap and in contact: Kalman's, with disturbances of all accelerations.
-
-    In the gap the motor alone has the rate (1/s).
-    """
-    load, n = axis.load, axis.n
-    links = chain(load.masses, load.stiffnesses, load.dampings, axis.transmission.k_d, axis.transmission.c_d)
-    inertia = 1.0 / (axis.p**2 * float(axis.shaft().E[-2]))
-    gains = np.zeros((2, 2 * n + 2))
-    gains[0, :2] = 2.0 * rate * interval, rate * rate * interval
-    # Motor's angle and speed, positions and speeds of the load, all at the load.
-    flow = np.zeros((2 * n + 2, 2 * n + 2))
-    flow[0, 1] = 1.0
-    flow[1, :2] = -axis.transmission.k_d / inertia, -axis.transmission.c_d / inertia
-    flow[1, 2:] = -links.reaction / inertia
-    flow[2:, 2:] = links.A
-    flow[2:, 0], flow[2:, 1] = links.B_position, links.B_velocity
-    step = np.eye(len(flow)) + expm1(flow, interval)
-    noise = np.zeros((2 * n + 2, 2 * n + 2))
-    shaken = [1, *range(2 + n, 2 + 2 * n)]
-    noise[shaken, shaken] = rate**4 * interval * interval
-    gains[1] = _kalman(step, noise)
-    return gains
-
-
-def _kalman(step: Array, noise: Array) -> Array:
-    """(s,) stationary gains of a filter that measures the first state with a variance of 1, by doubling the time."""
-    size = len(step)
-    forwards, backwards, spread = step.T.copy(), np.zeros((size, size)), noise.copy()
-    backwards[0, 0] = 1.0
-    for _ in range(_DOUBLINGS):
-        inner = np.linalg.inv(np.eye(size) + backwards @ spread)
-        spread, backwards, forwards = (
-            spread + forwards.T @ spread @ inner @ forwards,
-            backwards + forwards @ inner @ backwards @ forwards.T,
-            forwards @ inner @ forwards,
-        )
-    return np.asarray(spread[:, 0] / (spread[0, 0] + 1.0))

@@ -16,6 +16,9 @@ class MotorSideSettings:
     stiffness: Annotated[
         float, key("stiffness_share", above=0.0, help="Standard deviation of each stiffness over the inertia.")
     ] = 0.08
+    screw: Annotated[
+        float, key("screw_share", above=0.0, help="Standard deviation of the stiffness of a screw that the gap holds.")
+    ] = 0.2
     damping: Annotated[
         float, key("damping_share", above=0.0, help="Standard deviation of each damping and friction.")
     ] = 0.3
