@@ -44,6 +44,36 @@ def test_a_wrong_model_is_named(change, words):
         assert off < 1.96 * mild.std_total
 
 
+def hunting(ratio: float, calm: bool = False) -> Servo:
+    """The paper's servo at 1 kHz, with a screw so many times as stiff as the structure."""
+    law = SERVO.controller.replace(sample_rate=1000.0, **({"Ki": 0.0} if calm else {}))
+    return SERVO.replace(k_d=ratio * float(SERVO.stiffnesses[1]), controller=law)
+
+
+@pytest.mark.parametrize(("ratio", "k", "wrong"), [(1000.0, 1.074, 9.5), (200.0, 0.93, 1.9), (20.0, 1.03, 4.4)])
+def test_a_wrong_minimum_is_refused_where_a_free_model_shows_another_gap(ratio, k, wrong):
+    """A swinging load on an elastic screw without noise: what a wrong stiffness leaves is whitened away."""
+    model = hunting(ratio)
+    plant = model.replace(k=k * SERVO.k)
+    run = simulate(plant, 13.0, reference=SquareWave(1e-3, 20.0), gap=math.radians(2.92), sample_rate=1000.0)
+    window = Window.from_run(run, 9.7, 2.0)
+    assert math.degrees(fit(window, model, None, None).aligned.whitened.point.gap) == pytest.approx(wrong, abs=0.1)
+    found = estimate_gap(window, model)
+    assert found.status is GapStatus.MODEL_MISMATCH
+    assert f"the gap would be 2.92 deg: a stiffness off by {100.0 * (k - 1.0):+.2g} %" in found.reasons[-1]
+    assert estimate_gap(window, plant).gap == pytest.approx(math.radians(2.92), abs=math.radians(1e-3))
+
+
+def test_a_lower_bound_is_not_above_that_of_a_free_model():
+    model = hunting(200.0, calm=True)
+    plant = model.replace(k=1.055878 * SERVO.k, c=1.052926 * SERVO.c, p=0.995546 * SERVO.p)
+    gap = math.radians(1.142902)
+    run = simulate(plant, 13.0, reference=SquareWave(1e-3, 20.0), gap=gap, sample_rate=1000.0)
+    found = estimate_gap(Window.from_run(run, 10.0 - 0.2348, 2.0), model)
+    assert not found.ok
+    assert not found.gap > gap
+
+
 @pytest.mark.slow
 def test_a_compliant_screw_taken_as_rigid():
     assert failures(conditions.compliant_screw(3, (1e6,))) == []

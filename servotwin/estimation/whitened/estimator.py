@@ -7,6 +7,7 @@ the play operator. docs/estimator.md explains it, with its measured accuracy.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -19,7 +20,7 @@ from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_
 from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle, refused
 from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
-from servotwin.estimation.whitened.free_model import ContactEvidence, FactorPrior, adapted
+from servotwin.estimation.whitened.free_model import FREEDOM, ContactEvidence, FactorPrior, adapted
 from servotwin.estimation.whitened.gate import (
     FitEvidence,
     FitFacts,
@@ -50,6 +51,8 @@ __all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "f
 
 METHOD = "whitened"
 _ONE_CONTACT = "one contact with a model that is a little off explains the window nearly as well as two"
+_NUMBERS = "stiffness", "damping", "pitch", "mass ratio"  # in words, as FACTORS has them
+_LEFT = 5e-4  # of the position's slow motion: with less unexplained the model is right, or off by next to nothing
 _NO_SHIFT = ModelShift(0.0, math.inf, "", 0.0)
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
 
@@ -131,6 +134,16 @@ class WindowFit:
         """Judge the fit and make the estimate."""
         if self.aligned is None:
             return self.blank
+        made = self._judged()
+        # A machine that is learnt was fitted with its numbers free.
+        told = made.status in (GapStatus.OK, GapStatus.LOWER_BOUND)
+        if not told or self.learnt is not None or self.evidence.unexplained <= _LEFT:
+            return made
+        return self._beside_free_model(made)
+
+    def _judged(self) -> GapEstimate:
+        """The estimate by the fit alone."""
+        assert self.aligned is not None
         evidence = self.evidence
         status, reasons = judge(evidence, self.settings)
         usable = status in (GapStatus.OK, GapStatus.LOWER_BOUND)
@@ -160,6 +173,23 @@ class WindowFit:
         if self.learnt is None or not teaches:
             return made
         return replace(made, machine=self.learnt.reading(self.settings.calibration))
+
+    def _beside_free_model(self, made: GapEstimate) -> GapEstimate:
+        """The estimate, or a refusal where a fit with the model free within its usual error contradicts it.
+
+        Whitening takes what a wrong model leaves for noise, and its linear shift does not lead from a wrong minimum to
+        the right one. So where anything slow is left, that fit is made.
+        """
+        usual = FactorPrior.of_spreads(*FREEDOM)
+        free = fit(self.window, self.servo, self.prior, self.settings, usual).concluded()
+        if not made.ok:
+            least = free.interval[0] if free.ok or free.status is GapStatus.LOWER_BOUND else 0.0
+            return made if made.gap <= least else self._bounded(least, made.reasons)
+        if not free.ok or abs(free.gap - made.gap) <= NORMAL_95 * math.hypot(free.std_total, made.std_total):
+            return made
+        cause = self.evidence.shift.words if free.machine is None else _farthest(free.machine.factors)
+        words = f"with the model free the gap would be {math.degrees(free.gap):.4g} deg: {cause}"
+        return stated(self.blank, self.evidence, GapStatus.MODEL_MISMATCH, (words,), self.prior, self.settings)
 
     @cached_property
     def facts(self) -> FitFacts:
@@ -192,12 +222,16 @@ class WindowFit:
 
     def _one_contact(self, evidence: FitEvidence, contacts: ContactEvidence, reasons: tuple[str, ...]) -> GapEstimate:
         """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
-        fitted = evidence.aligned.whitened
-        blank = replace(self.blank, reasons=reasons, rms=fitted.residual_rms, evaluations=fitted.evaluations)
         bound = lower_bound(evidence, self.settings) if sure_of_contact(evidence, self.settings) else 0.0
         if bound >= evidence.smallest:  # the lead, which costs far more, can only lower it
             bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings))
-        if bound < evidence.smallest:
+        return self._bounded(bound, reasons)
+
+    def _bounded(self, bound: float, reasons: tuple[str, ...]) -> GapEstimate:
+        """State a lower bound (rad), or, where it says nothing, that the window does not show the gap."""
+        fitted = self.evidence.aligned.whitened
+        blank = replace(self.blank, reasons=reasons, rms=fitted.residual_rms, evaluations=fitted.evaluations)
+        if bound < self.evidence.smallest:
             return replace(blank, status=GapStatus.UNIDENTIFIABLE)
         return replace(blank, status=GapStatus.LOWER_BOUND, gap=bound, interval=(bound, math.inf))
 
@@ -328,6 +362,12 @@ def _count(angle: Array, servo: Servo) -> float:
 def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:
     """Widen a spread and an interval by what the model's factors leave open."""
     return _spread_to(evidence, learnt.gap_std(settings.calibration))
+
+
+def _farthest(factors: Sequence[float]) -> str:
+    """Words on the factor (logarithm) that is the farthest off the model, in usual deviations."""
+    place = int(np.argmax(np.abs(factors) / np.array(FREEDOM)))
+    return f"a {_NUMBERS[place]} off by {100.0 * math.expm1(factors[place]):+.2g} % would explain most of it"
 
 
 def _spread_to(evidence: FitEvidence, std: float) -> FitEvidence:
