@@ -18,6 +18,7 @@ from servotwin.estimation.whitened.estimator import WhitenedSettings, fit
 from servotwin.estimation.whitened.gate import FitEvidence, judge
 from servotwin.estimation.whitened.shift import ModelShift
 from servotwin.estimation.window import Window
+from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave, Step
 from servotwin.simulation import simulate
@@ -72,6 +73,20 @@ def test_a_lower_bound_is_not_above_that_of_a_free_model():
     found = estimate_gap(Window.from_run(run, 10.0 - 0.2348, 2.0), model)
     assert not found.ok
     assert not found.gap > gap
+
+
+def test_a_window_that_begins_after_the_contact_bounds_no_gap():
+    """Free motions took the place of a way of 34 deg to the contact, and 25 deg were stated of a gap of 8."""
+    model = hunting(1000.0, calm=True)
+    plant = model.replace(k=1.00118 * SERVO.k, c=0.934912 * SERVO.c, p=0.995702 * SERVO.p)
+    gap, noise = math.radians(8.159), Noise(1e-6)
+    for seed in (0, 1, 914111070):
+        run = simulate(
+            plant, 13.0, reference=SquareWave(1e-3, 20.0), gap=gap, sample_rate=1000.0, noise=noise, seed=seed
+        )
+        found = estimate_gap(Window.from_run(run, 10.1724, 1.0), model)
+        assert not found.ok
+        assert not found.gap > gap
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from servotwin.estimation.whitened.nearby import PITCH, own_softness
 # Structure's stiffness over the screw's, beyond that of the model. Below the first the lead moves by little, and a
 # screw softer than the last is no drive.
 _SOFTER = (0.0, 0.02, 0.05, 0.1, 0.2)
+_EXCLUDED = 30.0  # rise of the cost over the variance: 5.5 standard deviations
 _GAIN = 0.1  # of the variance: a third of one standard deviation
 
 
@@ -36,7 +37,8 @@ class Lead(NamedTuple):
 
 
 def possible_leads(problem: FreeProblem, single: FreeFit, variance: float) -> list[Lead]:
-    """Leads in the fits of one contact, one for each softness of the screw that explains the window nearly as well.
+    """Leads in the fits of one contact, for each softness of the screw and each begin that explain the window nearly as
+    well.
 
     Parameters
     ----------
@@ -48,9 +50,10 @@ def possible_leads(problem: FreeProblem, single: FreeFit, variance: float) -> li
         Of the residual in units of the noise, at least 1.
     """
     allowed = BELIEVED * variance
-    fits = list(_softer(problem, single, allowed))
-    least = min(fit.cost for fit in fits)
+    fits, begun = list(_softer(problem, single, allowed)), _begun_in_contact(problem, single)
+    least = min(fit.cost for fit in (*fits, *begun))
     possible = [fit for fit in fits if fit.cost <= least + allowed]
+    possible += [fit for fit in begun if fit.cost <= least + _EXCLUDED * variance]
     # Without noise none of a few screws explains the window as well as the true one, which lies between them.
     start = np.array([*single.point, *single.factors])
     possible += other_screws(replace(problem, compliance=0.0), start, (False, True), _GAIN)
@@ -77,6 +80,16 @@ def _softer(problem: FreeProblem, single: FreeFit, allowed: float) -> Iterator[F
         there = np.array([*fit.point, *fit.factors])
         moved = (there - here) / (more - before) if before > 0.0 else moved
         before, here = more, there
+
+
+def _begun_in_contact(problem: FreeProblem, single: FreeFit) -> list[FreeFit]:
+    """Fits in which the motor touches the screw from the first sample on, on either side.
+
+    In a window that begins after the contact, free motions and the machine's own error take the place of a way to it.
+    """
+    stiff = replace(problem, compliance=0.0)
+    starts = [np.array([single.point.gap, side, *single.factors]) for side in (-1.0, 1.0)]
+    return [stiff.descend(start, (False, True), gain=_GAIN) for start in starts]
 
 
 def _lead(problem: FreeProblem, fit: FreeFit, variance: float) -> Lead:
