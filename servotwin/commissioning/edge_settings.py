@@ -254,7 +254,23 @@ class Commissioning:
         InvalidInput
             No fallback set is verified for the whole stated range.
         """
-        agent = dataclasses.replace(self.recorder_settings(servo, boot), parameters=self.start)
+        return self._agent_settings(servo, boot, self.window)
+
+    def check_agent(self, servo: str, boot: str) -> None:
+        """Refuse what `agent_settings` does, without a run that tells how long a step takes; raises InvalidInput."""
+        self._agent_settings(servo, boot, self._own_window)
+
+    def check_recorder(self, servo: str, boot: str) -> None:
+        """Refuse windows that an agent would refuse, without a search for the setting at the start.
+
+        Raises
+        ------
+        InvalidInput
+        """
+        self._recorder_settings(servo, boot, self._own_window)
+
+    def _agent_settings(self, servo: str, boot: str, window: float) -> AgentSettings:
+        agent = dataclasses.replace(self._recorder_settings(servo, boot, window), parameters=self.start)
         own, guarded = gains_of(self.servo.controller), self.guarding
         if guarded is not None:
             open_limits = self.recording.limits == Limits()
@@ -269,14 +285,14 @@ class Commissioning:
             return dataclasses.replace(agent, controller=self.law, own=own, supervision=self.supervision)
         return agent
 
-    def recorder_settings(self, servo: str, boot: str) -> AgentSettings:
+    def _recorder_settings(self, servo: str, boot: str, window: float) -> AgentSettings:
         """Settings of the agent that concern windows."""
         r = self.recording
         return AgentSettings(
             servo=servo,
             boot=boot,
             sample_rate=r.sample_rate,
-            window_s=self.window,
+            window_s=window,
             pre_trigger_s=self.pre_trigger,
             fine_angle=r.fine_angle,
             retry=r.retry,

@@ -108,7 +108,7 @@ class Scenario:
         as_pieces(self.reference, self.duration)
         as_gap(self.gap, self.duration)
         self.commissioning.check_window()
-        self.commissioning.recorder_settings(self.name, BOOT)
+        self.commissioning.check_recorder(self.name, BOOT)
 
     def __repr__(self) -> str:
         """Name, length, servo and policy in one line."""
@@ -155,7 +155,7 @@ class Scenario:
             table.done()
             scenario.servo.check_loop(scenario.law)
             try:
-                scenario.agent_settings()
+                scenario.commissioning.check_agent(scenario.name, BOOT)
             except InvalidInput as error:
                 hint = "; without a twin it can be simulated: enabled = false in [twin], and no policy"
                 raise InvalidInput(f"{error}{hint}") from None
