@@ -15,8 +15,10 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.visible import counted
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
 from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.flank import OneFlank
+from servotwin.estimation.output_error.flank_pair import with_contact
 from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
@@ -61,6 +63,7 @@ def estimate(
     prior: float | GapEstimate | None,
     settings: OutputErrorSettings | None,
     machine: FactorPrior | None = None,
+    before: LastContact | None = None,
 ) -> GapEstimate:
     """Estimate the total gap (rad at the motor) from a window with theta_m and position.
 
@@ -76,6 +79,8 @@ def estimate(
     machine : FactorPrior, optional
         What is known of the machine, in place of the settings' spreads; the estimate then has a reading. Of a rigid
         transmission its pitch counts alone, which is the ratio.
+    before : LastContact, optional
+        Of the last window that showed one flank of a free shaft.
 
     Raises
     ------
@@ -100,6 +105,8 @@ def estimate(
     if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
     stated = _stated(blank, found, verdict, unit)
+    if verdict.one_flank and (here := OneFlank.of(found, settings)) is not None:
+        return with_contact(stated, here, before, window)
     if machine is None or not stated.ok:
         return stated
     if possible is None:
