@@ -133,11 +133,11 @@ def _fits_of_axis(servo: Plant, method: str, settings: TwinSettings) -> _Fits:
     def fitted(
         window: Window, expected: Expectation, machine: FactorPrior | None, *, afresh: bool = False
     ) -> GapEstimate:
-        prior, chosen = None if afresh else expected.prior, _worn(method, expected, settings)
-        if machine is None:
+        prior, contact = (None, None) if afresh else (expected.prior, expected.contact)
+        chosen = _worn(method, expected, settings)
+        if isinstance(chosen, motor_side.MotorSideSettings):
             return estimate_gap(window, servo, method, prior, chosen)
-        assert isinstance(chosen, output_error.OutputErrorSettings)
-        return output_error.estimate(window, servo, prior, chosen, machine)
+        return output_error.estimate(window, servo, prior, chosen, machine, contact)
 
     return fitted
 

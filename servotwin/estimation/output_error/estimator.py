@@ -15,8 +15,10 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.visible import counted
-from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
+from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
 from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.flank import OneFlank
+from servotwin.estimation.output_error.flank_pair import with_contact
 from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
@@ -61,6 +63,7 @@ def estimate(
     prior: float | GapEstimate | None,
     settings: OutputErrorSettings | None,
     machine: FactorPrior | None = None,
+    before: LastContact | None = None,
 ) -> GapEstimate:
     """Estimate the total gap (rad at the motor) from a window with theta_m and position.
 
@@ -76,13 +79,19 @@ def estimate(
     machine : FactorPrior, optional
         What is known of the machine, in place of the settings' spreads; the estimate then has a reading. Of a rigid
         transmission its pitch counts alone, which is the ratio.
+    before : LastContact, optional
+        Of the last window that showed one flank of a free shaft.
 
     Raises
     ------
     InvalidInput
         Another kind of axis, no theta_m, a window too short.
     """
-    return fitted(window, axis, prior, settings or OutputErrorSettings(), machine).estimate
+    made = fitted(window, axis, prior, settings or OutputErrorSettings(), machine)
+    if made.search is None or made.one_flank is None:
+        return made.estimate
+    here = OneFlank.of(made.search, made.one_flank)
+    return made.estimate if here is None else with_contact(made.estimate, here, before, window)
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,11 +105,15 @@ class FittedWindow:
         None: the window was refused before any fit.
     possible : PossibleHalf, optional
         What the window leaves possible of a motion without dynamics.
+    one_flank : OutputErrorSettings, optional
+        Settings of the fit, with what is known of the machine, where one flank explains the window nearly as well as
+        two; otherwise None.
     """
 
     estimate: GapEstimate
     search: Search | None = None
     possible: PossibleHalf | None = None
+    one_flank: OutputErrorSettings | None = None
 
 
 def fitted(
@@ -128,7 +141,8 @@ def fitted(
     if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
     stated = _stated(blank, found, verdict, unit)
-    return FittedWindow(_with_machine(stated, found, possible, settings, machine), found, possible)
+    told = _with_machine(stated, found, possible, settings, machine)
+    return FittedWindow(told, found, possible, settings if verdict.one_flank else None)
 
 
 def _with_machine(

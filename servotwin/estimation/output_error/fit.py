@@ -215,7 +215,12 @@ def plain_cost(problem: FitProblem, values: Array, rate: float = 0.0) -> float:
 
 
 def one_flank(found: Search) -> Fit:
-    """The best fit of a window in which the motor touches one flank only.
+    """The best fit of a window in which the motor touches one flank only."""
+    return min((fit for fits in on_each_flank(found) for fit in fits), key=lambda fit: fit.cost)
+
+
+def on_each_flank(found: Search) -> tuple[list[Fit], list[Fit]]:
+    """Fits with the lower and with the upper flank only.
 
     The gap is so wide that the other flank is out of reach, and fixed.
     """
@@ -226,4 +231,4 @@ def one_flank(found: Search) -> Fit:
         costs = [plain_cost(problem, values, rate) for values in tried]
         start = tried[int(np.argmin(costs))]
         best.append(descend(problem, start, found.noise, free, _SINGLE_STEPS, rate))
-    return min(best, key=lambda fit: fit.cost)
+    return best[: len(best) // 2], best[len(best) // 2 :]

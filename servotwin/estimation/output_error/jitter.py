@@ -44,8 +44,8 @@ class TimeJitter(NamedTuple):
     lasting: bool = False
 
 
-def time_jitter(found: Search) -> TimeJitter:
-    """Errors that grow with the speed in a fit's residual.
+def time_jitter(found: Search, which: int = HALF) -> TimeJitter:
+    """Errors that grow with the speed in a fit's residual; `which`: unknown that counts in place of the half gap.
 
     The squares of its differences are regressed on the squared speed (Breusch and Pagan's test, studentised by
     Koenker): the slope is the variance of the times. What it does to the half gap is linearised; and no number is known
@@ -61,7 +61,7 @@ def time_jitter(found: Search) -> TimeJitter:
         return TimeJitter()
     noise = time * speed
     least = float(np.sum(noise**4)) / float(np.linalg.norm(noise)) ** 3
-    half = max(least, float(np.linalg.norm(_weights(found) * noise)))
+    half = max(least, float(np.linalg.norm(_weights(found, which) * noise)))
     return TimeJitter(time, half, _lasting(speed[1:-1] * differences))
 
 
@@ -87,10 +87,10 @@ def _regressed(squares: Array, by: Array) -> tuple[float, float]:
     return (squares.size * slope**2 * size / total, slope) if slope > 0.0 else (0.0, 0.0)
 
 
-def _weights(found: Search) -> Array:
-    """(m,) change of the half gap by each sample of the residual, linearised, beside the other unknowns."""
+def _weights(found: Search, which: int) -> Array:
+    """(m,) change of an unknown by each sample of the residual, linearised, beside the other unknowns."""
     rows = found.best.rows[found.free]
-    at, size = int(np.sum(found.free[:HALF])), np.linalg.norm(rows, axis=1)
+    at, size = int(np.sum(found.free[:which])), np.linalg.norm(rows, axis=1)
     size[size == 0.0] = 1.0
     scaled = rows / size[:, None]
     inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)

@@ -168,11 +168,15 @@ class ShaftModel:
     priors : Priors
     learnt : (4, 4) array, optional
         Covariance of the logarithms of stiffness, damping, ratio and ratio of the masses, in place of their `priors`.
+    friction : float, optional
+        Standard deviation of the logarithm of the load's friction, where it is known; None: it is as hardly known as a
+        damping.
     """
 
     axis: Axis
     priors: Priors
     learnt: Array | None = None
+    friction: float | None = None
 
     @property
     def speed(self) -> float:
@@ -197,7 +201,8 @@ class ShaftModel:
         if any(load.c):
             factors.append(Unknown("load damping", known.damping, "damping"))
         if load.friction > 0.0:
-            factors.append(Unknown("load friction", known.damping, "damping"))
+            unit = "damping" if self.friction is None else "factor"
+            factors.append(Unknown("load friction", self.friction or known.damping, unit))
         if load.force != 0.0:
             factors.append(Unknown("load force", known.stiffness, "factor"))
         if any(load.k):

@@ -29,8 +29,9 @@ class OutputErrorSettings:
             "friction_share",
             minimum=0.0,
             below=1.0,
-            help="Half-width of the stated Coulomb friction of a load that the gap holds: within it the friction that "
-            "fits best is believed, and its doubt is in the interval.",
+            help="Half-width of the stated Coulomb friction of the load. If the gap holds the load, the friction that "
+            "fits best is believed within it, and its doubt is in the interval; of a free shaft it counts where two "
+            "windows of one flank each show the gap.",
         ),
     ] = 0.25
     delay: Annotated[

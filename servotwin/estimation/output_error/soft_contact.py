@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.estimation.output_error.fit import Fit, Search
-from servotwin.estimation.output_error.models import DELAY, ShaftModel
+from servotwin.estimation.output_error.models import DELAY, HALF, ShaftModel
 from servotwin.estimation.output_error.problem import Problem, delayed
 from servotwin.estimation.output_error.rounding import influence
 from servotwin.plant.signals import Array
@@ -23,15 +23,17 @@ _DIFFERENCE = 1e-4  # makes a derivative
 _SURE = 4.0  # computed standard deviations of a change by chance: two, each twice the computed one as in `verdict`
 
 
-def moved_by_contact(found: Search) -> float:
+def moved_by_contact(found: Search, which: int = HALF) -> float:
     """Change of the half gap (m or rad at the load), linearised, if the stiffness at first contact were free.
 
-    Beyond what noise and rounding make of it.
+    Beyond what noise and rounding make of it. `which`: unknown that counts in place of the half gap.
     """
     problem, whole = found.problem, np.arange(found.best.residual.size)
     if not isinstance(problem, Problem) or not isinstance(problem.model, ShaftModel):
         return 0.0
-    (without, *known), (given, *open_) = influence(found, whole), influence(_with_soft_contact(found, problem), whole)
+    (without, *known), (given, *open_) = (
+        influence(each, whole, which) for each in (found, _with_soft_contact(found, problem))
+    )
     chance = max(0.0, math.hypot(*open_) ** 2 - math.hypot(*known) ** 2)
     return math.sqrt(max(0.0, (given - without) ** 2 - _SURE**2 * chance))
 

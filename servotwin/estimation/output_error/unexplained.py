@@ -41,12 +41,12 @@ def slow_error(found: Search) -> float:
     return math.sqrt(max(0.0, left**2 - (_EVENLY * problem.count) ** 2))
 
 
-def unexplained(found: Search) -> float:
-    """Standard deviation of the half gap (m or rad at the load) by the slow error: the gap may hide as much as it
-    leaves.
+def unexplained(found: Search, which: int = HALF) -> float:
+    """Standard deviation of the half gap, or of another unknown (m or rad at the load), by the slow error: it may hide
+    as much as it leaves.
     """
     error = slow_error(found)
-    return max(error, *left_open(found, error, [HALF])) if error > 0.0 else 0.0
+    return max(error, *left_open(found, error, [which])) if error > 0.0 else 0.0
 
 
 def left_open(found: Search, error: float, places: Sequence[int]) -> list[float]:

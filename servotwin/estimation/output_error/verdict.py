@@ -22,17 +22,17 @@ from servotwin.estimation.output_error.soft_contact import moved_by_contact
 from servotwin.estimation.output_error.unexplained import slow, unexplained
 from servotwin.plant.signals import Array
 
-_BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
+BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
-_RIVAL = 30.0  # the same of another gap that explains the window as well
+RIVAL = 30.0  # the same of another gap that explains the window as well
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
-_APART = 4.0  # standard deviations between the halves of a window
-_UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
+APART = 4.0  # standard deviations between the halves of a window
+UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
 _OUTLYING = 7.0  # standard deviations
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 # The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
-_DOUBT = 2.0  # interval over the computed one
+DOUBT = 2.0  # interval over the computed one
 _RATCHET = 4.0  # of the noise left in the motor's angle: its extremes push the load, so that the gap seems wider
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
@@ -55,6 +55,8 @@ class JudgedFit:
     reasons : tuple of str
     ratio : UnknownRatio, optional
         The transmission's ratio, where the window would show the gap with it.
+    one_flank : bool
+        True where one flank explains the window nearly as well as two.
     """
 
     status: GapStatus
@@ -63,6 +65,7 @@ class JudgedFit:
     std_total: float = math.inf
     reasons: tuple[str, ...] = ()
     ratio: UnknownRatio | None = None
+    one_flank: bool = False
 
 
 def judge(
@@ -93,8 +96,9 @@ def judge(
         return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
     single, likely_single = _single(found, known)
     if likely_single:
-        return _bounded(found, single, "one flank explains the window nearly as well as two")
-    allowed = _allowed(found, known.half, settings)
+        bounded = _bounded(found, single, "one flank explains the window nearly as well as two")
+        return replace(bounded, one_flank=True)
+    allowed = largest_std(found, known.half, settings)
     doubts, explained = _doubts(found, known, allowed, unit, settings.friction)
     if not doubts and _out_of_reach(found, known.half + NORMAL_95 * explained):
         return _bounded(found, single, "the interval contains gaps that the motor does not cross in the window")
@@ -124,7 +128,7 @@ def _known_half(
     std *= settings.calibration
     growth = grown(found, settings.gap_rate / unit)
     floor = 0.5 * _ROUNDED * found.problem.count
-    total = math.hypot(_DOUBT * std, settings.model_share * half, floor, growth, _RATCHET * jitter)
+    total = math.hypot(DOUBT * std, settings.model_share * half, floor, growth, _RATCHET * jitter)
     return _KnownHalf(half, std, total)
 
 
@@ -136,7 +140,7 @@ def _single(found: Search, known: _KnownHalf) -> tuple[Fit, bool]:
         singles += one_flank_without_a_gap(found)
     single = min(singles, key=lambda fit: fit.cost)
     rise = (single.cost - best.cost) / best.variance()
-    return single, rise < _BELIEVED or any(_alike(found, fit) for fit in singles)
+    return single, rise < BELIEVED or any(_alike(found, fit) for fit in singles)
 
 
 def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
@@ -175,7 +179,7 @@ def _doubts(
         _of_jitter(times, allowed, unit),
     )
     contact = 0.0 if any(doubts) else moved_by_contact(found)
-    explained = math.hypot(total, friction.std, _DOUBT * left, _DOUBT * times.half, _DOUBT * contact)
+    explained = math.hypot(total, friction.std, DOUBT * left, DOUBT * times.half, DOUBT * contact)
     return tuple(filter(None, doubts)), explained
 
 
@@ -216,7 +220,7 @@ def _alike(found: Search, single: Fit) -> bool:
     return float(np.max(np.abs(single.raw - found.best.raw))) < _ALIKE * found.problem.count
 
 
-def _allowed(found: Search, half: float, settings: OutputErrorSettings) -> float:
+def largest_std(found: Search, half: float, settings: OutputErrorSettings) -> float:
     """Largest standard deviation with which a half gap counts as known, m or rad at the load."""
     travel = 0.5 * _TRAVEL * float(np.ptp(found.problem.drive))
     return max(settings.largest_share * half, 0.5 * settings.counts * found.problem.count, travel)
@@ -245,8 +249,8 @@ def _of_friction(found: Search, friction: _FrictionDoubt, allowed: float, unit: 
 
 def _of_slow_motion(left: float, half: float, allowed: float, unit: float) -> str:
     """Sentence for slow motion whose interval contains every smaller half gap (m or rad at the load): no news."""
-    hidden = NORMAL_95 * _DOUBT * left
-    if hidden <= max(half, NORMAL_95 * _DOUBT * allowed):
+    hidden = NORMAL_95 * DOUBT * left
+    if hidden <= max(half, NORMAL_95 * DOUBT * allowed):
         return ""
     return (
         f"the model leaves slow motion that may hide {_deg(unit * hidden)}, and the gap would be {_deg(unit * half)}: "
@@ -313,7 +317,7 @@ def _rival(found: Search, half: float, total: float, unit: float) -> str:
     best = found.best
     for other in found.others:
         apart = abs(float(other.values[HALF]) - half)
-        if apart > NORMAL_95 * total and (other.cost - best.cost) / best.variance() < _RIVAL:
+        if apart > NORMAL_95 * total and (other.cost - best.cost) / best.variance() < RIVAL:
             return f"a gap of {_deg(unit * float(other.values[HALF]))} explains the window nearly as well"
     return ""
 
@@ -328,9 +332,9 @@ def _mismatches(found: Search, likely: Array, rate: float, least: float) -> tupl
     variation = float(np.std(problem.position))
     left = slow(best.raw, max(1, best.raw.size // 100))
     share = left / variation if variation > 0.0 else math.inf
-    if share > _UNEXPLAINED:
+    if share > UNEXPLAINED:
         sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
-    elif problem.model.speed == 0.0 and left > max(_UNEXPLAINED * best.values[HALF], problem.count):
+    elif problem.model.speed == 0.0 and left > max(UNEXPLAINED * best.values[HALF], problem.count):
         sentences.append(
             f"the model leaves motion of {100.0 * left / best.values[HALF]:.0f} % of half the gap unexplained"
         )
@@ -368,7 +372,7 @@ def differing_halves(found: Search, rate: float) -> tuple[str, ...]:
     """Sentence for a window whose halves differ by more than a growth at a `rate` (1/s, of the half gap) explains."""
     difference, spread = between_halves(found)
     apart = abs(difference) / math.hypot(spread, 0.5 * rate * found.problem.duration)
-    return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > _APART else ()
+    return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > APART else ()
 
 
 def _outliers(found: Search, least: float) -> tuple[str, ...]:
@@ -383,15 +387,15 @@ def _outliers(found: Search, least: float) -> tuple[str, ...]:
     return (f"in a few places the model errs by {most / rms:.2g} times as much as in the others",)
 
 
-def between_halves(found: Search) -> tuple[float, float]:
-    """Difference of the half gap between the second and the first half of a window, linearised, and its std.
+def between_halves(found: Search, which: int = HALF) -> tuple[float, float]:
+    """Difference of an unknown between the second and the first half of a window, linearised, and its std.
 
-    The standard deviation is inf where a half does not show the gap.
+    The standard deviation is inf where a half does not show it.
     """
     data = found.best.raw.size
     prior = np.arange(data, found.best.residual.size)
     parts = np.array_split(np.arange(data), 2)
-    (one, *first), (two, *second) = (influence(found, np.concatenate([part, prior])) for part in parts)
+    (one, *first), (two, *second) = (influence(found, np.concatenate([part, prior]), which) for part in parts)
     return two - one, math.hypot(*first, *second, _ROUNDED * found.problem.count)
 
 
@@ -402,7 +406,7 @@ def grown(found: Search, rate: float) -> float:
     show of it, whichever is less: the rate may be a mere assumption.
     """
     apart, spread = between_halves(found)
-    return _EVENLY * min(rate * found.problem.duration, 2.0 * math.hypot(apart, _DOUBT * spread))
+    return _EVENLY * min(rate * found.problem.duration, 2.0 * math.hypot(apart, DOUBT * spread))
 
 
 def _deg(angle: float) -> str:

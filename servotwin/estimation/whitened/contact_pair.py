@@ -24,6 +24,16 @@ from servotwin.estimation.estimate import (
     OffsetReading,
     interval_95,
 )
+from servotwin.estimation.two_contacts import (
+    AGREE,
+    LEAST_PITCH,
+    VAGUE,
+    WITHIN,
+    confirmed_std,
+    deg,
+    followed,
+    unconfirmed,
+)
 from servotwin.estimation.whitened.doubt import way_doubt
 from servotwin.estimation.whitened.estimator import WindowFit
 from servotwin.estimation.whitened.fit import WhitenedFit
@@ -35,11 +45,6 @@ from servotwin.estimation.whitened.reduction import CONSTANT, PLACE, RESIDUAL, P
 from servotwin.estimation.whitened.shift import fastest
 from servotwin.plant.servo import Servo
 
-_AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
-_SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
-_VAGUE = 2.0  # times the largest standard deviation of an estimate
-_WITHIN = 0.25  # standard deviations per growth within a window, which its one contact hardly tells from the way to it
-_PITCH = 0.002  # least standard deviation of the pitch: noise and cyclic errors of the angle bend it beyond its own
 _ROUNDED = math.sqrt(1.0 / 12.0)  # of a count, at each contact
 
 
@@ -189,7 +194,7 @@ class Pair:
             return ""
         possible = NORMAL_95 * self.here.fitted.settings.gap_rate * (self.here.begin.time - self.before.time)
         against = _against(self.here, self.between, self.before.lead, possible)
-        return against or _unconfirmed(self.between, self.before.between, possible)
+        return against or unconfirmed(self.between, self.before.between, possible)
 
     @property
     def estimate(self) -> GapEstimate | None:
@@ -208,7 +213,7 @@ class Pair:
         seen, earlier = self.between, None if self.before is None else self.before.between
         if seen is None:
             return True
-        elapsed, spread = other.time - seen.time, _AGREE * math.hypot(other.std_total, seen.std)
+        elapsed, spread = other.time - seen.time, AGREE * math.hypot(other.std_total, seen.std)
         if math.isnan(seen.rate):
             return abs(other.gap - seen.gap) <= spread + NORMAL_95 * self.here.fitted.settings.gap_rate * elapsed
         bend = 0.0 if earlier is None or math.isnan(earlier.rate) else abs(seen.rate - earlier.rate)
@@ -233,24 +238,19 @@ def pair(here: OneContact, before: LastContact | None) -> Pair:
         return Pair(here, replace(contact, between=before.between))
     moved = (here.begin.position - before.position) / here.gain
     gap, std = before.side * (before.motor + moved - here.begin.motor), _spread(here, before, moved)
-    between = _followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
+    between = followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
     # What is known so badly confirms no other gap.
-    vague = std > _VAGUE * here.fitted.settings.largest_std
+    vague = std > VAGUE * here.fitted.settings.largest_std
     return Pair(here, replace(contact, between=before.between if vague else between), before, between)
-
-
-def _followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
-    """The gap with its growth since an earlier one."""
-    if earlier is None or not now.time > earlier.time:
-        return now
-    return replace(now, rate=(now.gap - earlier.gap) / (now.time - earlier.time))
 
 
 def _spread(here: OneContact, before: LastContact, moved: float) -> float:
     """Standard deviation of the gap between two contacts, rad; `moved`: the screw's way in between, rad."""
     problem = here.learnt.problem
     # A softer screw takes more of the travel.
-    pitch = max(_PITCH, math.sqrt(problem.prior.covariance[PITCH, PITCH]), SCREW_SPREAD * own_softness(problem.servo))
+    pitch = max(
+        LEAST_PITCH, math.sqrt(problem.prior.covariance[PITCH, PITCH]), SCREW_SPREAD * own_softness(problem.servo)
+    )
     way, level = here.way_std, here.begin.std / here.gain
     unsure = max(0.0, here.apart - NORMAL_95 * way)
     return math.hypot(way + level, unsure, before.std, here.rounded, pitch * moved)
@@ -262,37 +262,22 @@ def _against(here: OneContact, between: GapBetween, lead: float, possible: float
     `lead`: of the motor in the window before, rad.
     """
     settings = here.fitted.settings
-    gap, least, widest = between.gap, -_AGREE * between.std, between.std * here.fitted.facts.caution
+    gap, least, widest = between.gap, -AGREE * between.std, between.std * here.fitted.facts.caution
     if not widest <= settings.largest_std:
-        return f"two contacts show the gap to {_deg(widest)} only, and {_deg(settings.largest_std)} are allowed"
+        return f"two contacts show the gap to {deg(widest)} only, and {deg(settings.largest_std)} are allowed"
     # Half of the growth is on the side of the contact before, and the motor follows it.
     if not gap >= max(here.way - 0.5 * possible, lead, 0.0) + least:
         ahead = max(here.way, lead)
-        return f"the motor leads the screw by {_deg(ahead)}, more than the {_deg(gap)} between two contacts"
+        return f"the motor leads the screw by {deg(ahead)}, more than the {deg(gap)} between two contacts"
     if (shifted := here.shifted()) > settings.largest_shift:
-        return f"with the model free the contact would move by {_deg(shifted)} more than its spread"
+        return f"with the model free the contact would move by {deg(shifted)} more than its spread"
     return ""
-
-
-def _unconfirmed(now: GapBetween, earlier: GapBetween | None, possible: float) -> str:
-    """Reason for which the two contacts before do not confirm a gap; empty: they do."""
-    if earlier is None:
-        return f"two contacts show a gap of {_deg(now.gap)}: another window must confirm it"
-    spread = _AGREE * math.hypot(now.std, earlier.std)
-    if -spread <= now.gap - earlier.gap <= possible + spread:
-        return ""
-    return f"two contacts show a gap of {_deg(now.gap)}, the two before {_deg(earlier.gap)}"
 
 
 def _stated(here: OneContact, before: LastContact, now: GapBetween, earlier: GapBetween) -> GapEstimate:
     """Make the estimate of the gap between two contacts."""
     fitted, settings = here.fitted, here.fitted.settings
-    elapsed = now.time - earlier.time
-    steady = 0.0 if math.isnan(earlier.rate) else max(0.0, earlier.rate) * elapsed
-    # An encoder that slips, or a position that drifts to and fro, looks like growth once.
-    sudden = math.hypot(now.gap - earlier.gap - steady, earlier.std)
-    within = _WITHIN * settings.gap_rate * fitted.window.duration
-    std = math.hypot(now.std, _SUDDEN * sudden, within)
+    std = math.hypot(confirmed_std(now, earlier), WITHIN * settings.gap_rate * fitted.window.duration)
     total = math.hypot(std, settings.model_error, here.doubt())
     # The middle of both contacts, as if they were of one moment.
     levels = (before.position + here.begin.position) / here.gain - before.motor - here.begin.motor
@@ -366,7 +351,3 @@ def _level_stds(fitted: WindowFit, result: WhitenedFit) -> tuple[float, float]:
     last = scale * solved.deviation(weights)
     weights[0] = 0.5 * result.reduction.response.static_gain * result.point.gap
     return scale * solved.deviation(weights), last
-
-
-def _deg(angle: float) -> str:
-    return f"{math.degrees(angle):.3g} deg"

@@ -1,0 +1,48 @@
+"""Confirmation of a gap that the contacts of two windows show, one on each side, by the two contacts before."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from servotwin.estimation.estimate import GapBetween
+
+AGREE = 3.0  # standard deviations by which the gaps of two pairs may differ
+SUDDEN = 0.6  # standard deviations per growth that was not there before: its whole size is then within the interval
+VAGUE = 2.0  # times the largest standard deviation of an estimate: a pair that knows its gap so badly confirms none
+WITHIN = 0.25  # standard deviations per growth within a window, which its one contact hardly tells from the way to it
+LEAST_PITCH = (
+    0.002  # least standard deviation of the pitch: noise and cyclic errors of the angle bend it beyond its own
+)
+
+
+def followed(now: GapBetween, earlier: GapBetween | None) -> GapBetween:
+    """The gap with its growth since an earlier one."""
+    if earlier is None or not now.time > earlier.time:
+        return now
+    return replace(now, rate=(now.gap - earlier.gap) / (now.time - earlier.time))
+
+
+def unconfirmed(now: GapBetween, earlier: GapBetween | None, possible: float) -> str:
+    """Reason for which the two contacts before do not confirm a gap that may have grown (rad); empty: they do."""
+    if earlier is None:
+        return f"two contacts show a gap of {deg(now.gap)}: another window must confirm it"
+    spread = AGREE * math.hypot(now.std, earlier.std)
+    if -spread <= now.gap - earlier.gap <= possible + spread:
+        return ""
+    return f"two contacts show a gap of {deg(now.gap)}, the two before {deg(earlier.gap)}"
+
+
+def confirmed_std(now: GapBetween, earlier: GapBetween) -> float:
+    """Standard deviation (rad) of a gap with its growth since the one that confirms it.
+
+    An encoder that slips, or a position that drifts to and fro, looks like growth once.
+    """
+    elapsed = now.time - earlier.time
+    steady = 0.0 if math.isnan(earlier.rate) else max(0.0, earlier.rate) * elapsed
+    return math.hypot(now.std, SUDDEN * math.hypot(now.gap - earlier.gap - steady, earlier.std))
+
+
+def deg(angle: float) -> str:
+    """An angle (rad) in words."""
+    return f"{math.degrees(angle):.3g} deg"
