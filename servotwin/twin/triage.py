@@ -34,7 +34,9 @@ _SHORTEST = 400  # samples, as for the estimator
 # Factor per window on the usual misfit. It fades slowly, because steps to one side may leave a larger misfit than those
 # to the other.
 _FADES = 0.95
-_PATIENCE, _SPARSE = 3, 8  # rejected estimates in a row, after which one window in _SPARSE is tried
+# Rejected estimates in a row, after which one window in _SPARSE is tried. That is odd: steps to and fro show one flank
+# and the other by turns, and two of these show the gap together.
+_PATIENCE, _SPARSE = 3, 7
 
 
 class TriageState(Struct, frozen=True):
