@@ -22,7 +22,7 @@ from servotwin.plant.actuator import DcMotor, TorqueDrive
 from servotwin.plant.axis import AXES, Axis
 from servotwin.plant.load import Load
 from servotwin.plant.sensors import Sensors
-from servotwin.plant.signals import SquareWave
+from servotwin.plant.signals import Array, SquareWave
 from servotwin.plant.transmission import Transmission
 from servotwin.simulation import simulate
 from servotwin.twin.settings import TwinSettings
@@ -130,3 +130,26 @@ def test_the_errors_of_the_observer_fade_at_its_rate_however_few_the_samples(tur
     moved = np.array([[1.0, interval], [0.0, 1.0]]) @ np.array([[1.0 - places, 0.0], [-speeds, 1.0]])
     assert np.trace(moved) == pytest.approx(2.0 * math.exp(-turn), rel=1e-12)
     assert np.linalg.det(moved) == pytest.approx(math.exp(-2.0 * turn), rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_of_a_count_of_the_motors_encoder_does_not_widen_the_gap(seed: int) -> None:
+    """Play follows the extremes of a noisy angle: with a low-pass alone the gap is a count too wide, and outside."""
+    axis, random = Axis.preset("micro-positioner"), np.random.default_rng(seed)
+    fine = axis.replace(sensors=replace(axis.sensors, encoder_resolution=0.0, position_resolution=0.0))
+    gap = 6e-7 / axis.p
+    run = simulate(fine, 9.0, reference=SquareWave(1.2e-5, 6.0), gap=gap, sample_rate=5000.0)
+    window = Window.from_run(run, 2.85, 4.8)
+
+    def read(signal: Array, count: float) -> Array:
+        return np.asarray(count * np.round(signal / count + random.normal(size=signal.size)))
+
+    assert window.theta_m is not None
+    noisy = window.replace(
+        theta_m=read(window.theta_m, axis.sensors.encoder_resolution),
+        position=read(window.position, axis.sensors.position_resolution),
+    )
+    found = estimate_gap(noisy, axis)
+    assert found.ok, found.reasons
+    assert found.interval[0] <= gap <= found.interval[1]
+    assert abs(found.gap - gap) < axis.sensors.encoder_resolution

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from servotwin.estimation.core.motor_angle import without_noise
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.estimator import _problem
 from servotwin.estimation.output_error.fit import Search
-from servotwin.estimation.output_error.motor_angle import without_noise
 from servotwin.estimation.output_error.play_model import lagged
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.search import search

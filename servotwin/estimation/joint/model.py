@@ -19,7 +19,7 @@ from servotwin.estimation.core.contacts import BY_GAP, BY_RATE, BY_START, SCREW,
 from servotwin.estimation.core.counts import between_counts, errors_between, errors_of_counts
 from servotwin.estimation.core.family import STRUCTURE, InputHold, Sampled, motor_family, structure_family
 from servotwin.estimation.core.least_squares import orthonormal, project_out
-from servotwin.estimation.output_error.motor_angle import noise_of, without_noise
+from servotwin.estimation.core.motor_angle import noise_of, without_noise
 from servotwin.estimation.window import Window
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array

@@ -14,6 +14,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.decimation import decimation
+from servotwin.estimation.core.motor_angle import MotorAngle, without_noise
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
 from servotwin.estimation.output_error.fit import Search
@@ -22,7 +23,6 @@ from servotwin.estimation.output_error.flank_pair import with_contact
 from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
-from servotwin.estimation.output_error.motor_angle import MotorAngle, without_noise
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem

@@ -8,8 +8,8 @@ from functools import cached_property
 
 import numpy as np
 
+from servotwin.estimation.core.motor_angle import noise_of
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel, usual_sizes
-from servotwin.estimation.output_error.motor_angle import noise_of
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares
+from servotwin.estimation.core.motor_angle import without_noise
 from servotwin.estimation.core.response import response
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapEstimate, GapStatus
@@ -210,7 +211,8 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
     """(n,) theta_m, low-passed without phase where the encoder is noisy.
 
     The play operator would ratchet to the extremes of the noise. The cut-off goes from 200 Hz for little noise down to
-    60 Hz, on the paper's servo.
+    60 Hz, on the paper's servo. Louder noise than that one takes away, beyond the counts, is smoothed as far as the
+    motion allows.
 
     Parameters
     ----------
@@ -227,6 +229,10 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
         noise = _encoder_noise(window.theta_m)
         if max(noise, resolution / math.sqrt(12.0)) <= _QUIET:
             return window.theta_m
+        if noise > _LOUD:
+            smooth = without_noise(window.theta_m, max(resolution, counted(window.theta_m))).angle
+            if smooth is not window.theta_m:
+                return smooth
         share = math.log(max(noise, _QUIET) / _QUIET) / math.log(_LOUD / _QUIET)
         cutoff = _HIGHEST_HZ / second * (_LOWEST_HZ / _HIGHEST_HZ) ** min(1.0, share)
         if cutoff >= 0.45 * rate:
