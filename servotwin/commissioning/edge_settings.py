@@ -162,10 +162,11 @@ class Commissioning:
 
         The load touches the other flank where it is slowed down.
         """
-        own, start = self._own_window, self.start
+        own = self._own_window
         if self.recording.window is not None:
             return own
-        law, step = with_gains(self.law, start.setting.gains), self.twin.uncertainty.step[1]
+        start, step = self.start, self.twin.uncertainty.step[1]
+        law = with_gains(self.law, start.setting.gains)
         taken = move_time(self.servo, law, start.setting.tolerance, step, _LONGEST_MOVE * own)
         return max(own, self._whole(_BEYOND_MOVE * taken))
 
