@@ -52,6 +52,7 @@ __all__ = ["METHOD", "SHORTEST", "WhitenedSettings", "WindowFit", "estimate", "f
 METHOD = "whitened"
 _ONE_CONTACT = "one contact with a model that is a little off explains the window nearly as well as two"
 _NUMBERS = "stiffness", "damping", "pitch", "mass ratio"  # in words, as FACTORS has them
+_COUNT = math.sqrt(12.0)  # of the deviation that rounding to it leaves
 _LEFT = 5e-4  # of the position's slow motion: with less unexplained the model is right, or off by next to nothing
 _NO_SHIFT = ModelShift(0.0, math.inf, "", 0.0)
 SHORTEST = 400  # samples: with fewer there is little left beside the nuisances
@@ -209,16 +210,20 @@ class WindowFit:
         return evidence
 
     def _moved_by_growth(self) -> float:
-        """Distance (rad) of the gap from that of the same window taken for constant.
+        """Distance (rad) of the gap from that of the same window taken for constant, as far as rounding can feign it.
 
         Two pushes tell gap, offset and growth apart by less than a count of the position, where the machine's own
-        error is as large.
+        error is as large. What the growing gap explains beyond what the fit leaves is growth.
         """
         assert self.aligned is not None
-        gap, still = self.aligned.whitened.point.gap, replace(self.settings, gap_rate=0.0)
+        fitted, still = self.aligned.whitened, replace(self.settings, gap_rate=0.0)
         position, rate = self.window.position, self.window.sample_rate
-        _, points = coarse_search(self.angle, position, rate, self.servo, gap, still)
-        return abs(align_and_fit(self.angle, position, rate, self.servo, points, still).whitened.point.gap - gap)
+        _, points = coarse_search(self.angle, position, rate, self.servo, fitted.point.gap, still)
+        constant = align_and_fit(self.angle, position, rate, self.servo, points, still).whitened
+        explained = math.sqrt(max(0.0, constant.residual_rms**2 - fitted.residual_rms**2))
+        feigned = _COUNT * fitted.residual_rms
+        share = 1.0 if explained <= feigned else feigned / explained
+        return share * abs(constant.point.gap - fitted.point.gap)
 
     def _one_contact(self, evidence: FitEvidence, contacts: ContactEvidence, reasons: tuple[str, ...]) -> GapEstimate:
         """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
