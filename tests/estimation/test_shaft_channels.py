@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.axis_faults import faulty_windows
 from benchmarks.random_axes import random_axis, step_window
+from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.whitened.channels import faults
@@ -78,6 +79,25 @@ def test_a_motor_that_friction_stops_is_not_saturated_and_one_whose_channel_is_c
     sentences = faults(Window(1e-6 * cut, 1e-3 * cut, sample_rate=1000.0))
     assert all("stays at its extreme" in sentence for sentence in sentences)
     assert len(sentences) == 2
+
+
+def test_a_load_that_friction_stops_within_few_samples_is_not_saturated() -> None:
+    """Seen on a ball screw: the load brakes once its motor no longer pushes it, by 25 counts in each sample."""
+    steps = np.concatenate([np.full(400, 92.0), [85.0, 77.0, 73.0, 61.0, 36.0, 11.0], np.zeros(200)])
+    counts = np.cumsum(np.concatenate([steps, -steps]))
+    assert faults(Window(1e-7 * counts, 1e-3 * counts, sample_rate=2000.0)) == ()
+    cut = np.minimum(counts, counts.max() - 150.0)
+    assert any("stays at its extreme" in each for each in faults(Window(1e-7 * cut, 1e-3 * counts, sample_rate=2000.0)))
+
+
+def test_a_load_that_breaks_loose_by_a_count_has_not_slipped_where_samples_were_rounded_again() -> None:
+    """A message's 16 bits lie beside the grid of an encoder of 17."""
+    count = 2.0 * math.pi / 2**17
+    counts = np.concatenate([np.repeat(np.arange(0.0, 60.0), 30), np.full(300, 60.0), np.full(300, 61.0)])
+    position = np.round(count * counts / 7e-7) * 7e-7
+    assert counted(position) == pytest.approx(count, rel=5e-3)
+    motor = np.concatenate([np.sin(np.linspace(0.0, 0.5 * math.pi, 1800)), np.ones(600)])
+    assert faults(Window(position, motor, sample_rate=1000.0), ROTARY) == ()
 
 
 def test_noise_of_few_counts_that_repeats_by_chance_was_not_held() -> None:

@@ -15,6 +15,8 @@ from servotwin.plant.signals import Array
 TRAVEL, BOUND = math.radians(0.5), math.radians(0.1)
 _SHARE = 1.0 / 3.0  # of the gap
 _TRAVEL_COUNTS, _BOUND_COUNTS = 100.0, 30.0
+# Of a count, for samples that were rounded twice; steps that are so many counts long tell nothing of it; so many do.
+_ROUNDED_AGAIN, _NEAR, _ENOUGH = 0.1, 4.5, 12
 
 
 def least_travel(gap: float, resolution: float) -> float:
@@ -31,12 +33,23 @@ def least_bound(resolution: float) -> float:
 
 
 def counted(angle: Array) -> float:
-    """Count (rad) of an encoder that shows in its angle, all values of which lie on one grid; 0 where none shows."""
+    """Count (rad) of an encoder that shows in its angle, all values of which lie on one grid; 0 where none shows.
+
+    Samples that were rounded once more, for the link or a log, lie beside that grid, by less than a tenth of it.
+    """
     values = np.unique(angle)
     # An angle that moves evenly takes evenly spaced values too, but each of them once.
     if not 3 <= values.size <= 0.75 * angle.size:
         return 0.0
     steps = np.diff(values)
-    ratios = steps / steps.min()
-    even = np.abs(ratios - np.round(ratios)) <= 1e-3 * ratios
-    return float(steps.min()) if np.all(even) else 0.0
+    least = float(steps.min())
+    if np.all(_beside_grid(steps, least) <= 1e-3 * steps):
+        return least
+    count = float(np.mean(steps[steps < 1.5 * least]))
+    near = steps[steps < _NEAR * count]
+    return count if near.size >= _ENOUGH and np.all(_beside_grid(near, count) <= _ROUNDED_AGAIN * count) else 0.0
+
+
+def _beside_grid(steps: Array, count: float) -> Array:
+    """Distances (as the steps) of steps from the next multiples of a count."""
+    return np.abs(steps - count * np.round(steps / count))

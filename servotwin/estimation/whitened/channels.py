@@ -180,7 +180,8 @@ def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: st
         fastest = float(np.partition(run, -5)[-5])
         entries = begins[(begins > _RUN) & (ends - begins >= _CREST)]
         reached = [entry for entry in entries if np.all(steps[entry - _RUN : entry] > 0.0)]
-        if any(min(run[entry - _RUN], _run_ahead(steps, entry)) > _STEEP * fastest for entry in reached):
+        ways = (min(run[entry - _RUN], _run_ahead(steps, entry), _way_to_rest(steps, entry)) for entry in reached)
+        if any(way > _STEEP * fastest for way in ways):
             value = f"{factor * extreme:.6g} {unit}"
             return f"{name} stays at its extreme of {value} for {size} samples: it is saturated"
     return ""
@@ -193,6 +194,18 @@ def _run_ahead(steps: Array, entry: int) -> float:
     """
     earlier, later = np.sum(steps[entry - 1 - _RUN : entry - 1].reshape(2, -1), axis=1)
     return float(2.0 * later + (later - earlier) * (_RUN // 2 + 2) / (_RUN // 2))
+
+
+def _way_to_rest(steps: Array, entry: int) -> float:
+    """Way to rest of what brakes evenly before a sample, as a load does that friction stops; infinite where none does.
+
+    By the three steps before the last one, which a limit cuts.
+    """
+    first, second, third = steps[entry - 4 : entry - 1]
+    if not first > second > third:
+        return math.inf
+    brake, speed = second - third, max(0.0, 2.0 * third - second)
+    return float(0.5 * speed * speed / brake)
 
 
 def _encoder_noise(theta_m: Array) -> float:
