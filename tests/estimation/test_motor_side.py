@@ -91,7 +91,7 @@ def test_beside_a_minimum_that_leaves_more_than_counts_another_is_found(
         assert abs(first.values[0] / half - 1.0) > 0.05
         assert found is not None
         assert rms(found.raw) < 0.5 * problem.count
-        assert abs(found.values[0] / half - 1.0) < 0.002
+        assert abs(found.values[0] / half - 1.0) < 0.005
 
 
 @pytest.mark.slow
