@@ -46,6 +46,11 @@ def scales(servo: Plant) -> Scales:
     return Scales(own.time / paper.time, own.length / paper.length, own.voltage / paper.voltage)
 
 
+def structure_time(servo: Servo) -> float:
+    """A servo's own second by its structure alone, whatever its loop: that of `scales` or less; 0 of one mass."""
+    return _passing(servo) / _paper().time
+
+
 @cache
 def _paper() -> Scales:
     return _units(Servo.preset("paper"))
@@ -59,10 +64,15 @@ def _units(servo: Plant) -> Scales:
     """
     if isinstance(servo, Axis):
         return _units_of_axis(servo)
-    time = float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:])))
+    time = _passing(servo)
     if servo.controller.Kp != 0.0:
         time = max(time, _LOOP * servo.k_B / (abs(servo.controller.Kp) * servo.p))
     return Scales(time, servo.p, servo.k_B / time)
+
+
+def _passing(servo: Servo) -> float:
+    """Time (s) in which a motion passes from the screw to the last mass."""
+    return float(np.sum(np.sqrt(servo.masses[1:] / servo.stiffnesses[1:])))
 
 
 def _units_of_axis(axis: Axis) -> Scales:

@@ -39,6 +39,8 @@ _REPEATED, _ABRUPT, _LEAP = 4, 4.0, 2.0
 _THIRD_DIFFERENCES = math.sqrt(20.0)  # gain on white noise
 _QUIET, _LOUD = math.radians(0.002), math.radians(0.03)  # noise of the encoder: below, nothing; above, the lowest cut
 _HIGHEST_HZ, _LOWEST_HZ, _ORDER = 200.0, 60.0, 3  # of the servo's own seconds
+_TAKEN, _PEAK = 1.5, 8.0  # standard deviations of the noise: what a low-pass may take away, rms and in a sample
+_NYQUIST = 0.45  # of the sample rate: the highest cut-off
 
 
 def faults(window: Window, motion: str = LINEAR) -> tuple[str, ...]:
@@ -224,8 +226,8 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
     """(n,) theta_m, low-passed without phase where the encoder is noisy.
 
     The play operator would ratchet to the extremes of the noise. The cut-off goes from 200 Hz for little noise down to
-    60 Hz, on the paper's servo. Louder noise than that one takes away, beyond the counts, is smoothed as far as the
-    motion allows.
+    60 Hz, on the paper's servo, but no lower than the motion allows. Louder noise than that one takes away, beyond the
+    counts, is smoothed as far as the motion allows.
 
     Parameters
     ----------
@@ -247,15 +249,32 @@ def motor_angle(window: Window, resolution: float, settings: WhitenedSettings, s
             if smooth is not window.theta_m:
                 return smooth
         share = math.log(max(noise, _QUIET) / _QUIET) / math.log(_LOUD / _QUIET)
-        cutoff = _HIGHEST_HZ / second * (_LOWEST_HZ / _HIGHEST_HZ) ** min(1.0, share)
-        if cutoff >= 0.45 * rate:
-            return window.theta_m
+        lowest = _HIGHEST_HZ / second * (_LOWEST_HZ / _HIGHEST_HZ) ** min(1.0, share)
+        return _low_passed(window.theta_m, lowest, rate, max(noise, resolution / math.sqrt(12.0)))
     if cutoff == 0.0:
         return window.theta_m
     if cutoff >= 0.5 * rate:
         raise InvalidInput(f"estimator prefilter_hz = {cutoff!r} Hz: must be below half of {rate:.6g} Hz")
-    padding = min(round(rate / cutoff), window.theta_m.size - 1)
-    return ZeroPhase(cutoff, _ORDER, rate, "odd", padding).respond(window.theta_m)
+    return _zero_phase(window.theta_m, cutoff, rate)
+
+
+def _low_passed(theta_m: Array, cutoff: float, rate: float, noise: float) -> Array:
+    """(n,) theta_m, low-passed at the lowest cut-off from `cutoff` (Hz) on that takes away no more than noise (rad).
+
+    A machine that moves faster than its stated loop would lose its motion by a lower one.
+    """
+    while cutoff < _NYQUIST * rate:
+        smooth = _zero_phase(theta_m, cutoff, rate)
+        taken = smooth - theta_m
+        if float(np.std(taken)) <= _TAKEN * noise and float(np.max(np.abs(taken))) <= _PEAK * noise:
+            return smooth
+        cutoff *= 2.0
+    return theta_m
+
+
+def _zero_phase(theta_m: Array, cutoff: float, rate: float) -> Array:
+    """(n,) theta_m, low-passed without phase at a cut-off (Hz)."""
+    return ZeroPhase(cutoff, _ORDER, rate, "odd", min(round(rate / cutoff), theta_m.size - 1)).respond(theta_m)
 
 
 _EXPLAINS, _BETTER = 0.05, 0.2  # share left that counts as a fit; of what the channels as given leave

@@ -43,7 +43,7 @@ from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.whitened.shift import ModelShift, fastest, model_shift, observer_shift
 from servotwin.estimation.whitened.statement import stated
 from servotwin.estimation.window import Window
-from servotwin.plant.scales import scales
+from servotwin.plant.scales import scales, structure_time
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -330,10 +330,12 @@ def _start(prior: float | GapEstimate | None) -> float:
 
 def _facts(aligned: AlignedFit, window: Window, servo: Servo, settings: WhitenedSettings, second: float) -> FitFacts:
     result = aligned.whitened
+    # A load that swings behind a slow loop is no noise either.
+    paces = {second, structure_time(servo) or second}
     return FitFacts(
         aligned=aligned,
         travel=_travel(result),
-        unexplained=slow_share(result, second),
+        unexplained=max(slow_share(result, pace) for pace in paces),
         needed=travel_needed(result.point.gap, servo, settings),
         smallest=least_bound(servo.encoder_resolution),
         count=servo.encoder_resolution if window.theta_m is None else _count(window.theta_m, servo),

@@ -55,7 +55,7 @@ def _averaged_noise(values: Array, interval: float) -> float:
 
     The interval here and below is in the servo's own seconds.
     """
-    weights = np.convolve(_averaging(interval), _averaging(interval))
+    weights = np.convolve(_averaging(interval, values.size), _averaging(interval, values.size))
     return _rms(np.diff(values)) * math.sqrt(0.5 * float(weights @ weights))
 
 
@@ -65,15 +65,15 @@ def _loudest(result: WhitenedFit) -> float:
     return abs(reduction.response.static_gain) * max(float(np.ptp(reduction.theta_m)), 2.0 * math.pi)
 
 
-def _averaging(interval: float) -> Array:
-    """Weights (w,) of one average."""
-    size = max(1, round(_SLOW_S / interval))
+def _averaging(interval: float, samples: int) -> Array:
+    """Weights (w,) of one average, over a quarter of so many samples at most."""
+    size = max(1, min(round(_SLOW_S / interval), samples // 4))
     return np.full(size, 1.0 / size)
 
 
 def slow(values: Array, interval: float) -> Array:
     """A signal (m,) averaged twice."""
-    window = _averaging(interval)
+    window = _averaging(interval, values.size)
     return np.convolve(np.convolve(values, window, "valid"), window, "valid")
 
 
