@@ -9,12 +9,14 @@ from pathlib import Path
 from rich.progress import Progress
 
 from servotwin.errors import InvalidInput
+from servotwin.store.engine import POSTGRESQL, SQLITE
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message
 from servotwin.store.store import Store
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.twin_file import service_of
 
 _BODIES = 256
+_REMEDY = {SQLITE: "end the twin, move the file away", POSTGRESQL: "end all twins, create an empty database"}
 
 
 def check_store(config: Path) -> None:
@@ -47,6 +49,6 @@ def _check_bodies(store: Store) -> int:
 def _require_sound(store: Store, result: IntegrityReport) -> None:
     if result.faults:
         raise InvalidInput(
-            f"store {store.name}: is damaged ({'; '.join(result.faults)}); end the twin, move the file away and "
-            "restore a backup: edges send again what they still keep"
+            f"store {store.name}: is damaged ({'; '.join(result.faults)}); {_REMEDY[store.engines.writer.dialect.name]}"
+            " and restore a backup: edges send again what they still keep"
         )

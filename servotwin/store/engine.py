@@ -33,6 +33,9 @@ _CALLERS_FAULT = (IntegrityError, DataError, ProgrammingError)
 _SQLITE_DAMAGE, _SQL_DAMAGE = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB), ("XX001", "XX002")
 _LOST_RACES = ("40001", "40P01")
 """SQLSTATE of a serialization failure and of a deadlock."""
+_NOT_AS_MADE = ("3F000", "42P01", "42703", "42501")
+"""SQLSTATE of a schema, table or column that is not there, and of a right that was taken away: the driver counts them
+among faults of the statement, but the same statements worked before."""
 
 
 class StoreUnavailable(ResourceUnavailable):
@@ -125,9 +128,9 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
     try:
         with engine.begin() as connection:
             yield connection
-    except _CALLERS_FAULT:
-        raise
     except DBAPIError as error:
+        if isinstance(error, _CALLERS_FAULT) and getattr(error.orig, "sqlstate", None) not in _NOT_AS_MADE:
+            raise
         if is_damage(error.orig):
             raise StoreDamaged(f"store {public_address(engine.url)}: is damaged ({error.orig})") from error.orig
         raise _unavailable(engine, str(error.orig)) from error.orig

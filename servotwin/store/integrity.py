@@ -15,8 +15,9 @@ import sqlalchemy as sa
 
 from servotwin.messages import MAX_BYTES, InvalidMessage
 from servotwin.messages.codec import decompress
-from servotwin.store.engine import StoreDamaged, is_damage, sqlite_file, transaction
-from servotwin.store.schema import WINDOWS, bodies, messages
+from servotwin.store.engine import POSTGRESQL, StoreDamaged, is_damage, sqlite_file, transaction
+from servotwin.store.postgresql_tables import table_faults
+from servotwin.store.schema import WINDOWS, bodies, messages, metadata
 from servotwin.store.store import Store
 
 log = logging.getLogger(__name__)
@@ -71,10 +72,17 @@ def check_files(store: Store) -> IntegrityReport:
 
 
 def check_pages(store: Store, seconds: float) -> IntegrityReport:
-    """Check the pages of an SQLite store, table by table, for a bounded time; PostgreSQL checks its own at each read.
+    """Check the pages of a store, table by table, for a bounded time.
 
-    Reading happens on a connection of its own and delays nobody; the log cannot be shortened meanwhile.
+    Reading happens on a connection of its own and delays nobody; the log of SQLite cannot be shortened meanwhile.
+
+    Raises
+    ------
+    StoreUnavailable
+        The PostgreSQL server does not answer.
     """
+    if store.engines.writer.dialect.name == POSTGRESQL:
+        return IntegrityReport(*table_faults(store.engines.reader, seconds), len(metadata.tables))
     file = sqlite_file(store.engines.writer.url)
     if file is None:
         return IntegrityReport()

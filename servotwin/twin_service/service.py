@@ -102,8 +102,9 @@ class TwinService:
         self.commits = GroupCommit(store, limits, self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
         self.watch = StoreWatch(
-            store, self.executor, self._writes.put, self._writes.commit, self.clocks.wall, self.clocks.monotonic
-        )
+            store, self.executor, self._writes.put, self._writes.commit, self.clocks.wall, self.clocks.monotonic,
+            twin.path,
+        )  # fmt: skip
         sequences = SequenceWatch(self.clocks.monotonic)
         self._missing = MissingWindows(
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce

@@ -12,7 +12,7 @@ from typing import TypeVar
 
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
-from servotwin.store.engine import StoreDamaged, StoreUnavailable, sqlite_file
+from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, sqlite_file
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_files, check_pages, newest_message
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, PutResult, WorkResult
@@ -47,11 +47,13 @@ class StoreWatch:
         Commit a message, and a work result.
     wall, monotonic : callable
         s.
+    beside : Path
+        File beside which the newest message is noted where the store is no file: the twin's own.
 
     Attributes
     ----------
-    fault : str
-        Damage that was found; empty: none.
+    fault, lost : str
+        Damage that was found; messages that the store had and has no more; empty: none.
     rounds : int
         Number of times that everything was checked.
     """
@@ -64,8 +66,12 @@ class StoreWatch:
         commit: Callable[[WorkResult], Awaitable[bool]],
         wall: Callable[[], float],
         monotonic: Callable[[], float],
+        beside: Path,
     ) -> None:
         self._store, self._executor = store, executor
+        shared = store.engines.writer.dialect.name == POSTGRESQL
+        file = beside if shared else sqlite_file(store.engines.writer.url)
+        self._mark_file = None if file is None else file.with_name(f"{file.name}-{_MARK}")
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
@@ -115,46 +121,48 @@ class StoreWatch:
 
         `notify` is called with each that was asked, so that its poll ends.
         """
-        while self.lost and not self.fault:
+        while not self.fault:
             await asyncio.sleep(_NEW_S)
-            with suppress(StoreUnavailable):
-                for servo in await self._executor.run(self._ask_for_windows):
-                    notify(servo)
+            if self.lost:
+                with suppress(StoreUnavailable):
+                    for servo in await self._executor.run(self._ask_for_windows):
+                        notify(servo)
 
     async def tell(self, announce: Callable[[str, str], None]) -> None:
-        """Announce that the store has lost messages, if it has, and that it is damaged, once it is."""
-        if self.lost:
-            announce("the store has lost messages", self.lost)
+        """Announce that the store has lost messages, once it has, and that it is damaged, once it is."""
+        told = ""
         while not self.fault:
+            if self.lost != told:
+                told = self.lost
+                announce("the store has lost messages", told)
             await asyncio.sleep(_TELL_S)
         announce("store damaged", f"it is not written any more: {self.fault}")
 
     def mark(self) -> None:
-        """Note the newest message beside an SQLite store."""
-        file = self._mark_file
-        newest = 0 if file is None else newest_message(self._store)
-        if file is None or newest == self._marked:
+        """Note the newest message; where the store had a newer one, a database was put back while this ran."""
+        newest = 0 if self._mark_file is None else newest_message(self._store)
+        if self._mark_file is None or newest == self._marked:
             return
+        if newest < self._marked:
+            self._lost(self._marked, newest)
         try:
-            replace_file(file, b"%d\n" % newest, durable=True, mode=0o600)
+            replace_file(self._mark_file, b"%d\n" % newest, durable=True, mode=0o600)
             self._marked, self._not_marked = newest, ""
         except OSError as error:
             if str(error) != self._not_marked:  # each reason once: a log fills a full disk too
                 log.warning("newest message not noted", extra={"why": str(error)})
             self._not_marked = str(error)
 
-    @property
-    def _mark_file(self) -> Path | None:
-        file = sqlite_file(self._store.engines.writer.url)
-        return None if file is None else file.with_name(f"{file.name}-{_MARK}")
-
     def _compare_mark(self) -> None:
-        """Ask all edges for the windows that they still keep, where the store lacks messages that it once had."""
         noted, newest = _read_mark(self._mark_file), newest_message(self._store)
-        if newest >= noted:
-            return
-        log.error("the store has lost messages", extra={"had": noted, "has": newest})
-        self.lost = f"its newest message is number {newest}, and it once had number {noted}"
+        if newest < noted:
+            self._lost(noted, newest)
+
+    def _lost(self, had: int, has: int) -> None:
+        """Ask all edges for the windows that they still keep: the store lacks messages that it once had."""
+        log.error("the store has lost messages", extra={"had": had, "has": has})
+        self.lost = f"its newest message is number {has}, and it once had number {had}"
+        self._asked.clear()
         self._ask_for_windows()
 
     def _ask_for_windows(self) -> set[str]:

@@ -4,16 +4,21 @@ import asyncio
 import os
 import shutil
 from collections.abc import Awaitable, Callable
+from contextlib import closing, suppress
 from pathlib import Path
 
 import msgspec
 import pytest
 from service_system import bearer, place, served, twin_file, window
+from store_cases import postgresql_addresses
 
 from servotwin.messages import Resend, decode, encode
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
 from servotwin.twin_service import missing_windows, store_watch
+from servotwin.twin_service.twin_file import service_of
+
+pytest_plugins = ("store_fixtures",)
 
 PAGE = 8192
 Body = Callable[..., Awaitable[None]]
@@ -97,6 +102,48 @@ def test_a_store_that_lost_acknowledged_messages_says_so_and_asks_for_them(tmp_p
     serve(path, look)
     (line,) = (record for record in caplog.records if record.message == "the store has lost messages")
     assert (line.had, line.has) == (5, 2)
+
+
+@pytest.mark.slow
+def test_a_database_that_was_put_back_to_an_earlier_dump_is_noticed_at_the_start(tmp_path, postgres_server):
+    path = twin_file(tmp_path, f'store = "{postgresql_addresses(postgres_server)()}"')
+
+    async def fill(_system, client):
+        assert set(await send(client, *range(5))) == {201}
+
+    async def look(system, _client):
+        assert posted(system) == [Resend("ax-1", reason="the twin's store has lost messages")]
+        assert system.watch.lost == "its newest message is number 2, and it once had number 5"
+
+    serve(path, fill)
+    assert (tmp_path / "twin.toml-newest").read_text() == "5\n"
+    with closing(open_store(service_of(path).store)) as store:
+        lose(store, 2)
+    serve(path, look)
+
+
+def lose(store, last):
+    """Delete all messages after one, as in a dump that was made then."""
+    with store.engines.writer.begin() as connection:
+        connection.exec_driver_sql(f"DELETE FROM bodies WHERE message > {last}")
+        connection.exec_driver_sql(f"DELETE FROM messages WHERE id > {last}")
+
+
+@pytest.mark.slow
+def test_a_database_that_was_put_back_while_the_twin_runs_is_noticed(tmp_path, postgres_server, caplog):
+    async def body(system, client):
+        assert set(await send(client, *range(5))) == {201}
+        system.watch.mark()
+        lose(system.store, 2)
+        system.watch.mark()
+        assert posted(system) == [Resend("ax-1", reason="the twin's store has lost messages")]
+        said = []
+        with suppress(TimeoutError):
+            await asyncio.wait_for(system.watch.tell(lambda *about: said.append(about)), 0.1)
+        assert said == [("the store has lost messages", "its newest message is number 2, and it once had number 5")]
+
+    serve(twin_file(tmp_path, f'store = "{postgresql_addresses(postgres_server)()}"'), body)
+    assert caplog.messages.count("the store has lost messages") == 1
 
 
 @pytest.mark.parametrize("name", ["twin.db", "twin.db-wal"])
