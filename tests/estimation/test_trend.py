@@ -343,3 +343,22 @@ def test_a_prior_for_the_next_window():
 def test_nonsense_is_refused(wrong):
     with pytest.raises(InvalidInput):
         wrong()
+
+
+@pytest.mark.parametrize("share", [0.01, 0.15])
+def test_a_first_gap_of_several_turns_of_the_motor_counts(share: float) -> None:
+    """The prior's 60 degrees are nobody's statement: a gap behind a gear of a hundred turns is no outlier."""
+    gap = 826.0 * DEG
+    found = Trend.start(0.0).update(seen(1.0, gap, share * gap))
+    assert (found.updates, found.refused) == (1, 0)
+    assert found.gap == pytest.approx(gap, rel=0.03)
+    assert found.gap_interval[0] < gap < found.gap_interval[1]
+
+
+def test_a_jump_to_several_turns_of_the_motor_starts_the_trend_afresh_there() -> None:
+    gap = 826.0 * DEG
+    found = Trend.start(0.0).update(seen(1.0, 10.0 * DEG, 0.1 * DEG))
+    for time in (2.0, 3.0):
+        found = found.update(seen(time, gap, 0.15 * gap))
+    assert found.afresh
+    assert found.gap == pytest.approx(gap, rel=0.03)

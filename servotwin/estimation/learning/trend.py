@@ -201,7 +201,8 @@ class Trend:
         """
         ahead = self.predict(estimate.time)
         if estimate.ok:
-            return ahead._corrected(reading(estimate, offset or estimate.offset))
+            measurement = reading(estimate, offset or estimate.offset)
+            return ahead._open_to(measurement)._corrected(measurement)
         if estimate.status is GapStatus.LOWER_BOUND and math.isfinite(estimate.gap):
             return ahead._bounded(estimate)
         because = "; ".join(estimate.reasons) or "no reason given"
@@ -229,6 +230,18 @@ class Trend:
         if self._distance(measurement) > self.settings.outlier_std:
             return replace(self.without_offset()._joseph(measurement), reasons=(_MOVED,))
         return self._joseph(measurement)
+
+    def _open_to(self, measurement: TrendMeasurement) -> Trend:
+        """The state, at least as uncertain as a first gap is wide that lies beyond its 95 %.
+
+        A motor behind a gear of a hundred turns has gaps of hundreds of degrees, and no window spoke against them.
+        """
+        gap = abs(float(measurement.of_gap.values[0]))
+        if self.updates > 0 or gap <= NORMAL_95 * math.sqrt(self.covariance[GAP, GAP]):
+            return self
+        covariance = self.covariance.copy()
+        covariance[GAP, GAP] = gap**2
+        return replace(self, covariance=covariance)
 
     def _distance(self, measurement: TrendMeasurement) -> float:
         """Distance from the prediction, in standard deviations of both."""
@@ -270,7 +283,7 @@ class Trend:
             # The gap has jumped; the wear rate that was learnt stays.
             start.covariance[RATE, RATE] = self.covariance[RATE, RATE]
             start.mean[RATE] = self.mean[RATE]
-        return start._joseph(measurement)
+        return start._open_to(measurement)._joseph(measurement)
 
     def _bounded(self, estimate: GapEstimate) -> Trend:
         """Moments of the state given that the gap exceeds an uncertain bound (the exact ones of a cut normal)."""
