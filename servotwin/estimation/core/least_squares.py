@@ -54,12 +54,11 @@ class LeastSquares:
 def least_squares(columns: Array, target: Array) -> LeastSquares:
     """Fit the rows of `columns` (k, m) to `target` (m,)."""
     products = columns @ columns.T
-    size = np.sqrt(products.diagonal())
-    size[size == 0.0] = 1.0
-    # Columns of length one: the test for dependence must not depend on their units.
-    values, vectors = np.linalg.eigh(products / (size[:, None] * size))
-    good = values > _DEPENDENT_EIGENVALUE * values[-1]
-    root = (vectors[:, good] / np.sqrt(values[good])).T / size
+    size = np.empty(len(columns))
+    scale(products, size)
+    values, vectors = np.linalg.eigh(products)
+    root = np.empty(products.shape)
+    root = root[: take_root(values, vectors, size, root)]
     return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(size.size, dtype=bool))
 
 
@@ -122,6 +121,32 @@ def inner(one: Array, other: Array) -> float:
     for i in range(other.size):
         total += one[i] * other[i]
     return total
+
+
+@bare
+def scale(products: Array, size: Array) -> None:
+    """Make products (k, k) of columns those of columns of length one, in place; the lengths (k,) into `size`.
+
+    The test for dependence must not depend on their units.
+    """
+    for i in range(size.size):
+        size[i] = np.sqrt(products[i, i]) if products[i, i] > 0.0 else 1.0
+    for i in range(size.size):
+        for j in range(size.size):
+            products[i, j] /= size[i] * size[j]
+
+
+@bare
+def take_root(values: Array, vectors: Array, size: Array, root: Array) -> int:
+    """`LeastSquares.root` into the first rows of `root` (k, k), from eigenvalues and eigenvectors; return their
+    number."""
+    count = 0
+    for i in range(size.size):
+        if values[i] > _DEPENDENT_EIGENVALUE * values[-1]:
+            for j in range(size.size):
+                root[count, j] = vectors[j, i] / np.sqrt(values[i]) / size[j]
+            count += 1
+    return count
 
 
 @bare

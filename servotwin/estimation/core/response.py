@@ -83,19 +83,38 @@ class Response:
 
         A real pole gives one row; with n masses on a rigid screw there are 2 (n - 1) rows.
         """
-        return self.real_parts(geometric(self.poles * self.interval, samples))
-
-    def real_parts(self, motions: Complex) -> Array:
-        """(2 modes, n) real and imaginary parts of motions (modes, n) of the modes; those of a real pole are real."""
-        return np.vstack([motions.real, motions.imag[np.abs(self.poles.imag) > 0.0]])
+        return free_motions(self.poles * self.interval, np.ones(self.poles.size, dtype=complex), samples)
 
 
-def geometric(exponents: Complex, samples: int) -> Complex:
-    """(modes, n) exp(exponent i), i = 0, 1, ...: a product of two exponentials, of which there are few."""
-    width = max(1, math.isqrt(samples))
-    height = -(-samples // width)
-    far, near = (np.exp(np.outer(exponents, steps)) for steps in (width * np.arange(height), np.arange(width)))
-    return np.asarray((far[:, :, None] * near[:, None, :]).reshape(exponents.size, -1)[:, :samples])
+def free_motions(exponents: Complex, sizes: Complex, samples: int) -> Array:
+    """(2 modes, n) real and imaginary parts of motions size exp(exponent i) of modes, i = 0, 1, ...
+
+    A real exponent gives one row.
+    """
+    turning = np.abs(exponents.imag) > 0.0
+    shares = np.concatenate([sizes, -1j * sizes[turning]])
+    out, width = np.zeros((shares.size, samples)), max(1, math.isqrt(samples))
+    add_motions(
+        np.concatenate([exponents, exponents[turning]])[:, None], shares[:, None], np.empty(width, complex), out
+    )
+    return out
+
+
+@bare
+def add_motions(exponents: Complex, shares: Complex, near: Complex, out: Array) -> None:
+    """Add to rows (r, n) the real parts of share exp(exponent i), i = 0, 1, ..., summed over modes (r, modes).
+
+    Each is a product of two exponentials, of which there are few; `near` (about the root of n,) is room for one kind.
+    """
+    for row in range(len(out)):
+        for mode in range(exponents.shape[1]):
+            exponent = exponents[row, mode]
+            for i in range(near.size):
+                near[i] = np.exp(exponent * i)
+            for first in range(0, out.shape[1], near.size):
+                far = shares[row, mode] * np.exp(exponent * first)
+                for i in range(min(near.size, out.shape[1] - first)):
+                    out[row, first + i] += far.real * near[i].real - far.imag * near[i].imag
 
 
 class Structures(NamedTuple):
