@@ -53,13 +53,20 @@ class LeastSquares:
 
 def least_squares(columns: Array, target: Array) -> LeastSquares:
     """Fit the rows of `columns` (k, m) to `target` (m,)."""
-    products = columns @ columns.T
-    size = np.empty(len(columns))
-    scale(products, size)
-    values, vectors = np.linalg.eigh(products)
-    root = np.empty(products.shape)
-    root = root[: take_root(values, vectors, size, root)]
-    return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(size.size, dtype=bool))
+    products, root = columns @ columns.T, np.zeros((len(columns), len(columns)))
+    if not invert_triangle(products, root):
+        root = _root_of_dependent(products)
+    return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(len(columns), dtype=bool))
+
+
+def _root_of_dependent(products: Array) -> Array:
+    """`LeastSquares.root` of columns with these products (k, k), some of which depend on others."""
+    size = np.sqrt(products.diagonal())
+    size[size == 0.0] = 1.0
+    # Columns of length one: the test for dependence must not depend on their units.
+    values, vectors = np.linalg.eigh(products / (size[:, None] * size))
+    good = values > _DEPENDENT_EIGENVALUE * values[-1]
+    return np.asarray((vectors[:, good] / np.sqrt(values[good])).T / size)
 
 
 def independent_least_squares(columns: Array, target: Array) -> LeastSquares:
@@ -124,29 +131,31 @@ def inner(one: Array, other: Array) -> float:
 
 
 @bare
-def scale(products: Array, size: Array) -> None:
-    """Make products (k, k) of columns those of columns of length one, in place; the lengths (k,) into `size`.
+def invert_triangle(products: Array, root: Array) -> bool:
+    """`LeastSquares.root` as the inverse of a triangle (Cholesky's) into `root` (k, k), which is zero.
 
-    The test for dependence must not depend on their units.
+    False where some columns with these products (k, k) may depend on others, by the test of the eigenvalues: the least
+    is at least one over the sum of the root's squares, and the largest at most k, for columns of length one.
     """
-    for i in range(size.size):
-        size[i] = np.sqrt(products[i, i]) if products[i, i] > 0.0 else 1.0
-    for i in range(size.size):
-        for j in range(size.size):
-            products[i, j] /= size[i] * size[j]
-
-
-@bare
-def take_root(values: Array, vectors: Array, size: Array, root: Array) -> int:
-    """`LeastSquares.root` into the first rows of `root` (k, k), from eigenvalues and eigenvectors; return their
-    number."""
-    count = 0
-    for i in range(size.size):
-        if values[i] > _DEPENDENT_EIGENVALUE * values[-1]:
-            for j in range(size.size):
-                root[count, j] = vectors[j, i] / np.sqrt(values[i]) / size[j]
-            count += 1
-    return count
+    count, total = len(products), 0.0
+    for i in range(count):
+        row = root[i]
+        left = products[i, i]
+        for j in range(i):
+            share = 0.0
+            for k in range(j + 1):
+                share += root[j, k] * products[i, k]
+            left -= share * share
+            for k in range(j + 1):
+                row[k] -= share * root[j, k]
+        if not left > 0.0:
+            return False
+        length = np.sqrt(left)
+        row[i] = 1.0
+        for k in range(i + 1):
+            row[k] /= length
+            total += row[k] * row[k] * products[k, k]
+    return total * count * _DEPENDENT_EIGENVALUE < 1.0
 
 
 @bare

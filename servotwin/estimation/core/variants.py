@@ -42,13 +42,14 @@ class _Parts(NamedTuple):
 def _parts(servo: Servo, elastic: bool) -> _Parts:
     """Parts of a servo's structure, with an elastic or a rigid screw."""
     m, k, c = servo.masses, servo.stiffnesses, servo.dampings
-    still, screw = 0.0 if elastic else np.inf, 1.0 if elastic else np.inf
-    none = chain(m, 0.0 * k, 0.0 * c, still)
-    others = chain(m, k, 0.0 * c, still), chain(m, 0.0 * k, c, still), chain(m, 0.0 * k, 0.0 * c, screw)
-    first, *rest = (np.column_stack([part.A, part.B_position, part.B_velocity]) for part in (none, *others))
+    # None of the three, and one at a time.
+    only = np.eye(4)[1:, :, None]
+    parts = chain(np.tile(m, (4, 1)), only[0] * k, only[1] * c, only[2, :, 0] if elastic else np.inf)
+    shares = np.concatenate([parts.A, parts.B_position[:, :, None], parts.B_velocity[:, :, None]], axis=2)
+    shares[1:] -= shares[0]
     delays = np.sqrt(m[1:] / k[1:])
     unseen = float(np.sum(delays[:-1])), float(delays[-1])
-    return _Parts(np.array([first, *(one - first for one in rest)]), none.C_last, float(none.D[-1]), unseen)
+    return _Parts(shares, parts.C_last, float(parts.D[-1]), unseen)
 
 
 def variants(
