@@ -53,14 +53,20 @@ class LeastSquares:
 
 def least_squares(columns: Array, target: Array) -> LeastSquares:
     """Fit the rows of `columns` (k, m) to `target` (m,)."""
-    products = columns @ columns.T
+    products, root = columns @ columns.T, np.zeros((len(columns), len(columns)))
+    if not invert_triangle(products, root):
+        root = _root_of_dependent(products)
+    return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(len(columns), dtype=bool))
+
+
+def _root_of_dependent(products: Array) -> Array:
+    """`LeastSquares.root` of columns with these products (k, k), some of which depend on others."""
     size = np.sqrt(products.diagonal())
     size[size == 0.0] = 1.0
     # Columns of length one: the test for dependence must not depend on their units.
     values, vectors = np.linalg.eigh(products / (size[:, None] * size))
     good = values > _DEPENDENT_EIGENVALUE * values[-1]
-    root = (vectors[:, good] / np.sqrt(values[good])).T / size
-    return LeastSquares(root.T @ (root @ (columns @ target)), root, np.zeros(size.size, dtype=bool))
+    return np.asarray((vectors[:, good] / np.sqrt(values[good])).T / size)
 
 
 def independent_least_squares(columns: Array, target: Array) -> LeastSquares:
@@ -122,6 +128,34 @@ def inner(one: Array, other: Array) -> float:
     for i in range(other.size):
         total += one[i] * other[i]
     return total
+
+
+@bare
+def invert_triangle(products: Array, root: Array) -> bool:
+    """`LeastSquares.root` as the inverse of a triangle (Cholesky's) into `root` (k, k), which is zero.
+
+    False where some columns with these products (k, k) may depend on others, by the test of the eigenvalues: the least
+    is at least one over the sum of the root's squares, and the largest at most k, for columns of length one.
+    """
+    count, total = len(products), 0.0
+    for i in range(count):
+        row = root[i]
+        left = products[i, i]
+        for j in range(i):
+            share = 0.0
+            for k in range(j + 1):
+                share += root[j, k] * products[i, k]
+            left -= share * share
+            for k in range(j + 1):
+                row[k] -= share * root[j, k]
+        if not left > 0.0:
+            return False
+        length = np.sqrt(left)
+        row[i] = 1.0
+        for k in range(i + 1):
+            row[k] /= length
+            total += row[k] * row[k] * products[k, k]
+    return total * count * _DEPENDENT_EIGENVALUE < 1.0
 
 
 @bare

@@ -9,13 +9,14 @@ at the full rate waits for its own result at every angle. The free motions are g
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import numpy as np
 
 from servotwin.estimation.core.decimation import AVERAGES, Decimation
-from servotwin.estimation.core.response import Complex, Readout, Response, geometric
+from servotwin.estimation.core.response import Complex, Readout, Response, add_motions, free_motions
 from servotwin.hybrid.compiled import bare, inlined
 from servotwin.plant.signals import Array
 
@@ -87,36 +88,35 @@ class ReducedResponse:
 
     def free(self, samples: int) -> Array:
         """(2 modes, m) reduced free motions over `samples` angles; see `Response.free`."""
-        model = self.response
-        return model.real_parts(free_motions(model.poles * model.interval, self.decimation, samples))
-
-
-def free_motions(exponents: Complex, reduce: Decimation, samples: int) -> Complex:
-    """(modes, m) reduced motions exp(exponent i) of unforced modes (modes,) over `samples` angles i = 0, 1, ..."""
-    factor = reduce.factor
-    if factor == 1:
-        return geometric(exponents, samples)
-    return np.asarray(
-        _averages(exponents, factor)[:, None] * geometric(factor * exponents, samples // factor - AVERAGES + 1)
-    )
+        exponents, factor = self.response.poles * self.response.interval, self.decimation.factor
+        return free_motions(factor * exponents, _averages(exponents, factor), _reduced_size(samples, factor))
 
 
 def summed_motions(exponents: Complex, shares: Complex, reduce: Decimation, samples: int) -> Array:
-    """(s, m) real parts of the `free_motions` of some structures (s, modes), summed with the modes' shares (modes,)."""
-    factor = reduce.factor
-    count = samples if factor == 1 else samples // factor - AVERAGES + 1
-    # As in `geometric`, a product of two exponentials; summing first leaves a product of two small matrices.
-    width = max(1, math.isqrt(count))
-    height = -(-count // width)
-    far = np.exp((factor * width) * exponents[:, None, :] * np.arange(height)[:, None])
-    near = np.exp(factor * exponents[:, :, None] * np.arange(width))
-    weights = shares if factor == 1 else shares * _averages(exponents, factor)[:, None, :]
-    return np.asarray(((far * weights) @ near).real.reshape(len(exponents), -1)[:, :count])
+    """(s, m) reduced free motions of some structures (s, modes) over `samples` angles, summed with the modes' shares
+    (modes,)."""
+    count = _reduced_size(samples, reduce.factor)
+    out, near = np.zeros((len(exponents), count)), np.empty(max(1, math.isqrt(count)), complex)
+    add_motions(reduce.factor * exponents, shares * _averages(exponents, reduce.factor), near, out)
+    return out
+
+
+def _reduced_size(samples: int, factor: int) -> int:
+    """Samples that are left of `samples`."""
+    return samples if factor == 1 else samples // factor - AVERAGES + 1
 
 
 def _averages(exponents: Complex, factor: int) -> Complex:
     """Weighted sums of exp(exponent i) under the taps of a decimation: `AVERAGES` means, one after another."""
+    if factor == 1:
+        return np.ones_like(exponents)
     return np.asarray((np.expm1(factor * exponents) / (factor * np.expm1(exponents))) ** AVERAGES)
+
+
+def respond_each(models: Sequence[ReducedResponse], angles: Array) -> Array:
+    """(s, m) reduced positions (m) of structures with as many modes, and one decimation, for angles (1, n)."""
+    weights = [one for one in (model.position for model in models) if one is not None]
+    return _run_each(angles, weights)[:, 0] if weights else np.vstack([model.respond(angles) for model in models])
 
 
 @lru_cache(maxsize=64)
@@ -126,11 +126,18 @@ def reduced_response(model: Response, reduce: Decimation) -> ReducedResponse:
 
 
 def _run(inputs: Array, weights: BlockWeights) -> Array:
-    factor = weights.angles.shape[1]
+    return _run_each(inputs, [weights])[0]
+
+
+def _run_each(inputs: Array, structures: Sequence[BlockWeights]) -> Array:
+    """(s, k, m) answers of structures with the same number of modes."""
+    sums, factor = structures[0].angles.shape
     blocks = inputs.shape[1] // factor
-    out = np.empty((len(inputs), blocks - AVERAGES + 1))
+    out = np.empty((len(structures), len(inputs), blocks - AVERAGES + 1))
     inputs = np.ascontiguousarray(inputs)  # as `evaluate` calls it: another order is compiled anew
-    run_blocks(inputs, *_arrays(weights), np.empty((factor, blocks)), np.empty((len(weights.angles), blocks)), out)
+    room = np.empty((factor, blocks)), np.empty((sums, blocks))
+    for weights, answers in zip(structures, out, strict=True):
+        run_blocks(inputs, *_arrays(weights), *room, answers)
     return out
 
 

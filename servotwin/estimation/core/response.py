@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.hybrid.compiled import bare
+from servotwin.hybrid.compiled import bare, inlined
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
@@ -83,19 +83,38 @@ class Response:
 
         A real pole gives one row; with n masses on a rigid screw there are 2 (n - 1) rows.
         """
-        return self.real_parts(geometric(self.poles * self.interval, samples))
-
-    def real_parts(self, motions: Complex) -> Array:
-        """(2 modes, n) real and imaginary parts of motions (modes, n) of the modes; those of a real pole are real."""
-        return np.vstack([motions.real, motions.imag[np.abs(self.poles.imag) > 0.0]])
+        return free_motions(self.poles * self.interval, np.ones(self.poles.size, dtype=complex), samples)
 
 
-def geometric(exponents: Complex, samples: int) -> Complex:
-    """(modes, n) exp(exponent i), i = 0, 1, ...: a product of two exponentials, of which there are few."""
-    width = max(1, math.isqrt(samples))
-    height = -(-samples // width)
-    far, near = (np.exp(np.outer(exponents, steps)) for steps in (width * np.arange(height), np.arange(width)))
-    return np.asarray((far[:, :, None] * near[:, None, :]).reshape(exponents.size, -1)[:, :samples])
+def free_motions(exponents: Complex, sizes: Complex, samples: int) -> Array:
+    """(2 modes, n) real and imaginary parts of motions size exp(exponent i) of modes, i = 0, 1, ...
+
+    A real exponent gives one row.
+    """
+    turning = np.abs(exponents.imag) > 0.0
+    shares = np.concatenate([sizes, -1j * sizes[turning]])
+    out, width = np.zeros((shares.size, samples)), max(1, math.isqrt(samples))
+    add_motions(
+        np.concatenate([exponents, exponents[turning]])[:, None], shares[:, None], np.empty(width, complex), out
+    )
+    return out
+
+
+@bare
+def add_motions(exponents: Complex, shares: Complex, near: Complex, out: Array) -> None:
+    """Add to rows (r, n) the real parts of share exp(exponent i), i = 0, 1, ..., summed over modes (r, modes).
+
+    Each is a product of two exponentials, of which there are few; `near` (about the root of n,) is room for one kind.
+    """
+    for row in range(len(out)):
+        for mode in range(exponents.shape[1]):
+            exponent = exponents[row, mode]
+            for i in range(near.size):
+                near[i] = np.exp(exponent * i)
+            for first in range(0, out.shape[1], near.size):
+                far = shares[row, mode] * np.exp(exponent * first)
+                for i in range(min(near.size, out.shape[1] - first)):
+                    out[row, first + i] += far.real * near[i].real - far.imag * near[i].imag
 
 
 class Structures(NamedTuple):
@@ -120,26 +139,23 @@ class Structures(NamedTuple):
         """The response of each structure at a sample rate (Hz)."""
         interval = 1.0 / sample_rate
         poles, shapes = _modes(self.A)
-        weight = (self.row @ shapes) * np.linalg.solve(shapes, self.drive[:, :, None])[:, :, 0]
-        # One of each conjugate pair, with twice its weight: the real part of the sum is the same.
-        weight = weight * (1.0 + np.sign(poles.imag))
-        now, after = _hold(poles, interval)
-        decay, speed = np.exp(poles * interval), weight * poles
-        taken = now + decay * after
-        gains = weight * taken, speed * taken
-        sums = [np.add.reduce(terms, axis=1).real for terms in (weight * after, weight + speed * after, weight / poles)]
-        directs, still = (self.direct + sums[0], sums[1]), self.direct - sums[2]
+        count, size = poles.shape
+        seen = self.row @ shapes
+        decay, sums, kept = np.empty((3, count, size, 2)), np.empty((count, 3)), np.empty(count, dtype=np.int64)
+        sample_modes(poles, shapes, self.drive.astype(complex), seen, self.direct, interval, decay, sums, kept)
         return [
             Response(
-                poles=poles[i, upper],
-                decay=_parts(decay[i, upper]),
-                position=Readout(_parts(gains[0][i, upper]), float(directs[0][i])),
-                velocity=Readout(_parts(gains[1][i, upper]), float(directs[1][i])),
-                interval=interval,
-                static_gain=float(still[i]),
-                unseen=float(self.unseen[i]),
+                upper[:modes],
+                decay[:modes],
+                Readout(position[:modes], direct),
+                Readout(velocity[:modes], speed),
+                interval,
+                still,
+                unseen,
             )
-            for i, upper in enumerate(poles.imag >= 0.0)
+            for upper, decay, position, velocity, (direct, speed, still), unseen, modes in zip(
+                poles, *decay, sums.tolist(), self.unseen.tolist(), kept.tolist(), strict=True
+            )
         ]
 
 
@@ -172,22 +188,89 @@ def _modes(matrices: Array) -> tuple[Complex, Complex]:
     return poles, shapes
 
 
-def _hold(poles: Complex, interval: float) -> tuple[Complex, Complex]:
-    """Weights of u[i] and u[i+1] in z[i+1] for z' = pole z + u with u linear in between."""
-    x = poles * interval
-    small, after = np.abs(x) < _SMALL, np.zeros_like(x)
-    if small.any():
-        for order in range(_TERMS, 1, -1):
-            after = (1.0 + x * after) / order
-    if not small.all():
-        # exp(x) - 1 - x loses its digits for small x; the 1.0 only avoids a division by zero there.
-        far = np.where(small, 1.0, x)
-        after = np.where(small, after, (np.exp(far) - 1.0 - far) / far**2)
-    return np.asarray(interval * (1.0 + x * after - after)), np.asarray(interval * after)
+@bare
+def solve(matrix: Complex, right: Complex) -> None:
+    """Solve matrix x = right (N,) into `right`, by elimination with the largest pivots; the matrix is used up."""
+    size = right.size
+    for j in range(size):
+        top = j
+        for i in range(j + 1, size):
+            if abs(matrix[i, j]) > abs(matrix[top, j]):
+                top = i
+        for k in range(j, size):
+            matrix[j, k], matrix[top, k] = matrix[top, k], matrix[j, k]
+        right[j], right[top] = right[top], right[j]
+        for i in range(j + 1, size):
+            share = matrix[i, j] / matrix[j, j]
+            for k in range(j + 1, size):
+                matrix[i, k] -= share * matrix[j, k]
+            right[i] -= share * right[j]
+    for j in range(size - 1, -1, -1):
+        for k in range(j + 1, size):
+            right[j] -= matrix[j, k] * right[k]
+        right[j] /= matrix[j, j]
 
 
-def _parts(values: Complex) -> Array:
-    return np.ascontiguousarray(values).view(float).reshape(-1, 2)
+@inlined
+def late_share(x: complex) -> complex:
+    """(exp(x) - 1 - x) / x^2, by its series where x is so small that this loses its digits."""
+    if abs(x) >= _SMALL:
+        return (np.exp(x) - 1.0 - x) / (x * x)
+    total = 0.0 * x
+    for order in range(_TERMS, 1, -1):
+        total = (1.0 + x * total) / order
+    return total
+
+
+@bare
+def sample_modes(
+    poles: Complex,
+    shapes: Complex,
+    drive: Complex,
+    seen: Complex,
+    direct: Array,
+    interval: float,
+    parts: Array,
+    sums: Array,
+    kept: NDArray[np.int64],
+) -> None:
+    """Sample the modes of some structures at an interval (s), the input u linear in between: z[i+1] = e z[i] + u[i].
+
+    Parameters
+    ----------
+    poles, shapes : (s, N), (s, N, N) complex arrays
+        Of each conjugate pair one pole is kept, in front; the shapes are used up.
+    drive, seen : (s, N) complex arrays
+        Of the structure's states, used up; share of each mode in what is read.
+    direct : (s,) array
+        Of what is read.
+    parts : (3, s, N, 2) array
+        Decay, gains of position and of velocity of the poles that are kept.
+    sums : (s, 3) array
+        Direct terms of position and velocity, and the static gain.
+    kept : (s,) array
+        Poles that are kept.
+    """
+    for s in range(len(poles)):
+        solve(shapes[s], drive[s])
+        count, at_once, moving, still = 0, direct[s], 0.0, direct[s]
+        for i in range(poles.shape[1]):
+            pole = poles[s, i]
+            # One of each conjugate pair, with twice its weight: the real part of the sum is the same.
+            weight = (1.0 + np.sign(pole.imag)) * (seen[s, i] * drive[s, i])
+            x = pole * interval
+            share, power = late_share(x), np.exp(x)
+            after = interval * share
+            taken = interval * (1.0 + x * share - share) + power * after
+            at_once += (weight * after).real
+            moving += (weight + weight * pole * after).real
+            still -= (weight / pole).real
+            if pole.imag >= 0.0:
+                poles[s, count] = pole
+                for k, value in enumerate((power, weight * taken, weight * pole * taken)):
+                    parts[k, s, count, 0], parts[k, s, count, 1] = value.real, value.imag
+                count += 1
+        sums[s, 0], sums[s, 1], sums[s, 2], kept[s] = at_once, moving, still, count
 
 
 def _respond(inputs: Array, decay: Array, readout: Readout) -> Array:

@@ -13,48 +13,43 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.core.response import Response, Structures
+from servotwin.hybrid.compiled import bare
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
 
 class _Parts(NamedTuple):
-    """x' = A x + position d + velocity d': shares of the stiffnesses, of the dampings, and per N/m of the screw."""
+    """x' = A x + position d + velocity d' as a sum, and the time that a motion takes through the masses.
 
-    upper: Array
-    A_by_k: Array
-    A_by_c: Array
-    A_by_screw: Array
-    position_by_k: Array
-    position_by_screw: Array
-    velocity: Array
+    Attributes
+    ----------
+    shares : (4, N, N + 2) array
+        [A, position, velocity]: constant part, shares of the stiffnesses, of the dampings, and per N/m of the screw.
+    row : (N,) array
+    direct : float
+    unseen : (float, float)
+        Sums of sqrt(m / k): all but the last mass, and the last one.
+    """
+
+    shares: Array
     row: Array
     direct: float
-    masses: Array
-    stiffnesses: Array
+    unseen: tuple[float, float]
 
 
 @lru_cache(maxsize=64)
 def _parts(servo: Servo, elastic: bool) -> _Parts:
     """Parts of a servo's structure, with an elastic or a rigid screw."""
     m, k, c = servo.masses, servo.stiffnesses, servo.dampings
-    screw = 1.0 if elastic else np.inf
-    none = chain(m, 0.0 * k, 0.0 * c, 0.0 if elastic else np.inf)
-    stiff, damped = (chain(m, *one, 0.0 if elastic else np.inf) for one in ((k, 0.0 * c), (0.0 * k, c)))
-    soft = chain(m, 0.0 * k, 0.0 * c, screw)
-    return _Parts(
-        none.A,
-        stiff.A - none.A,
-        damped.A - none.A,
-        soft.A - none.A,
-        stiff.B_position - none.B_position,
-        soft.B_position - none.B_position,
-        damped.B_velocity,
-        none.C_last,
-        float(none.D[-1]),
-        m,
-        k,
-    )
+    # None of the three, and one at a time.
+    only = np.eye(4)[1:, :, None]
+    parts = chain(np.tile(m, (4, 1)), only[0] * k, only[1] * c, only[2, :, 0] if elastic else np.inf)
+    shares = np.concatenate([parts.A, parts.B_position[:, :, None], parts.B_velocity[:, :, None]], axis=2)
+    shares[1:] -= shares[0]
+    delays = np.sqrt(m[1:] / k[1:])
+    unseen = float(np.sum(delays[:-1])), float(delays[-1])
+    return _Parts(shares, parts.C_last, float(parts.D[-1]), unseen)
 
 
 def variants(
@@ -72,24 +67,60 @@ def variants(
     screw : sequence of float, optional
         N/m, the screw's stiffness in each machine; None: the servo's own.
     """
-    k, c, pitch, last = np.exp(np.array(factors)).T
-    p, elastic = pitch * servo.p, screw is not None or not servo.rigid
-    parts = _parts(servo, elastic)
-    A = parts.upper + _times(k, parts.A_by_k) + _times(c, parts.A_by_c)
-    position, velocity = _times(k, parts.position_by_k), _times(c, parts.velocity)
-    if elastic:
-        stiffness = np.full(k.size, servo.k_d) if screw is None else np.array(screw)
-        A += _times(stiffness, parts.A_by_screw)
-        position += _times(stiffness, parts.position_by_screw)
-    masses = _times(np.ones(k.size), parts.masses)
-    if servo.n > 2:
-        A[:, -1] /= last[:, None]
-        masses[:, -1] *= last
-    drive = p[:, None] * ((A @ velocity[:, :, None])[:, :, 0] + position)
-    unseen = np.sqrt(masses[:, 1:] / _times(k, parts.stiffnesses[1:])).sum(axis=1)
-    return Structures(A, drive, parts.row, p * (velocity @ parts.row + parts.direct), unseen).responses(sample_rate)
+    elastic, given = screw is not None or not servo.rigid, np.array(factors)
+    parts, count = _parts(servo, elastic), len(given)
+    stiffness = np.full(count, servo.k_d if elastic else 0.0) if screw is None else np.array(screw)
+    size = parts.row.size
+    whole, drive, shown = np.empty((count, size, size + 2)), np.empty((count, size)), np.empty((count, 2))
+    if servo.n == 2:
+        given[:, -1] = 0.0
+    assemble(
+        np.exp(given), stiffness, servo.p, parts.shares, parts.row, parts.direct, parts.unseen, whole, drive, shown
+    )
+    return Structures(whole[:, :, :size], drive, parts.row, shown[:, 0], shown[:, 1]).responses(sample_rate)
 
 
-def _times(factors: Array, part: Array) -> Array:
-    """(s, ...) a part times each factor (s,)."""
-    return factors.reshape(-1, *part.ndim * [1]) * part
+@bare
+def assemble(
+    factors: Array,
+    screw: Array,
+    pitch: float,
+    shares: Array,
+    row: Array,
+    direct: float,
+    delays: tuple[float, float],
+    whole: Array,
+    drive: Array,
+    shown: Array,
+) -> None:
+    """Put structures together: [A, position, velocity] into `whole`, the input's direct term and delay into `shown`.
+
+    Parameters
+    ----------
+    factors : (s, 4) array
+        On stiffnesses, dampings, pitch and last mass.
+    screw : (s,) array
+        N/m.
+    pitch : float
+        m/rad, of the servo.
+    shares, row, direct, delays
+        As of `_Parts`.
+    whole : (s, N, N + 2) array
+    drive, shown : (s, N), (s, 2) arrays
+    """
+    size = row.size
+    for s in range(len(factors)):
+        k, c, heavier, p, A = factors[s, 0], factors[s, 1], factors[s, 3], pitch * factors[s, 2], whole[s]
+        for i in range(size):
+            for j in range(size + 2):
+                A[i, j] = (shares[0, i, j] + k * shares[1, i, j]) + (c * shares[2, i, j] + screw[s] * shares[3, i, j])
+        for j in range(size):
+            A[size - 1, j] /= heavier
+        seen = direct
+        for i in range(size):
+            total = A[i, size]
+            for j in range(size):
+                total += A[i, j] * A[j, size + 1]
+            drive[s, i] = p * total
+            seen += A[i, size + 1] * row[i]
+        shown[s, 0], shown[s, 1] = p * seen, (delays[0] + np.sqrt(heavier) * delays[1]) / np.sqrt(k)

@@ -49,12 +49,13 @@ class Autoregression:
         """Share of the variance that no earlier sample predicts; 1: white."""
         return float(self.spread[-1] / self.spread[0]) ** 2 if self.spread[0] > 0.0 else 1.0
 
-    def whiten(self, columns: Array) -> Array:
-        """(k, n) rows as errors of prediction over their standard deviation, from the first sample on.
+    def whiten(self, columns: Array, more: int = 0) -> Array:
+        """(k, n + more) rows (k, n) as errors of prediction over their standard deviation, from the first sample on.
 
         Sample i is predicted from all i before it, at most from p. Noise of the model comes out white, of variance 1.
+        Behind the last sample are as many zeros as asked for.
         """
-        out = np.empty_like(columns)
+        out = np.zeros((len(columns), columns.shape[1] + more))
         whiten(columns, self.predictors, self.spread, out)
         return out
 
@@ -167,7 +168,8 @@ def add_four(one: float, two: float, three: float, four: float, late: Array, out
 
 @bare
 def whiten(columns: Array, predictors: Array, spread: Array, out: Array) -> None:
-    """`Autoregression.whiten` into `out`: the first samples one by one, the others four coefficients at a time."""
+    """`Autoregression.whiten` into the first samples of `out`: those without p before them one by one, the others four
+    coefficients at a time."""
     most, size = spread.size - 1, columns.shape[1]
     weights, fours = predictors[most], 4 * (most // 4)
     for k in range(len(columns)):
@@ -177,7 +179,7 @@ def whiten(columns: Array, predictors: Array, spread: Array, out: Array) -> None
             for j in range(i + 1):
                 total += predictors[i, j] * column[i - j]
             white[i] = total / spread[i]
-        left = white[most:]
+        left = white[most:size]
         for i in range(left.size):
             left[i] = column[i + most]
         for j in range(1, fours, 4):

@@ -17,6 +17,7 @@ from functools import cached_property
 
 import numpy as np
 
+from servotwin.estimation.core.bounded_step import bounded_step
 from servotwin.estimation.core.contacts import BY_RATE
 from servotwin.estimation.core.least_squares import Flags, least_squares, orthonormal, project_out
 from servotwin.estimation.core.whitening import Autoregression
@@ -210,18 +211,17 @@ class FreeProblem:
         answer = reduction.position - table[RESIDUAL]
         motions = near.motions(screw[:1], answer, weights[1 : len(reduction.fixed())])
         motions[factors.size :] *= self.compliance
-        motions = np.vstack([motions, *self._by_sensors(reduction, point, screw)])
-        last, seen = len(table) + factors.size, rows.shape[1]
-        whole = np.zeros((len(table) + len(motions), seen + len(motions)))
-        whole[: len(table), :seen], whole[len(table) :, : answer.size] = rows, self.noise.whiten(motions)
-        root = self.prior.root
-        whole[len(table) : last, seen : seen + factors.size] = root.T
-        whole[RESIDUAL, seen : seen + factors.size] = root @ (self.prior.mean - factors)
-        whole[last:, seen + factors.size :] = np.eye(len(motions) - factors.size)
-        if keep:
-            last = len(whole)
-        basis = orthonormal(np.vstack([whole[CONSTANT : len(table)], whole[last:]]))
-        remainder = project_out(basis, np.vstack([whole[RESIDUAL:CONSTANT], whole[len(table) : last]]))
+        motions = np.concatenate([motions, *self._by_sensors(reduction, point, screw)])
+        root, seen, known, count = self.prior.root, rows.shape[1], factors.size, len(motions)
+        # One more sample each for what is known of the motions' sizes.
+        white, more = self.noise.whiten(motions, seen - answer.size + count), np.zeros((len(rows), count))
+        white[:known, seen : seen + known] = root.T
+        white[known:, seen + known :] = np.eye(count - known)
+        more[RESIDUAL, :known] = root @ (self.prior.mean - factors)
+        whole = np.hstack([rows, more])
+        wanted = count if keep else known
+        basis = orthonormal(np.concatenate([whole[CONSTANT:], white[wanted:]]))
+        remainder = project_out(basis, np.concatenate([whole[:CONSTANT], white[:wanted]]))
         return remainder[RESIDUAL], remainder[GAP:]
 
     def _by_sensors(self, reduction: Reduction, point: Point, screw: Array) -> list[Array]:
@@ -261,8 +261,8 @@ class FreeProblem:
                 floor = _linear_floor(residual, rows, movable)
                 if floor > hopeless or floor - most > cost - floor:
                     break
-            step = np.clip(q + _step(residual, rows, movable, q, low, high, damping), low, high) - q
-            variance, promised = cost / residual.size, _promised(step, residual, rows)
+            step, promised = bounded_step(residual, rows, movable, q, low, high, damping)
+            variance = cost / residual.size
             if promised <= gain * variance:
                 break
             ahead, slopes = self.rows(q + step)
@@ -285,12 +285,6 @@ def other_screws(problem: FreeProblem, start: Array, free: tuple[bool, bool], ga
         here[2 + PITCH] += (1.0 / share - 1.0) * own_softness(servo)
         fits.append(replace(problem, servo=servo.replace(k_d=share * servo.k_d)).descend(here, free, gain=gain))
     return fits
-
-
-def _promised(step: Array, residual: Array, rows: Array) -> float:
-    """Decrease of the cost by a step, were the residual linear."""
-    move = step @ rows
-    return float(move @ (2.0 * residual - move))
 
 
 def _linear_floor(residual: Array, rows: Array, movable: Array) -> float:
@@ -374,20 +368,6 @@ def same_way(point: Point, gap: float) -> tuple[float, float, float]:
     share = point.gap / gap
     ahead, behind = share * (1.0 + point.place) - 1.0, 1.0 - share * (1.0 - point.place)
     return point.place, min(max(ahead, -1.0), 1.0), min(max(behind, -1.0), 1.0)
-
-
-def _step(residual: Array, rows: Array, movable: Array, q: Array, low: Array, high: Array, damping: float) -> Array:
-    """The damped Gauss-Newton step; a coordinate at its bound that wants to leave stays."""
-    downhill = rows @ residual
-    blocked = ((q <= low) & (downhill < 0.0)) | ((q >= high) & (downhill > 0.0))
-    size = np.linalg.norm(rows, axis=1)
-    use = np.flatnonzero(np.logical_and.reduce([movable, ~blocked, size > 0.0]))
-    step = np.zeros(q.size)
-    if use.size:
-        scaled = rows[use] / size[use, None]
-        matrix = scaled @ scaled.T + damping * np.eye(use.size)
-        step[use] = np.linalg.solve(matrix, downhill[use] / size[use]) / size[use]
-    return step
 
 
 def _covariance(rows: Array, movable: Flags) -> Array:

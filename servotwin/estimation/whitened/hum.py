@@ -22,8 +22,10 @@ _PARAMETERS = 3.0  # of a sine: frequency, amplitude and phase
 
 def sines(frequencies: tuple[float, ...], samples: int) -> Array:
     """(2 f, m) sines and cosines of frequencies (rad per sample)."""
+    if not frequencies:
+        return np.empty((0, samples))
     phase = np.outer(frequencies, np.arange(samples))
-    return np.vstack([np.sin(phase), np.cos(phase)]) if frequencies else np.empty((0, samples))
+    return np.vstack([np.sin(phase), np.cos(phase)])
 
 
 def hum(residual: Array, order: int, least: float) -> tuple[float, ...]:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.estimation.core.decimation import Decimation
-from servotwin.estimation.core.reduced import ReducedResponse, reduced_response, summed_motions
+from servotwin.estimation.core.reduced import ReducedResponse, reduced_response, respond_each, summed_motions
 from servotwin.estimation.core.response import Complex, Readout, Response
 from servotwin.estimation.core.variants import variants
 from servotwin.plant.servo import Servo
@@ -99,11 +99,8 @@ def motions(model: ReducedResponse, others: Sequence[Neighbour], screw: Array, a
     shares[np.abs(model.response.poles.imag) > 0.0] -= 1j * weights[modes:]
     poles: Complex = np.array([model.response.poles, *(other.poles for other in others)])
     changes = summed_motions(poles * model.response.interval, shares, model.decimation, screw.shape[1])
-    moved = [
-        (other.reduced.respond(screw)[0] - answer + change - changes[0]) / other.step
-        for other, change in zip(others, changes[1:], strict=True)
-    ]
-    return np.array(moved)
+    moved = respond_each([other.reduced for other in others], screw) - answer + changes[1:] - changes[0]
+    return np.asarray(moved / np.array([[other.step] for other in others]))
 
 
 @dataclass(frozen=True, eq=False)

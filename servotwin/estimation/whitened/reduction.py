@@ -194,21 +194,19 @@ class Reduction:
         moving = self.reduced.respond(screw if self.growth else screw[:BY_RATE])
         late = [self.reduced.velocities(screw[:1])] if self.skew else []
         humming = sines(self.hum, self.position.size)
-        return np.vstack([self.position - moving[0], moving[1:3], self.fixed(), moving[3:], humming, *late])
+        residual = (self.position - moving[0])[None]
+        return np.concatenate([residual, moving[1:3], self.fixed(), moving[3:], humming, *late])
 
     def prepared(self, noise: Autoregression, rows: Array, first: int) -> Array:
         """(k, m + e) whitened rows and what is known beforehand, as e more samples; nuisances begin at row `first`."""
         known = {} if self.offset is None else {first: self.offset}
         if self.growth is not None:
             known[first + len(self.fixed())] = NuisancePrior(self.growth.mean - self.rate, self.growth.std)
-        columns = [noise.whiten(rows)]
-        for row, prior in known.items():
-            column = np.zeros((len(rows), 1))
-            # One sample that says: nuisance times 1 / std equals mean / std, with a deviation of 1, as whitened noise
-            # has.
-            column[0], column[row] = prior.mean / prior.std, 1.0 / prior.std
-            columns.append(column)
-        return np.hstack(columns) if known else columns[0]
+        white = noise.whiten(rows, len(known))
+        for sample, (row, prior) in enumerate(known.items(), rows.shape[1]):
+            # It says: nuisance times 1 / std equals mean / std, with a deviation of 1, as whitened noise has.
+            white[0, sample], white[row, sample] = prior.mean / prior.std, 1.0 / prior.std
+        return white
 
     def coarse(self) -> Misfit:
         """The misfit in white noise, with the fixed nuisances only: for the first search.
@@ -224,7 +222,7 @@ class Reduction:
     def misfit(self, noise: Autoregression, point: Point, table: Array | None = None) -> Misfit:
         """The misfit in noise of a known kind, its nuisances taken at a point; `table`: that of the point, if known."""
         nuisances = (self.table(point) if table is None else table)[CONSTANT:]
-        rows = self.prepared(noise, np.vstack([self.position, nuisances]), 1)
+        rows = self.prepared(noise, np.concatenate([self.position[None], nuisances]), 1)
         extra = rows.shape[1] - self.position.size
         basis = orthonormal(rows[1:])
         return Misfit(self.theta_m, rows[0], basis, self.reduced, noise, extra, self.rate)
@@ -260,7 +258,7 @@ class Reduction:
 @lru_cache(maxsize=32)
 def _fixed(model: ReducedResponse, samples: int) -> Array:
     free = model.free(samples)
-    return np.vstack([np.ones((1, free.shape[1])), free])
+    return np.concatenate([np.ones((1, free.shape[1])), free])
 
 
 @lru_cache(maxsize=32)
