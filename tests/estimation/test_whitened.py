@@ -204,3 +204,19 @@ def test_growth_that_many_counts_tell_is_growth():
         true = float(np.interp(window.mid_time, run.time, run.gap))
         assert estimate.ok
         assert abs(estimate.gap - true) < estimate.std < math.radians(0.02)
+
+
+@pytest.mark.slow
+def test_a_gap_of_nearly_a_turn_need_not_be_known_to_a_twentieth_of_a_degree():
+    """A motor behind a gear of 20 turns 20 times as far: the gap is known as well in proportion."""
+    turns, gap, random = 20.0, math.radians(350.0), np.random.default_rng(7)
+    law = SERVO.controller
+    servo = SERVO.replace(p=SERVO.p / turns, k_B=SERVO.k_B / turns, Kp=law.Kp, Ki=0.0, Kd=law.Kd)
+    run = simulate(servo, 8.0, reference=SquareWave(1e-3, 10.0), gap=gap, sample_rate=1000.0)
+    window = Window.from_run(run, 5.0, 2.0)
+    noisy = window.replace(position=window.position + random.normal(0.0, 3e-7, window.samples))
+    estimate = estimate_gap(noisy, servo)
+    assert estimate.ok
+    assert estimate.std > WhitenedSettings().largest_std
+    assert abs(estimate.gap / gap - 1.0) < 2e-3
+    assert estimate.interval[0] < gap < estimate.interval[1]

@@ -240,7 +240,7 @@ def pair(here: OneContact, before: LastContact | None) -> Pair:
     gap, std = before.side * (before.motor + moved - here.begin.motor), _spread(here, before, moved)
     between = followed(GapBetween(gap, std, 0.5 * (before.time + here.begin.time)), before.between)
     # What is known so badly confirms no other gap.
-    vague = std > VAGUE * here.fitted.settings.largest_std
+    vague = std > VAGUE * here.fitted.settings.of_gap(gap).largest_std
     return Pair(here, replace(contact, between=before.between if vague else between), before, between)
 
 
@@ -261,7 +261,7 @@ def _against(here: OneContact, between: GapBetween, lead: float, possible: float
 
     `lead`: of the motor in the window before, rad.
     """
-    settings = here.fitted.settings
+    settings = here.fitted.settings.of_gap(between.gap)
     gap, least, widest = between.gap, -AGREE * between.std, between.std * here.fitted.facts.caution
     if not widest <= settings.largest_std:
         return f"two contacts show the gap to {deg(widest)} only, and {deg(settings.largest_std)} are allowed"

@@ -198,6 +198,7 @@ def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus,
 
     Where the screw was not pushed far enough, the fitted gap means nothing, and other views need not agree with it.
     """
+    settings = settings.of_gap(evidence.aligned.whitened.point.gap)
     too_little = one_sided(evidence.travel, evidence.needed, settings)
     disagreements = () if too_little else _disagreements(evidence, settings)
     mismatches = (*misfits(evidence, settings), *disagreements)

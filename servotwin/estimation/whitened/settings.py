@@ -10,6 +10,7 @@ from servotwin.config.contradiction import contradiction
 from servotwin.config.keys import check, key, settings, value
 
 _LARGEST_SKEW = 5e-3  # s of the paper's servo
+_WIDE = math.radians(60.0)  # of the motor: gaps of the paper's servo are narrower
 
 
 @settings("estimator")
@@ -88,8 +89,8 @@ class WhitenedSettings:
         key(
             "largest_std_deg",
             above=0.0,
-            help="Largest statistical standard deviation of an estimate that is accepted; in noise whose spectrum the "
-            "window itself must show down to three fifths of that.",
+            help="Largest statistical standard deviation of an estimate that is accepted, of gaps beyond 60 deg in "
+            "proportion more; in noise whose spectrum the window itself must show down to three fifths of that.",
         ),
     ] = math.radians(0.05)
     largest_shift: Annotated[
@@ -98,7 +99,7 @@ class WhitenedSettings:
             "largest_shift_deg",
             minimum=0.0,
             help="Where free stiffness, damping, pitch and compliance of the screw would move the gap by more, the "
-            "model does not fit the window.",
+            "model does not fit the window. Of gaps beyond 60 deg in proportion more.",
         ),
     ] = math.radians(0.05)
     model_error: Annotated[
@@ -124,6 +125,13 @@ class WhitenedSettings:
     def skew_limit(self) -> float:
         """Largest delay between the channels that is accepted, s."""
         return _LARGEST_SKEW if self.largest_skew is None else self.largest_skew
+
+    def of_gap(self, gap: float) -> WhitenedSettings:
+        """The settings for a gap (rad): the angles that are allowed grow with gaps that are wide."""
+        factor = gap / _WIDE
+        if not 1.0 < factor < math.inf:
+            return self
+        return replace(self, largest_std=factor * self.largest_std, largest_shift=factor * self.largest_shift)
 
     def on(self, second: float) -> WhitenedSettings:
         """The settings for a servo whose own second (`plant.scales`) is so many seconds."""
