@@ -71,8 +71,9 @@ def parse_address(url: str, password: str | None = None) -> sa.URL:
 
 
 def public_address(address: sa.URL) -> str:
-    """Address for logs and messages: without the password and without options, which may hold one too."""
-    return address.set(password=None, query={}).render_as_string()
+    """Address for logs and messages, as an operator writes it: without driver, password and options."""
+    system, user = address.get_backend_name(), address.username
+    return sa.URL.create(system, user, None, address.host, address.port, address.database).render_as_string()
 
 
 def sqlite_file(address: sa.URL) -> Path | None:

@@ -88,7 +88,7 @@ def _file(table: Table, name: str, path: Path, _folder: Path) -> Path:
 
 def _store_url(table: Table, name: str, url: str, _folder: Path) -> str:
     if "://" not in url:
-        raise table.invalid(name, "a URL such as sqlite:///twin.db or postgresql+psycopg://user@host/database")
+        raise table.invalid(name, "a URL such as sqlite:///twin.db or postgresql://user@host/database")
     head = url.split("://", 1)[1].split("/", 1)[0]
     if ":" in head.rpartition("@")[0] or "password=" in url.partition("?")[2]:
         raise InvalidInput(
