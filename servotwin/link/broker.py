@@ -77,6 +77,19 @@ def is_mqtt(url: str) -> bool:
         return False
 
 
+def check_broker(broker: Broker) -> None:
+    """Check that connections to a broker can be made, before one is.
+
+    Raises
+    ------
+    InvalidInput
+        paho-mqtt is missing, or the file of certificates cannot be used.
+    """
+    _import_paho()
+    if broker.tls:
+        tls_context(broker.ca_file)
+
+
 class MqttSession(NamedTuple):
     """Session at a broker: client, topics, expiry.
 
@@ -215,12 +228,18 @@ _NO_CONNECTION = 4
 """paho's code for a message that is queued until there is a connection."""
 
 
-def _client(broker: Broker, session: MqttSession) -> Client:
+def _import_paho() -> None:
     try:
-        from paho.mqtt.client import Client, MQTTv5
-        from paho.mqtt.enums import CallbackAPIVersion
+        import paho.mqtt.client  # noqa: F401
     except ModuleNotFoundError:
         raise missing_extra("paho", "the link over MQTT") from None
+
+
+def _client(broker: Broker, session: MqttSession) -> Client:
+    _import_paho()
+    from paho.mqtt.client import Client, MQTTv5
+    from paho.mqtt.enums import CallbackAPIVersion
+
     client = Client(CallbackAPIVersion.VERSION2, session.client_id, protocol=MQTTv5, manual_ack=True)
     client.max_queued_messages_set(_MOST_QUEUED)
     client.max_inflight_messages_set(session.receive)

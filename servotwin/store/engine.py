@@ -71,8 +71,9 @@ def parse_address(url: str, password: str | None = None) -> sa.URL:
 
 
 def public_address(address: sa.URL) -> str:
-    """Address for logs and messages: without the password and without options, which may hold one too."""
-    return address.set(password=None, query={}).render_as_string()
+    """Address for logs and messages, as an operator writes it: without driver, password and options."""
+    system, user = address.get_backend_name(), address.username
+    return sa.URL.create(system, user, None, address.host, address.port, address.database).render_as_string()
 
 
 def sqlite_file(address: sa.URL) -> Path | None:
@@ -129,7 +130,7 @@ def transaction(engine: sa.Engine) -> Iterator[sa.Connection]:
         with engine.begin() as connection:
             yield connection
     except DBAPIError as error:
-        if isinstance(error, _CALLERS_FAULT) and getattr(error.orig, "sqlstate", None) not in _NOT_AS_MADE:
+        if isinstance(error, _CALLERS_FAULT) and _is_of_the_statement(error):
             raise
         if is_damage(error.orig):
             raise StoreDamaged(f"store {public_address(engine.url)}: is damaged ({error.orig})") from error.orig
@@ -147,6 +148,11 @@ def is_damage(error: BaseException | None) -> bool:
     """Test for the errors of SQLite and PostgreSQL that name damage: CORRUPT, NOTADB; data or index corrupted."""
     code = getattr(error, "sqlite_errorcode", None)
     return (code is not None and code & 0xFF in _SQLITE_DAMAGE) or getattr(error, "sqlstate", None) in _SQL_DAMAGE
+
+
+def _is_of_the_statement(error: DBAPIError) -> bool:
+    """Tell a wrong statement from an address with an unknown option, and from a store that is not as it was made."""
+    return error.statement is not None and getattr(error.orig, "sqlstate", None) not in _NOT_AS_MADE
 
 
 def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:

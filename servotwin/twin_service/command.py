@@ -12,6 +12,7 @@ from pathlib import Path
 import sqlalchemy as sa
 
 from servotwin.errors import InvalidInput
+from servotwin.link.broker import check_broker
 from servotwin.runtime.locks import lock_beside, locked
 from servotwin.store.engine import StoreUnavailable, parse_address, sqlite_file
 from servotwin.store.store import Store, open_store
@@ -36,6 +37,8 @@ def run(path: Path, port: int | None = None) -> None:
     """
     twin = read_twin(path, models=False)
     check_tls(twin.service)
+    if twin.service.mqtt is not None:
+        check_broker(twin.service.mqtt.broker)
     configure_logging(twin.service.log_level)
     pool = pool_of(twin)
     with (

@@ -88,14 +88,25 @@ def _file(table: Table, name: str, path: Path, _folder: Path) -> Path:
 
 def _store_url(table: Table, name: str, url: str, _folder: Path) -> str:
     if "://" not in url:
-        raise table.invalid(name, "a URL such as sqlite:///twin.db or postgresql+psycopg://user@host/database")
+        raise table.invalid(name, "a URL such as sqlite:///twin.db or postgresql://user@host/database")
     head = url.split("://", 1)[1].split("/", 1)[0]
     if ":" in head.rpartition("@")[0] or "password=" in url.partition("?")[2]:
         raise InvalidInput(
             f"{table.source}: {table.path(name)} holds a password; give it in store_password_file or in the "
             f"environment variable {PASSWORD}"
         )
+    if not url.startswith(SQLITE):
+        _check_address(table.source, table.path(name), url)
     return url
+
+
+def _check_address(source: str, key: str, url: str) -> None:
+    from servotwin.store.engine import parse_address  # what it imports takes long, and is not needed for SQLite
+
+    try:
+        parse_address(url)
+    except InvalidInput as error:
+        raise InvalidInput(f"{source}: {key}: {error}") from None
 
 
 @settings("service")

@@ -44,7 +44,8 @@ class StoreHealth:
     ) -> None:
         self._executor, self._writes, self._now = executor, writes, monotonic
         self._leases, self._damage = leases, damage
-        self._logged, self._posted, self._since, self._seen = "", False, 0.0, -math.inf
+        self._logged = set[str]()
+        self._posted, self._since, self._seen = False, 0.0, -math.inf
 
     @property
     def trouble(self) -> str:
@@ -59,14 +60,15 @@ class StoreHealth:
         trouble, now = self.trouble, self._now()
         if trouble:
             self._since, self._seen = self._since if self._logged else now, now
-            if trouble != self._logged:
-                self._logged = trouble
+            if trouble not in self._logged:
+                self._logged.add(trouble)
                 log.error("store not available", extra={"why": trouble})
             if not self._posted and now - self._since >= _LASTS_S:
                 self._posted = True
                 announce("store not available", f"{trouble}; windows are refused meanwhile, and edges keep them")
         elif self._logged and not self._writes.failure and now - self._seen >= _OVER_S:
-            self._logged, self._posted = "", False
+            self._logged.clear()
+            self._posted = False
             log.info("store available again")
 
     async def watch(self, announce: Callable[[str, str], None]) -> None:

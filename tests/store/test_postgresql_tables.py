@@ -8,6 +8,7 @@ import pytest
 import sqlalchemy as sa
 from store_cases import claim, outcome, postgresql_addresses, window
 
+from servotwin.errors import InvalidInput
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.integrity import check_pages
 from servotwin.store.records import EvidenceRecord
@@ -90,3 +91,10 @@ def test_a_right_that_was_taken_away_makes_a_store_not_available(
         other.close()
     finally:
         run(filled, "DROP OWNED BY reader", "DROP ROLE reader")
+
+
+def test_an_address_with_an_unknown_option_is_one_sentence(postgres_server: postgres.Server) -> None:
+    address = postgresql_addresses(postgres_server)()
+    with pytest.raises(InvalidInput, match='invalid connection option "colour"') as refused:
+        open_store(f"{address}&colour=red")
+    assert "\n" not in str(refused.value)

@@ -212,6 +212,11 @@ def test_a_password_is_never_shown(url: str) -> None:
     assert SECRET not in " ".join(observed)
 
 
+def test_an_address_is_shown_as_an_operator_writes_it() -> None:
+    address = parse_address("postgresql://user@host:5433/d?sslmode=require", SECRET)
+    assert public_address(address) == "postgresql://user@host:5433/d"
+
+
 def test_a_password_of_its_own_replaces_that_of_the_address() -> None:
     assert parse_address("postgresql://u:old@h/d", SECRET).password == SECRET
     assert parse_address("postgresql://u:old@h/d").password == "old"

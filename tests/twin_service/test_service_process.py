@@ -191,6 +191,10 @@ def test_tls_with_a_self_made_certificate(tmp_path):
         ('bind = "elsewhere"', True, "IP address"),
         ('store = "postgresql://me:secret@host/twin"', True, "store_password_file"),
         ('tls_key = "no.key"', True, "no.key"),
+        ('store = "mysql://me@host/twin"', True, r"twin.toml: service.store: .* names 'mysql'"),
+        ('store = "postgresql://me@host:port/twin"', True, r"twin.toml: service.store: .* cannot be read"),
+        ('[service.mqtt]\nurl = "mqtts://here"\nca_file = "no.crt"', True, r"no.crt: holds no certificates"),
+        ('[service.mqtt]\nurl = "mqtts://here"\nca_file = "twin.toml"', True, r"twin.toml: holds no certificates"),
         ("queue = 0", True, "at least 1"),
     ],
 )

@@ -150,3 +150,14 @@ def test_a_full_disk_gets_one_line_on_the_note_that_cannot_be_written(
 
     asyncio.run(body())
     assert (tmp_path / "twin.db-newest").read_text() == "1\n"
+
+
+def test_reasons_that_take_turns_are_logged_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    watched = Watched()
+    for _ in range(20):  # as on a full disk of PostgreSQL, where now one file cannot grow and now another
+        for reason in ("no room for messages", "no room for bodies"):
+            watched.leases = reason
+            watched.looked(1)
+    assert lines(caplog) == [(KIND, "no room for messages"), (KIND, "no room for bodies")]
+    assert len(watched.told) == 1
