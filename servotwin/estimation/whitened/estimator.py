@@ -204,9 +204,9 @@ class WindowFit:
         assert self.aligned is not None
         evidence = _evidence(self.facts, self.window, self.angle, self.servo, self.settings, self.second)
         if self.learnt is not None:
-            evidence = _with_free_model(evidence, self.learnt, self.settings)
+            evidence = evidence.spread_to(self.learnt.gap_std(self.settings.calibration))
         if self.settings.gap_rate > 0.0 and max(evidence.scale, self.servo.position_resolution) > 0.0:
-            evidence = _spread_to(evidence, math.hypot(evidence.std, self._moved_by_growth()))
+            evidence = evidence.spread_to(math.hypot(evidence.std, self._moved_by_growth()))
         return evidence
 
     def _moved_by_growth(self) -> float:
@@ -366,25 +366,10 @@ def _count(angle: Array, servo: Servo) -> float:
     return max(servo.encoder_resolution, counted(angle))
 
 
-def _with_free_model(evidence: FitEvidence, learnt: LearntFit, settings: WhitenedSettings) -> FitEvidence:
-    """Widen a spread and an interval by what the model's factors leave open."""
-    return _spread_to(evidence, learnt.gap_std(settings.calibration))
-
-
 def _farthest(factors: Sequence[float]) -> str:
     """Words on the factor (logarithm) that is the farthest off the model, in usual deviations."""
     place = int(np.argmax(np.abs(factors) / np.array(FREEDOM)))
     return f"a {_NUMBERS[place]} off by {100.0 * math.expm1(factors[place]):+.2g} % would explain most of it"
-
-
-def _spread_to(evidence: FitEvidence, std: float) -> FitEvidence:
-    """Widen the spread (rad), and the interval with it; as it is where it is no narrower."""
-    if not evidence.std < std < math.inf:
-        return evidence
-    gap, (low, high) = evidence.aligned.whitened.point.gap, evidence.interval
-    extra = NORMAL_95 * math.sqrt(std**2 - evidence.std**2)
-    interval = max(0.0, gap - math.hypot(gap - low, extra)), gap + math.hypot(high - gap, extra)
-    return replace(evidence, std=std, interval=interval)
 
 
 def _travel(result: WhitenedFit) -> Travel:

@@ -7,7 +7,7 @@ the static lost motion at rest, the gap in the paper's observer form, and the ga
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -191,6 +191,15 @@ class FitEvidence(FitFacts):
     lost_motion: float
     doubt: float = 0.0
     learnt: bool = False
+
+    def spread_to(self, std: float) -> FitEvidence:
+        """The evidence with the spread (rad) widened, and the interval with it; as it is where that is no wider."""
+        if not self.std < std < math.inf:
+            return self
+        gap, (low, high) = self.aligned.whitened.point.gap, self.interval
+        extra = NORMAL_95 * math.sqrt(std**2 - self.std**2)
+        interval = max(0.0, gap - math.hypot(gap - low, extra)), gap + math.hypot(high - gap, extra)
+        return replace(self, std=std, interval=interval)
 
 
 def judge(evidence: FitEvidence, settings: WhitenedSettings) -> tuple[GapStatus, tuple[str, ...]]:
