@@ -17,10 +17,10 @@ from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.estimator import _problem, fit
 from servotwin.estimation.output_error.fit import one_flank
 from servotwin.estimation.output_error.learnt_shaft import adapted_shaft
+from servotwin.estimation.output_error.mismatches import grown
 from servotwin.estimation.output_error.models import HALF, Priors, ShaftModel
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.search import one_flank_without_a_gap, search
-from servotwin.estimation.output_error.verdict import grown
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive

@@ -11,9 +11,10 @@ from servotwin.estimation.motor_side.held_motion import HeldShaft
 from servotwin.estimation.motor_side.problem import MotorProblem
 from servotwin.estimation.motor_side.settings import MotorSideSettings
 from servotwin.estimation.output_error.fit import Fit, Search, descend, one_flank
+from servotwin.estimation.output_error.mismatches import differing_halves, grown, unusual_numbers
 from servotwin.estimation.output_error.models import HALF
 from servotwin.estimation.output_error.search import explains, rms
-from servotwin.estimation.output_error.verdict import JudgedFit, differing_halves, grown, unusual_numbers
+from servotwin.estimation.output_error.verdict import JudgedFit
 
 _BELIEVED = 60.0  # rise of the cost without the gap, or without the second flank, over the noise's variance
 _RIVAL = 30.0  # the same of another gap that explains the window as well

@@ -18,21 +18,20 @@ from numpy.typing import NDArray
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.output_error.fit import Fit, Search, descend, on_each_flank
 from servotwin.estimation.output_error.jitter import time_jitter
+from servotwin.estimation.output_error.mismatches import (
+    APART,
+    DOUBT,
+    UNEXPLAINED,
+    between_halves,
+    unusual_numbers,
+)
 from servotwin.estimation.output_error.models import HALF, OFFSET, RATIO, PreparedShaft, ShaftModel, other_friction
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
 from servotwin.estimation.output_error.unexplained import slow, unexplained
-from servotwin.estimation.output_error.verdict import (
-    APART,
-    BELIEVED,
-    DOUBT,
-    RIVAL,
-    UNEXPLAINED,
-    between_halves,
-    unusual_numbers,
-)
+from servotwin.estimation.output_error.verdict import BELIEVED, RIVAL
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import Array
 

@@ -13,28 +13,21 @@ from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
 from servotwin.estimation.output_error.held_chain import FRICTION, HeldChainModel
 from servotwin.estimation.output_error.jitter import TimeJitter, time_jitter
+from servotwin.estimation.output_error.mismatches import DOUBT, grown, mismatches
 from servotwin.estimation.output_error.models import HALF, RATIO, ShaftModel
 from servotwin.estimation.output_error.possible import PossibleHalf
-from servotwin.estimation.output_error.rounding import influence, rounded
+from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
-from servotwin.estimation.output_error.unexplained import slow, unexplained
-from servotwin.plant.signals import Array
+from servotwin.estimation.output_error.unexplained import unexplained
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
 RIVAL = 30.0  # the same of another gap that explains the window as well
-_UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
-APART = 4.0  # standard deviations between the halves of a window
-UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
-_OUTLYING = 7.0  # standard deviations
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
-# The noise's spectrum, the model's numbers and the contacts come from the same window: tails are longer than normal.
-DOUBT = 2.0  # interval over the computed one
 _RATCHET = 4.0  # of the noise left in the motor's angle: its extremes push the load, so that the gap seems wider
-_EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
 # The motor's motion between two samples is a cubic: error in the middle over the fourth difference, and that difference
 # which rounding makes at most (counts); the error that counts, of half the gap, and the samples that may have it.
@@ -91,9 +84,9 @@ def judge(
     """
     known = _known_half(found, settings, unit, possible, jitter)
     likely = found.best.values if possible is None else possible.unknowns
-    mismatches = _mismatches(found, likely, settings.gap_rate / unit, settings.model_share * known.half)
-    if mismatches:
-        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=mismatches)
+    against = mismatches(found, likely, settings.gap_rate / unit, settings.model_share * known.half)
+    if against:
+        return JudgedFit(GapStatus.MODEL_MISMATCH, reasons=against)
     single, likely_single = _single(found, known)
     if likely_single:
         bounded = _bounded(found, single, "one flank explains the window nearly as well as two")
@@ -320,93 +313,6 @@ def _rival(found: Search, half: float, total: float, unit: float) -> str:
         if apart > NORMAL_95 * total and (other.cost - best.cost) / best.variance() < RIVAL:
             return f"a gap of {_deg(unit * float(other.values[HALF]))} explains the window nearly as well"
     return ""
-
-
-def _mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple[str, ...]:
-    """List the signs that the model is not that of the machine; a `least` error (m or rad at the load) is none.
-
-    `likely` (u,) are the unknowns as the window makes them likely: errors of rounding bend those of the best fit.
-    """
-    best, problem = found.best, found.problem
-    sentences = []
-    variation = float(np.std(problem.position))
-    left = slow(best.raw, max(1, best.raw.size // 100))
-    share = left / variation if variation > 0.0 else math.inf
-    if share > UNEXPLAINED:
-        sentences.append(f"the model leaves {100.0 * share:.0f} % of the position's motion unexplained")
-    elif problem.model.speed == 0.0 and left > max(UNEXPLAINED * best.values[HALF], problem.count):
-        sentences.append(
-            f"the model leaves motion of {100.0 * left / best.values[HALF]:.0f} % of half the gap unexplained"
-        )
-    sentences += unusual_numbers(found, likely)
-    sentences += _outliers(found, least)
-    sentences += differing_halves(found, rate)
-    return tuple(sentences)
-
-
-def unusual_numbers(found: Search, likely: Array) -> tuple[str, ...]:
-    """List the unknowns (u,), as they are `likely`, that would have to be far off what is known of them.
-
-    Rounding may have moved them: a motor that touches softly, within few counts of its encoder, looks soft and late.
-    """
-    problem, sentences = found.problem, list[str]()
-    limits = problem.limits()
-    for i, unknown in enumerate(problem.model.unknowns):
-        size = abs(float(likely[i]))
-        known = math.isfinite(unknown.std) and unknown.unit != "damping"
-        far = known and (size > _UNUSUAL * unknown.std or size >= limits[i])
-        if far and not _rounding_explains(found, i, size, bool(size >= limits[i])):
-            late = unknown.unit == "time"
-            change = f"{1e3 * likely[i]:+.3g} ms" if late else f"{100.0 * math.expm1(likely[i]):+.2g} %"
-            sentences.append(f"the {unknown.name} would be off by {change}")
-    return tuple(sentences)
-
-
-def _rounding_explains(found: Search, which: int, size: float, at_limit: bool) -> bool:
-    """Tell whether an unknown may be off by a size because of rounding: alone where the search ended at its limit."""
-    rounding, known = rounded(found, which), found.problem.model.unknowns[which].std
-    return size <= _UNUSUAL * (rounding if at_limit else math.hypot(rounding, known))
-
-
-def differing_halves(found: Search, rate: float) -> tuple[str, ...]:
-    """Sentence for a window whose halves differ by more than a growth at a `rate` (1/s, of the half gap) explains."""
-    difference, spread = between_halves(found)
-    apart = abs(difference) / math.hypot(spread, 0.5 * rate * found.problem.duration)
-    return (f"the gaps of the window's halves are {apart:.2g} standard deviations apart",) if apart > APART else ()
-
-
-def _outliers(found: Search, least: float) -> tuple[str, ...]:
-    """Sentence for a motion without dynamics whose model errs in a few places: play errs evenly.
-
-    Errors up to a `least` one (m or rad at the load) count as none.
-    """
-    raw = found.best.raw
-    most, rms = float(np.max(np.abs(raw))), float(np.sqrt(np.mean(raw**2)))
-    if found.problem.model.speed > 0.0 or most <= _OUTLYING * max(rms, found.problem.count, least):
-        return ()
-    return (f"in a few places the model errs by {most / rms:.2g} times as much as in the others",)
-
-
-def between_halves(found: Search, which: int = HALF) -> tuple[float, float]:
-    """Difference of an unknown between the second and the first half of a window, linearised, and its std.
-
-    The standard deviation is inf where a half does not show it.
-    """
-    data = found.best.raw.size
-    prior = np.arange(data, found.best.residual.size)
-    parts = np.array_split(np.arange(data), 2)
-    (one, *first), (two, *second) = (influence(found, np.concatenate([part, prior]), which) for part in parts)
-    return two - one, math.hypot(*first, *second, _ROUNDED * found.problem.count)
-
-
-def grown(found: Search, rate: float) -> float:
-    """Standard deviation of the half gap that its growth makes: the fit's is that of whenever the motor crossed it.
-
-    The growth within the window is as likely as a `rate` (1/s, of the half gap) says, or what the halves of the window
-    show of it, whichever is less: the rate may be a mere assumption.
-    """
-    apart, spread = between_halves(found)
-    return _EVENLY * min(rate * found.problem.duration, 2.0 * math.hypot(apart, DOUBT * spread))
 
 
 def _deg(angle: float) -> str:
