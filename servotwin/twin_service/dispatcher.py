@@ -95,7 +95,7 @@ class Dispatcher:
         self._deferred, self._next_job = set[str](), 0.0
         self._work_pending = asyncio.Event()
         self._stopping, self._waited_for, self._latest = False, False, set[str]()
-        self.away = ""
+        self.away, self._not_committed = "", False
         self._tasks: set[asyncio.Task[None]] = set()
         self._to_release: set[str] = set()
         self._failures: Counter[_Queue] = Counter()
@@ -174,6 +174,9 @@ class Dispatcher:
             if self._paused():
                 await self._rest(_RETRY_S)
                 continue
+            if self._not_committed:  # not woken by new messages: the same work would be done and lost again
+                self._not_committed = False
+                await asyncio.sleep(_RETRY_S)
             try:
                 await self._release_failed()
                 leases = await self._lease_next()
@@ -321,6 +324,7 @@ class Dispatcher:
             valid = await self._commit(result)
         except StoreUnavailable as error:
             counts.add("not committed")
+            self._not_committed = True
             log.error("result not committed", extra={"servo": result.servo, "why": str(error)})
             self._to_release.add(result.servo)
             return False

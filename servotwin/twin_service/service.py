@@ -101,10 +101,8 @@ class TwinService:
         limits = CommitLimits(waiting=config.queue, gather=0.0 if config.lockstep else CommitLimits().gather)
         self.commits = GroupCommit(store, limits, self.clocks.wall)
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
-        self.watch = StoreWatch(
-            store, self.executor, self._writes.put, self._writes.commit, self.clocks.wall, self.clocks.monotonic,
-            twin.path,
-        )  # fmt: skip
+        writes = self._writes.put, self._writes.commit
+        self.watch = StoreWatch(store, self.executor, *writes, self.clocks.wall, self.clocks.monotonic, twin.path)
         sequences = SequenceWatch(self.clocks.monotonic)
         self._missing = MissingWindows(
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce

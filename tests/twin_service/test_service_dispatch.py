@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import sys
+import time
 from pathlib import Path
 
 import httpx
@@ -13,6 +14,7 @@ from service_system import bearer, place, twin_file, unpacked, window
 from servotwin.messages import encode
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import open_store
+from servotwin.twin_service import dispatcher
 from servotwin.twin_service.pace import VerificationQuota
 from servotwin.twin_service.service import TwinService
 from servotwin.twin_service.twin_file import read_twin
@@ -104,7 +106,7 @@ def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path
 
             def full(items, made, now):
                 if made and len(failures) < 2:
-                    failures.append(made)
+                    failures.append(time.monotonic())
                     raise StoreUnavailable("the disk is full")
                 return write(items, made, now)
 
@@ -114,6 +116,8 @@ def test_work_that_was_not_committed_is_repeated_when_the_store_is_back(tmp_path
                 await put(client, sequence, tries=3)
             await until(lambda: done(system))
             assert len(failures) == 2
+            # Between two attempts there was a pause, on any machine, however many messages came meanwhile.
+            assert failures[1] - failures[0] >= dispatcher._RETRY_S
             assert "result not committed" in caplog.messages
             assert {len(each) for each in statuses(system).values()} == {1}
             assert system.store.servo("ax-1").posted == 5
