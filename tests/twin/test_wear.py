@@ -251,11 +251,14 @@ def test_a_dead_zone_hides_the_gap_of_a_calm_loop():
 
 
 @pytest.mark.slow
-def test_sixteen_bits_for_the_angle_cost_hundredths_of_a_degree():
+def test_sixteen_bits_for_the_angle_cost_windows():
     """Decision 8: what the angle's rounding does, and that of the position does not."""
     fine, coarse = (loop_of("fig15-sampled", fine_angle=fine) for fine in (True, False))
     found = [max(abs(q.gap_change) for q in quantisation(loop)) for loop in (fine, coarse)]
-    assert found[0] < math.radians(0.003) < math.radians(0.005) < found[1]
-    assert 0.005 < np.max(np.abs(errors_deg(coarse))) < 0.05
+    assert found[0] < math.radians(0.003)
+    assert found[1] < math.radians(0.02)
+    accepted = [sum(each.ok for each in loop.estimates) for loop in (fine, coarse)]
+    assert accepted[1] <= 8 < accepted[0] == 10
+    assert np.max(np.abs(errors_deg(coarse))) < 0.05
     names = [channel.name for channel in fine.windows[0].channels]
     assert names == ["reference", "theta_m", "theta_m_fine", "position", "voltage"]
