@@ -33,14 +33,24 @@ def unconfirmed(now: GapBetween, earlier: GapBetween | None, possible: float) ->
     return f"two contacts show a gap of {deg(now.gap)}, the two before {deg(earlier.gap)}"
 
 
-def confirmed_std(now: GapBetween, earlier: GapBetween) -> float:
-    """Standard deviation (rad) of a gap with its growth since the one that confirms it.
+def confirmed_gap(now: GapBetween, earlier: GapBetween, time: float, gap_rate: float) -> tuple[float, float]:
+    """Gap at a later time (s) and its standard deviation, rad, with its growth since the gap that confirms it.
 
-    An encoder that slips, or a position that drifts to and fro, looks like growth once.
+    Half of what grew since the contact before is missing in the gap between both: it goes on growing as far as both
+    gaps tell the growth, with `gap_rate` (rad/s) expected. An encoder that slips, or a position that drifts to and fro,
+    looks like growth once.
     """
-    elapsed = now.time - earlier.time
+    elapsed, later, grown = now.time - earlier.time, time - now.time, now.gap - earlier.gap
+    expected, noise = (gap_rate * elapsed) ** 2, now.std**2 + earlier.std**2
+    told = expected / (expected + noise) if expected > 0.0 else 0.0
+    ahead = told * later / elapsed
     steady = 0.0 if math.isnan(earlier.rate) else max(0.0, earlier.rate) * elapsed
-    return math.hypot(now.std, SUDDEN * math.hypot(now.gap - earlier.gap - steady, earlier.std))
+    return now.gap + ahead * grown, math.hypot(
+        (1.0 + ahead) * now.std,
+        ahead * earlier.std,
+        (1.0 - told) * gap_rate * later,
+        SUDDEN * math.hypot(grown - steady, earlier.std),
+    )
 
 
 def deg(angle: float) -> str:

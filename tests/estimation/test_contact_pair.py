@@ -75,7 +75,7 @@ def test_two_windows_show_the_gap_and_a_third_confirms_it():
     for made, start in zip(later, STARTS[1:], strict=False):
         assert made.ok
         assert made.gap == pytest.approx(GAP, abs=0.01 * DEG)
-        assert made.time == pytest.approx(start + 6.0, abs=0.5)
+        assert made.time == pytest.approx(start + 11.0, abs=0.01)
         assert made.offset.offset == pytest.approx(0.0, abs=0.01 * DEG)
         assert holds(made, GAP)
     assert [e.contact.side for e in (first, second, *later)] == [-1.0, 1.0, -1.0, 1.0]
@@ -92,7 +92,8 @@ def test_intervals_hold_in_noise(noise):
     assert max(abs(each.offset.offset) / each.offset.std for each in accepted) <= 2.5
 
 
-def test_the_gap_of_a_worn_screw_is_that_of_the_middle_between_both_windows():
+def test_the_gap_of_a_worn_screw_is_that_of_the_window():
+    """Not of the middle between both contacts, 5 s before, when the gap was up to 0.3 deg narrower."""
     worn = 2.0 * DEG
     # Without any noise rounding decides what is growth: one processor was 0.086 deg off, within its interval.
     for each in estimates(windows(1e-8, worn=worn), gap_rate=0.2 * DEG)[2:]:

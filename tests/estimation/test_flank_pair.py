@@ -12,7 +12,7 @@ from servotwin.estimation import output_error
 from servotwin.estimation.estimate import GapBetween, GapEstimate, GapStatus, LastContact
 from servotwin.estimation.output_error import OutputErrorSettings
 from servotwin.estimation.output_error.flank import OneFlank
-from servotwin.estimation.two_contacts import confirmed_std, followed, unconfirmed
+from servotwin.estimation.two_contacts import SUDDEN, confirmed_gap, followed, unconfirmed
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive
 from servotwin.plant.axis import Axis
@@ -95,7 +95,7 @@ def test_two_windows_show_the_gap_of_a_load_that_friction_stops_and_a_third_conf
         assert made.ok
         assert made.gap == pytest.approx(GAP, abs=2.0 * COUNTED / PITCH)
         assert made.interval[0] <= GAP <= made.interval[1]
-        assert made.time == pytest.approx((place + 2.5) * HALF_PERIOD + 0.12, abs=0.05)
+        assert made.time == pytest.approx((place + 3.0) * HALF_PERIOD + 0.13, abs=0.001)
 
 
 def test_the_flank_is_where_the_machine_has_it() -> None:
@@ -155,4 +155,27 @@ def test_a_gap_is_confirmed_within_its_spread_and_growth() -> None:
     assert not unconfirmed(replace(now, gap=1.6), earlier, 0.3)
     assert unconfirmed(replace(now, gap=0.5), earlier, 1.0)
     # All of a sudden growth is within the interval.
-    assert 1.96 * confirmed_std(now, earlier) > 0.3
+    gap, std = confirmed_gap(now, earlier, now.time, 0.0)
+    assert gap == now.gap
+    assert 1.96 * std > 0.3
+
+
+def test_steady_growth_goes_on_until_the_window() -> None:
+    """Exactly where both gaps are; not at all where none is expected."""
+    earlier, now = GapBetween(1.0, 1e-6, 0.0, 0.15), GapBetween(1.3, 1e-6, 2.0, 0.15)
+    gap, std = confirmed_gap(now, earlier, 3.0, 0.1)
+    assert gap == pytest.approx(1.45, abs=1e-9)
+    assert std <= 3e-6
+    assert confirmed_gap(now, earlier, 3.0, 0.0)[0] == now.gap
+
+
+def test_the_spread_of_a_gap_carried_to_the_window_is_that_of_many_draws() -> None:
+    """Noise of both gaps hides half of a growth of 0.3 rad/s, root mean square."""
+    rng, rate = np.random.default_rng(1), 0.3
+    errors = []
+    for growth, early, late in rng.normal(0.0, (rate, 0.5, 0.3), (20_000, 3)):
+        earlier, now = GapBetween(early, 0.5, 0.0), GapBetween(2.0 * growth + late, 0.3, 2.0)
+        errors.append(confirmed_gap(now, earlier, 3.5, rate)[0] - 3.5 * growth)
+    steady = GapBetween(0.0, 0.5, 0.0, 0.3), GapBetween(0.6, 0.3, 2.0, 0.3)
+    std = confirmed_gap(steady[1], steady[0], 3.5, rate)[1]
+    assert math.sqrt(std**2 - (SUDDEN * 0.5) ** 2) == pytest.approx(np.std(errors), rel=0.02)

@@ -22,7 +22,7 @@ from servotwin.estimation.two_contacts import (
     LEAST_PITCH,
     VAGUE,
     WITHIN,
-    confirmed_std,
+    confirmed_gap,
     deg,
     followed,
     unconfirmed,
@@ -111,8 +111,8 @@ class _Pairing:
     def _stated(self, now: GapBetween, earlier: GapBetween) -> GapEstimate:
         """Make the estimate of the gap between two contacts."""
         settings = self.here.settings
-        std = math.hypot(confirmed_std(now, earlier), WITHIN * settings.gap_rate * self.window.duration)
-        gap = max(0.0, now.gap)
+        gap, spread = confirmed_gap(now, earlier, self.alone.time, settings.gap_rate)
+        std, gap = math.hypot(spread, WITHIN * settings.gap_rate * self.window.duration), max(0.0, gap)
         total = math.hypot(std, settings.model_share * gap)
         return replace(
             self.alone,
@@ -121,7 +121,6 @@ class _Pairing:
             std_total=total,
             interval=interval_95(gap, total),
             status=GapStatus.OK,
-            time=now.time,
             reasons=(),
             ratio=None,
         )

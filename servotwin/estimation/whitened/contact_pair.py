@@ -29,7 +29,7 @@ from servotwin.estimation.two_contacts import (
     LEAST_PITCH,
     VAGUE,
     WITHIN,
-    confirmed_std,
+    confirmed_gap,
     deg,
     followed,
     unconfirmed,
@@ -228,8 +228,8 @@ class Pair:
 def pair(here: OneContact, before: LastContact | None) -> Pair:
     """Find the gap between a window of one contact and the last contact of an earlier one on the other side.
 
-    An estimate of it belongs to the middle between both contacts, because half of the gap is that of each. The contacts
-    of a third window must confirm it: the encoder may have slipped in between.
+    It belongs to the middle between both contacts, because half of it is that of each. The contacts of a third window
+    must confirm it: the encoder may have slipped in between.
     """
     contact = here.last()
     if before is None or not before.time < here.begin.time:
@@ -277,13 +277,14 @@ def _against(here: OneContact, between: GapBetween, lead: float, possible: float
 def _stated(here: OneContact, before: LastContact, now: GapBetween, earlier: GapBetween) -> GapEstimate:
     """Make the estimate of the gap between two contacts."""
     fitted, settings = here.fitted, here.fitted.settings
-    std = math.hypot(confirmed_std(now, earlier), WITHIN * settings.gap_rate * fitted.window.duration)
+    later, spread = confirmed_gap(now, earlier, fitted.blank.time, settings.gap_rate)
+    std = math.hypot(spread, WITHIN * settings.gap_rate * fitted.window.duration)
     total = math.hypot(std, settings.model_error, here.doubt())
     # The middle of both contacts, as if they were of one moment.
     levels = (before.position + here.begin.position) / here.gain - before.motor - here.begin.motor
     grown = now.rate * (here.begin.time - before.time)
     offset_std = math.hypot(0.5 * total, 0.25 * math.hypot(now.std, earlier.std))
-    gap = max(0.0, now.gap)
+    gap = max(0.0, later)
     return replace(
         fitted.blank,
         gap=gap,
@@ -291,7 +292,6 @@ def _stated(here: OneContact, before: LastContact, now: GapBetween, earlier: Gap
         std_total=total,
         interval=interval_95(gap, total),
         status=GapStatus.OK,
-        time=now.time,
         theta_d0=here.begin.motor - 0.5 * here.side * gap,
         rms=fitted.rms(),
         evaluations=_fit_of(fitted).evaluations,
