@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from servotwin.estimation.core.elimination import solve
 from servotwin.estimation.core.least_squares import Flags, inner
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
@@ -30,21 +31,6 @@ def bounded_step(
     step = np.empty(q.size)
     room = np.empty((2, q.size, q.size)), np.empty(q.size)
     return step, take_step(residual, rows, movable, q, low, high, damping, *room, step)
-
-
-@bare
-def solve_symmetric(matrix: Array, right: Array) -> None:
-    """Solve matrix x = right (k,) into `right`, for a positive definite matrix (k, k), which is used up."""
-    for j in range(right.size):
-        for i in range(j + 1, right.size):
-            share = matrix[i, j] / matrix[j, j]
-            for k in range(j + 1, right.size):
-                matrix[i, k] -= share * matrix[j, k]
-            right[i] -= share * right[j]
-    for j in range(right.size - 1, -1, -1):
-        for k in range(j + 1, right.size):
-            right[j] -= matrix[j, k] * right[k]
-        right[j] /= matrix[j, j]
 
 
 @bare
@@ -75,7 +61,7 @@ def take_step(
         for j in range(i + 1):
             scaled[i, j] = scaled[j, i] = products[i, j] / size[i] / size[j]
         scaled[i, i] = 1.0 + damping
-    solve_symmetric(scaled, step)
+    solve(scaled, step)
     for i in range(count):
         step[i] = min(max(q[i] + step[i] / size[i], low[i]), high[i]) - q[i]
     for i in range(count):

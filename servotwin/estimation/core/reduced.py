@@ -16,8 +16,9 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from servotwin.estimation.core.decimation import AVERAGES, Decimation
-from servotwin.estimation.core.response import Complex, Readout, Response, add_motions, free_motions
+from servotwin.estimation.core.response import Readout, Response, add_motions, free_motions
 from servotwin.hybrid.compiled import bare, inlined
+from servotwin.plant.linear import Complex
 from servotwin.plant.signals import Array
 
 

@@ -10,16 +10,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.estimation.core.elimination import solve
 from servotwin.hybrid.compiled import bare, inlined
+from servotwin.plant.linear import Complex
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-Complex: TypeAlias = NDArray[np.complex128]
 _SMALL = 0.05  # of lambda T, below which the hold's weights come from their series
 _TERMS = 12
 _DEFECTIVE, _SPLIT = 1e9, 1e-9
@@ -186,29 +187,6 @@ def _modes(matrices: Array) -> tuple[Complex, Complex]:
         pattern = np.linspace(-_SPLIT, _SPLIT, matrices[i].size).reshape(matrices[i].shape)
         poles[i], shapes[i] = np.linalg.eig(matrices[i] * (1.0 + pattern))
     return poles, shapes
-
-
-@bare
-def solve(matrix: Complex, right: Complex) -> None:
-    """Solve matrix x = right (N,) into `right`, by elimination with the largest pivots; the matrix is used up."""
-    size = right.size
-    for j in range(size):
-        top = j
-        for i in range(j + 1, size):
-            if abs(matrix[i, j]) > abs(matrix[top, j]):
-                top = i
-        for k in range(j, size):
-            matrix[j, k], matrix[top, k] = matrix[top, k], matrix[j, k]
-        right[j], right[top] = right[top], right[j]
-        for i in range(j + 1, size):
-            share = matrix[i, j] / matrix[j, j]
-            for k in range(j + 1, size):
-                matrix[i, k] -= share * matrix[j, k]
-            right[i] -= share * right[j]
-    for j in range(size - 1, -1, -1):
-        for k in range(j + 1, size):
-            right[j] -= matrix[j, k] * right[k]
-        right[j] /= matrix[j, j]
 
 
 @inlined

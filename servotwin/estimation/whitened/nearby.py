@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 
 from servotwin.estimation.core.decimation import Decimation
 from servotwin.estimation.core.reduced import ReducedResponse, reduced_response, respond_each, summed_motions
-from servotwin.estimation.core.response import Complex, Readout, Response
+from servotwin.estimation.core.response import Readout, Response
 from servotwin.estimation.core.variants import variants
+from servotwin.plant.linear import Complex
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
