@@ -101,7 +101,7 @@ def test_a_bias_that_no_file_states_is_small_beside_the_command(name):
 @pytest.mark.slow
 def test_an_axis_has_a_fallback_set_where_its_file_states_gaps_and_steps_only():
     model = of_axis("ball-screw", "gap_deg = [0.0, 5.4]\nstep_mm = [0.15, 1.0]")
-    few = Demands(machines=16, screened=2, settled=0.8, beyond=Beyond(machines=4))
+    few = Demands(machines=300, screened=2, beyond=Beyond(machines=4))
     assert ServoModel("axis", model.servo, model.settings.replace(demands=few)).first_setting is not None
 
 
