@@ -133,11 +133,10 @@ def test_kinds_of_reference(tmp_path, text, signal):
     assert load(tmp_path, SHORT.replace('kind = "step"\nsize_mm = 1.0', text)).reference == signal
 
 
-@pytest.mark.slow
 def test_a_servos_path_is_relative_to_the_scenario(tmp_path):
     servo = Servo.preset("paper").replace(k=9e3)
     (tmp_path / "mine.toml").write_text(servo.dumps(), encoding="utf-8")
-    assert load(tmp_path, SHORT.replace('"paper"', '"mine.toml"')).servo == servo
+    assert load(tmp_path, SHORT.replace('"paper"', '"mine.toml"') + PAPER).servo == servo
 
 
 def test_another_servo_keeps_what_the_scenario_says_of_the_controller():

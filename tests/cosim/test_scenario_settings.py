@@ -64,10 +64,10 @@ def test_every_key_of_the_default_estimator_is_read(tmp_path):
     )
 
 
-@pytest.mark.slow
 def test_windows_have_the_rate_of_a_sampled_controller_unless_the_file_says_otherwise(tmp_path):
-    sampled = SHORT + "[controller]\nsample_rate_hz = 2000\n"
-    assert load(tmp_path, SHORT).recording.sample_rate == 5000.0
+    short = SHORT + PAPER
+    sampled = short + "[controller]\nsample_rate_hz = 2000\n"
+    assert load(tmp_path, short).recording.sample_rate == 5000.0
     assert load(tmp_path, sampled).recording.sample_rate == 2000.0
     assert load(tmp_path, sampled + "[recording]\nsample_rate_hz = 4000\n").recording.sample_rate == 4000.0
 

@@ -13,6 +13,7 @@ from scaling import AxisUnits, scaled_axis
 from servotwin.estimation.estimate import GapEstimate
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.joint.estimator import estimate_jointly
+from servotwin.estimation.joint.verdict import JointEstimate
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.signals import SquareWave
@@ -50,6 +51,13 @@ def estimated(name: str, units: AxisUnits) -> tuple[Run, GapEstimate]:
     return run, estimate_gap(Window.from_run(run, half, 2.0 * half), axis)
 
 
+@cache
+def estimated_jointly(name: str, units: AxisUnits) -> JointEstimate:
+    """The gap and the other numbers of the second step's window."""
+    (run, _), half = estimated(name, units), MOVES[name][1] * units.time
+    return estimate_jointly(Window.from_run(run, half, 2.0 * half), scaled_axis(Axis.preset(name), units))
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MOVES)
 @pytest.mark.parametrize("units", UNITS)
@@ -70,12 +78,7 @@ def test_an_axis_in_other_units_moves_and_is_estimated_alike(name: str, units: A
 @pytest.mark.parametrize("name", MOVES)
 @pytest.mark.parametrize("units", UNITS)
 def test_an_axis_in_other_units_has_the_same_numbers(name: str, units: AxisUnits) -> None:
-    (here, _), (there, _) = estimated(name, AxisUnits()), estimated(name, units)
-    half = MOVES[name][1]
-    first, second = (
-        estimate_jointly(Window.from_run(run, half * unit, 2.0 * half * unit), scaled_axis(Axis.preset(name), own))
-        for run, unit, own in ((here, 1.0, AxisUnits()), (there, units.time, units))
-    )
+    first, second = estimated_jointly(name, AxisUnits()), estimated_jointly(name, units)
     assert second.gap.status is first.gap.status
     assert second.gap.gap == pytest.approx(first.gap.gap, rel=1e-6)
     assert second.gap.std == pytest.approx(first.gap.std, rel=1e-3)

@@ -1,6 +1,7 @@
 """The gap of a free shaft whose load friction alone slows down: two windows of one flank each, on opposite sides."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -52,11 +53,12 @@ def windows(grown: float = 0.0, amplitude: float = 5e-3) -> tuple[Window, ...]:
     )
 
 
-def estimates(made: tuple[Window, ...], gap_rate: float = 0.0) -> list[GapEstimate]:
-    """Estimates one after the other, each with the contact before; `gap_rate`: assumed growth, rad/s."""
-    results: list[GapEstimate] = []
-    contact: LastContact | None = None
-    for window in made:
+def estimates(made: tuple[Window, ...], gap_rate: float = 0.0, before: Sequence[GapEstimate] = ()) -> list[GapEstimate]:
+    """Estimates one after the other, each with the contact before; `gap_rate`: assumed growth, rad/s; `before`: those
+    of the first windows, made already."""
+    results = list(before)
+    contact: LastContact | None = next((each.contact for each in reversed(results) if each.contact), None)
+    for window in made[len(results) :]:
         settings = OutputErrorSettings(gap_rate=gap_rate)
         results.append(output_error.estimate(window, RACK, None, settings, before=contact))
         contact = results[-1].contact or contact
@@ -80,6 +82,7 @@ def one_flank(window: Window) -> OneFlank:
     return flank
 
 
+@pytest.mark.slow
 def test_two_windows_show_the_gap_of_a_load_that_friction_stops_and_a_third_confirms_it() -> None:
     first, second, *later = steady()
     assert first.status in REFUSED
@@ -98,6 +101,7 @@ def test_two_windows_show_the_gap_of_a_load_that_friction_stops_and_a_third_conf
         assert made.time == pytest.approx((place + 3.0) * HALF_PERIOD + 0.13, abs=0.001)
 
 
+@pytest.mark.slow
 def test_the_flank_is_where_the_machine_has_it() -> None:
     """With the offset 0: half a gap behind the motor."""
     machine = 1.003 * PITCH
@@ -110,6 +114,7 @@ def test_the_flank_is_where_the_machine_has_it() -> None:
         assert place.std < 2e-6
 
 
+@pytest.mark.slow
 def test_encoders_that_count_from_elsewhere_show_the_same_gap() -> None:
     moved = tuple(
         each.replace(theta_m=each.theta_m + 5000 * COUNT, position=each.position - 700 * COUNTED) for each in windows()
@@ -119,14 +124,16 @@ def test_encoders_that_count_from_elsewhere_show_the_same_gap() -> None:
         assert made.gap == pytest.approx(usual.gap, rel=1e-2, nan_ok=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [-0.7, 0.6, 2.0])
 def test_an_encoder_that_slips_makes_no_false_gap(share: float) -> None:
     for first in (1, 2):
-        results = estimates(slipped(windows(), first, share * GAP)[:3])
+        results = estimates(slipped(windows(), first, share * GAP)[:3], before=steady()[:first])
         assert all(each.interval[0] <= GAP <= each.interval[1] for each in results if each.ok)
         assert not (first == 2 and results[2].ok)
 
 
+@pytest.mark.slow
 def test_a_gap_that_grows_as_it_may_is_confirmed() -> None:
     grown = 0.3 * GAP
     *_, made = estimates(windows(grown)[:3], gap_rate=2.0 * grown / (STEPS * HALF_PERIOD))
@@ -137,6 +144,7 @@ def test_a_gap_that_grows_as_it_may_is_confirmed() -> None:
     assert estimates(windows(grown)[:3])[2].std > 0.0
 
 
+@pytest.mark.slow
 def test_a_second_window_of_the_same_side_keeps_what_was_shown_before() -> None:
     contact = steady()[1].contact
     assert contact is not None

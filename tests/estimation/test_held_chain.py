@@ -90,6 +90,7 @@ def test_a_factor_on_the_force_moves_the_load_as_another_force_does() -> None:
     np.testing.assert_allclose(moved(1.0, 2.0), moved(2.0, 1.0), rtol=0.0, atol=1e-9 * np.ptp(window.position))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", AXES)
 def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
     axis = AXES[name]
@@ -100,6 +101,7 @@ def test_the_gap_is_right_and_inside_its_interval(name: str) -> None:
     assert estimate.interval[0] < GAP < estimate.interval[1]
 
 
+@pytest.mark.slow
 def test_friction_of_another_size_is_fitted_and_widens_the_interval() -> None:
     axis, window = screw_axis(3, 0.1), measured(worn(screw_axis(3, 0.105)), noise=1e-6)
     right, off = estimate_gap(window, screw_axis(3, 0.105)), estimate_gap(window, axis)
@@ -109,6 +111,7 @@ def test_friction_of_another_size_is_fitted_and_widens_the_interval() -> None:
     assert off.std_total > 2.0 * right.std_total
 
 
+@pytest.mark.slow
 def test_friction_that_is_twice_the_stated_one_is_no_gap() -> None:
     """The wind-up of the springs by the difference is as large as a third of the gap."""
     window = measured(worn(screw_axis(3, 0.2)), noise=1e-6)
@@ -119,6 +122,7 @@ def test_friction_that_is_twice_the_stated_one_is_no_gap() -> None:
     assert off == pytest.approx(100.0, abs=5.0)
 
 
+@pytest.mark.slow
 def test_friction_within_what_is_known_of_it_is_believed() -> None:
     """The stated friction would make the gap 1.3 deg wider, and its interval just contains that."""
     window, axis = measured(worn(screw_axis(3, 0.118)), noise=1e-6), screw_axis(3, 0.1)

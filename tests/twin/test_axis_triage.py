@@ -52,12 +52,18 @@ def fed(twin: Twin, arrived: tuple[messages.WindowMessage, ...]) -> Twin:
     return twin
 
 
-def new() -> Twin:
-    return Twin("axis", TwinModel.of(AXIS, SETTINGS))
+def new(state: bytes = b"") -> Twin:
+    return Twin("axis", TwinModel.of(AXIS, SETTINGS), None, state)
+
+
+@cache
+def settled(count: int) -> Twin:
+    """After the first windows of a gap that stays; not to be fed more."""
+    return fed(new(), windows(GAP)[:count])
 
 
 def test_windows_that_say_nothing_new_get_a_glance() -> None:
-    log = fed(new(), windows(GAP)).log
+    log = settled(6).log
     assert len(log.estimates) == 1
     glances = list(log.glances.values())
     assert [one.moved for one in glances] == [True, *[False] * 5]
@@ -69,7 +75,7 @@ def test_windows_that_say_nothing_new_get_a_glance() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("moved", [0.97, 1.03])
 def test_a_gap_that_moved_is_estimated_at_once(moved: float) -> None:
-    twin = fed(new(), (*windows(GAP), *windows(moved * GAP, 6)))
+    twin = fed(new(settled(6).state()), windows(moved * GAP, 6))
     first = twin.log.glances["axis", "boot-1", 6]
     assert first.why.startswith("the gap moved: ")
     assert first.gap == pytest.approx(moved * GAP, rel=0.005)
@@ -81,7 +87,7 @@ def test_a_gap_that_moved_is_estimated_at_once(moved: float) -> None:
 
 @pytest.mark.slow
 def test_what_triage_remembers_is_part_of_the_state() -> None:
-    whole, twin = fed(new(), windows(GAP)), fed(new(), windows(GAP)[:3])
+    whole, twin = settled(6), fed(new(), windows(GAP)[:3])
     reborn = fed(Twin("axis", twin.model, twin.log, twin.state()), windows(GAP)[3:])
     assert reborn.state() == whole.state()
     assert reborn.log.glances == whole.log.glances
@@ -91,7 +97,7 @@ def test_what_triage_remembers_is_part_of_the_state() -> None:
 @pytest.mark.parametrize("unknowns", [(), (0.015, 0.0)])
 def test_unknowns_of_another_version_or_model_are_not_used(unknowns: tuple[float, ...]) -> None:
     """The window is estimated, and its unknowns serve the next."""
-    twin = fed(new(), windows(GAP)[:2])
+    twin = settled(2)
     state = twin.model.restored("axis", twin.state())
     assert state.triage is not None
     older = structs.replace(state, triage=structs.replace(state.triage, unknowns=unknowns))

@@ -12,7 +12,6 @@ from functools import cache
 import msgspec
 import numpy as np
 import pytest
-from few_machines import certified_scenario
 from rich.console import Console
 from twin_messages import eq_21, message_of
 
@@ -29,7 +28,6 @@ from servotwin.estimation.whitened.quick import quick_fit
 from servotwin.estimation.window import Window
 from servotwin.plant.noise import Noise
 from servotwin.plant.servo import Servo
-from servotwin.redesign.certified.demands import Demands
 from servotwin.twin.estimating import decode_window, estimator_of
 from servotwin.twin.evidence import GlanceRecord
 from servotwin.twin.evidence_log import EvidenceLog
@@ -44,8 +42,6 @@ DEG = math.pi / 180.0
 SERVO = Servo.preset("paper")
 SETTINGS = TriageSettings()
 OFFSET = (0.0, 0.0155 * DEG)
-SMALL = {"machines": 16, "conditions": 4, "screened": 2, "settled": 0.8, "attempts": 1}
-"""Few machines and candidates: what is shown here does not depend on how often a setting was tried."""
 
 
 @cache
@@ -65,12 +61,11 @@ def calm_windows() -> tuple[messages.WindowMessage, ...]:
     return (*lively[:3], *calm[3:])
 
 
-def windows_under(scale: float, seconds: float) -> tuple[messages.WindowMessage, ...]:
+def windows_under(scale: float, seconds: float, gap: float = 25.0 * DEG) -> tuple[messages.WindowMessage, ...]:
     """Of a loop whose Kp and Kd are the servo's own times a scale: a livelier one shows both contacts for longer."""
-    demands = Demands(scales=(scale,), shapes=((1.0, 1.0),), notch=False, Ms_worst=100.0, **SMALL)
-    scenario = Scenario.preset("certified")
-    scenario = scenario.replace(gap=25.0 * DEG, duration=seconds, twin=scenario.twin.replace(demands=demands))
-    return cosimulate(scenario).windows
+    scenario = Scenario.preset("calm").replace(gap=gap, duration=seconds, input_bias=0.05)
+    law = scenario.law.replace(Kp=scale * SERVO.controller.Kp, Kd=scale * SERVO.controller.Kd)
+    return cosimulate(scenario.replace(controller=law)).windows
 
 
 def watch_of(gap: float, misfit: float = 5e-5, **changes) -> TriageState:
@@ -302,7 +297,7 @@ def test_wear_is_followed_as_closely_as_without_triage() -> None:
 @pytest.mark.slow
 def test_a_crash_in_a_steady_loop_is_estimated_at_once() -> None:
     before = calm_windows()
-    after = cosimulate(certified_scenario(63.0).replace(gap=26.0 * DEG)).windows[3:]
+    after = windows_under(0.7, 63.0, 26.0 * DEG)[3:]
     shifted = [
         msgspec.structs.replace(one, start=one.start + 400.0, sequence=one.sequence + 50, boot=before[0].boot)
         for one in after

@@ -43,6 +43,7 @@ def test_a_lag_is_told_from_the_gap():
     assert found.lag == pytest.approx(5e-3, rel=0.02)
 
 
+@pytest.mark.slow
 def test_a_load_that_runs_ahead_of_its_motor_is_doubted():
     # Inertia does that, or a motor's column that is late: the log does not tell which.
     found = estimate_lost_motion(recording(lag=-12e-3))
@@ -94,6 +95,7 @@ def test_a_load_that_hunts_follows_all_the_same():
     assert estimate_lost_motion(EncoderRecording(time, motor, resting)).status is GapStatus.LOWER_BOUND
 
 
+@pytest.mark.slow
 def test_a_load_that_overshoots_at_every_reversal_shows_no_gap():
     # All cycles agree on the least gap, 0: there is no spread to search within.
     time, motor = swings()
