@@ -46,7 +46,7 @@ def test_a_servo_is_enrolled_and_its_edge_can_begin(tmp_path):
     done = run("enroll", "ax-7", "--twin", twin, "--edge", edge, "--url", "https://twin:1", "--role", "control")
     assert done.exit_code == 0, done.output
     config = load(edge / "edge.toml")
-    token = token_of(config.twin, edge)
+    token = token_of(config)
     assert token not in done.output
     assert (config.agent.servo, config.role, config.twin.url) == ("ax-7", "control", "https://twin:1")
     assert isinstance(config.agent, AgentSettings)
