@@ -50,6 +50,13 @@ def _variable(_table: Table, _name: str, variable: str, _folder: Path) -> str:
     return secret_in(os.environ, variable)
 
 
+def _log(table: Table, name: str, path: Path, folder: Path) -> Path:
+    from servotwin.drives.replay import check_begin
+
+    check_begin(readable(table, name, path, folder))
+    return path
+
+
 def _certificate(table: Table, name: str, path: Path, folder: Path) -> Path:
     from servotwin.drives.opcua.settings import check_certificate
 
@@ -85,7 +92,7 @@ def _supervised(
 
 
 def _replay(
-    log: Annotated[Path, key(parse=readable, help="CSV as `servotwin simulate` writes it.")],
+    log: Annotated[Path, key(parse=_log, help="CSV as `servotwin simulate` writes it.")],
     speed: Annotated[float, key(minimum=0.0, help="Seconds of the log per second; 0: as fast as it is read.")] = 1.0,
     loop: Annotated[bool, key(help="Begin again at the end.")] = False,
     block_s: Annotated[float, key(above=0.0, help="Length of a block.")] = 0.05,

@@ -222,7 +222,7 @@ def test_a_twin_names_the_key_of_a_file_that_cannot_be_used_and_makes_no_store(
     assert set(tmp_path.iterdir()) == before
 
 
-OPC_UA = '[drive]\nkind = "opcua"\nurl = "opc.tcp://127.0.0.1:1"\n'
+OPC_UA = 'kind = "opcua"\nurl = "opc.tcp://127.0.0.1:1"\n'
 
 
 @FAULTS
@@ -233,6 +233,7 @@ OPC_UA = '[drive]\nkind = "opcua"\nurl = "opc.tcp://127.0.0.1:1"\n'
         ("twin.ca_file", f'url = "https://127.0.0.1"\n{TOKEN}'),
         ("twin.password_file", f'url = "mqtt://127.0.0.1"\n{TOKEN}user = "u"\n'),
         ("drive.password_file", 'user = "u"\n'),
+        ("drive.log", 'kind = "replay"\n'),
         ("drive.certificate", 'private_key = "token"\nserver_certificate = "token"\n'),
     ],
 )
@@ -244,13 +245,15 @@ def test_an_edge_names_the_key_of_a_file_that_cannot_be_used(tmp_path: Path, key
     text = EDGE.replace('role = "control"', 'role = "supervise"')
     if table == "drive":
         simulated = text[text.index("[drive]") : text.index("[controller]")]
-        text = text.replace(simulated, f'{OPC_UA}{more}{name} = "named"\n')
+        kind = "" if more.startswith("kind") else OPC_UA
+        text = text.replace(simulated, f'[drive]\n{kind}{more}{name} = "named"\n')
     else:
         text += f'[{table}]\n{more}{name} = "named"\n'
     (tmp_path / "edge.toml").write_text(text)
     with pytest.raises(InvalidInput) as refused:
         run_edge(tmp_path / "edge.toml")
     assert str(refused.value).startswith(f"{tmp_path / 'edge.toml'}: {key} = 'named': ")
+    assert {each.name for each in tmp_path.iterdir()} <= {"edge.toml", "token", "named"}
     assert "\n" not in str(refused.value)
 
 

@@ -247,7 +247,7 @@ def test_an_error_in_the_drive_table_is_named(tmp_path: Path, values: dict[str, 
 def test_the_table_of_each_kind(tmp_path: Path) -> None:
     (tmp_path / "word.txt").write_text("secret\n")
     (tmp_path / "word.txt").chmod(0o600)
-    (tmp_path / "run.csv").touch()
+    (tmp_path / "run.csv").write_text("time_s,reference_m,theta_m_rad,position_m,voltage_v\n0,0,0,0,0\n")
     tables = (
         {"kind": "opcua", "url": URL, "user": "edge", "password_file": "word.txt"},
         {"kind": "replay", "log": "run.csv", "speed": 0.0},
