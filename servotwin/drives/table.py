@@ -117,7 +117,11 @@ def _opcua(
         str | None, key(parse=_variable, help="Environment variable with the user's password.")
     ] = None,
     certificate: Annotated[
-        Path | None, key(parse=_certificate, help="The edge's certificate, PEM or DER; all three files or none.")
+        Path | None,
+        key(
+            parse=_certificate,
+            help="The edge's certificate: NAME.pem in PEM, any other in DER; all three files or none.",
+        ),
     ] = None,
     private_key: Annotated[Path | None, key(parse=_private_key, help="Its private key.")] = None,
     server_certificate: Annotated[Path | None, key(parse=_certificate, help="Certificate of the server.")] = None,
