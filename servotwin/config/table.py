@@ -297,10 +297,7 @@ def named(table: Table) -> Iterator[None]:
 
 @contextmanager
 def of_key(table: Table, key: str) -> Iterator[None]:
-    """Prefix an InvalidInput that says what is wrong with a value with the file, the key and the value.
-
-    An OSError becomes one: the value names a file that cannot be read.
-    """
+    """Prefix an InvalidInput about a value with file, key and value; of a file that cannot be read, raise one."""
     try:
         yield
     except InvalidInput as error:

@@ -175,6 +175,11 @@ def test_a_servo_that_nobody_knows_is_told_from_one_without_windows_and_a_store_
     assert (silent.exit_code, "has sent messages, but no window yet" in silent.stderr) == (2, True)
     checked = run("twin", "check", "--config", twin)
     assert (checked.exit_code, "is sound (1 messages agree" in checked.stdout) == (0, True), checked.output
+    (tmp_path / "twin.db-newest").write_text("2\n")  # as a twin noted it
+    short = run("twin", "check", "--config", twin)
+    assert short.exit_code == 2
+    assert "number 1, and it once had number 2" in " ".join(short.stderr.split())
+    (tmp_path / "twin.db-newest").unlink()
     database = sqlite3.connect(tmp_path / "twin.db")
     with closing(database), database:
         database.execute("UPDATE bodies SET body = x'00'")
