@@ -17,6 +17,7 @@ from urllib.request import HTTPRedirectHandler, HTTPSHandler, ProxyHandler, Requ
 import msgspec
 
 from servotwin.cli.audit_report import JsonObject, Units, lines_of, servo_lines
+from servotwin.config.files import read_secret
 from servotwin.config.table import did_you_mean
 from servotwin.dashboard.series import machine_series
 from servotwin.errors import InvalidInput
@@ -24,7 +25,6 @@ from servotwin.link.url import in_clear, is_encrypted
 from servotwin.runtime import files
 from servotwin.store.records import ServoSummary
 from servotwin.store.store import Store
-from servotwin.twin_service.auth import read_secret
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.fleet_reader import FleetReader
 from servotwin.twin_service.http_operator import MAX_ROWS, evidence_as_json, trace_as_json
@@ -217,7 +217,7 @@ def _client(source: Source) -> Callable[[str], bytes]:
     if source.token is not None and in_clear(url):
         raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
     if source.token is not None:
-        headers["Authorization"] = f"Bearer {read_secret(source.token)}"
+        headers["Authorization"] = f"Bearer {read_secret(source.token, in_header=True)}"
     # A request in clear goes to this computer only, and must not pass a proxy, which could read the token.
     handler = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
     opener = build_opener(_NoRedirect, handler)

@@ -13,6 +13,7 @@ from servotwin.store.engine import POSTGRESQL, SQLITE
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message
 from servotwin.store.store import Store
 from servotwin.twin_service.command import open_existing_store
+from servotwin.twin_service.store_watch import lost_messages
 from servotwin.twin_service.twin_file import service_of
 
 _BODIES = 256
@@ -25,10 +26,15 @@ def check_store(config: Path) -> None:
     Raises
     ------
     InvalidInput
-        The store is damaged, or cannot be opened.
+        The store is damaged, has lost messages, or cannot be opened.
     """
     with closing(open_existing_store(service_of(config))) as store:
         _require_sound(store, check_pages(store, math.inf))
+        if lost := lost_messages(store, config):
+            raise InvalidInput(
+                f"store {store.name}: has lost messages ({lost}); a twin that starts on it asks the edges for the "
+                "windows that they still keep, or end the twin and restore a newer backup"
+            )
         checked = _check_bodies(store)
         print(f"store {store.name}: is sound ({checked} messages agree with their digests)")
 

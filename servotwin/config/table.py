@@ -295,6 +295,19 @@ def named(table: Table) -> Iterator[None]:
         raise InvalidInput(f"{where}: {error}") from None
 
 
+@contextmanager
+def of_key(table: Table, key: str) -> Iterator[None]:
+    """Prefix an InvalidInput about a value with file, key and value; of a file that cannot be read, raise one."""
+    try:
+        yield
+    except InvalidInput as error:
+        if str(error).startswith(f"{table.source}: {table.path(key)}"):
+            raise
+        raise InvalidInput(f"{table.source}: {table.path(key)} = {_shown(table.values[key])}: {error}") from None
+    except OSError as error:
+        raise table.invalid(key, f"a file that can be read ({error.strerror or error})") from None
+
+
 def read_inner(table: Table, key: str, read: Callable[[Table], _Value]) -> _Value:
     """Read an inner table with `read`; every key must be read."""
     inner = table.table(key)

@@ -12,7 +12,7 @@ from typing import Any
 
 from servotwin.config.contradiction import Contradiction
 from servotwin.config.keys import ORDERED, Form, Item, Maker, items_of
-from servotwin.config.table import Table, named
+from servotwin.config.table import Table, named, of_key
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
@@ -141,10 +141,8 @@ def _value(table: Table, item: Item, name: str, folder: Path, base: object) -> A
     read_value = _plain(table, item, name, folder)
     if declared.parse is None:
         return read_value
-    try:
+    with of_key(table, name):
         return declared.parse(table, name, read_value, folder)
-    except OSError as error:
-        raise table.invalid(name, f"a file that can be read ({error.strerror or error})") from None
 
 
 def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:

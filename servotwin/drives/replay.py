@@ -165,6 +165,13 @@ def opened(path: Path) -> TextIO:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror})") from None
 
 
+def check_begin(path: Path) -> None:
+    """Check that a log has its columns and a first sample, without reading it whole; raises InvalidInput."""
+    with opened(path) as file:
+        if next(rows(path, file), None) is None:
+            raise InvalidInput(f"log {path}: has no samples")
+
+
 def extent(path: Path) -> Extent:
     """Check every sample of a log, and return their number and rate."""
     with opened(path) as file:

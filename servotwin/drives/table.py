@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from servotwin.config.keys import key
+from servotwin.config.files import readable, secret_file, secret_in
+from servotwin.config.keys import Form, key
 from servotwin.config.table import Table
 from servotwin.config.toml import read_kind
 from servotwin.edge.drive import ControlDrive, SupervisedDrive
@@ -43,6 +45,32 @@ def _socket(_table: Table, _name: str, address: str, folder: Path) -> str:
     return f"unix:{folder / path}" if kind == "unix" and path else address
 
 
+def _variable(_table: Table, _name: str, variable: str, _folder: Path) -> str:
+    """Read the secret in an environment variable."""
+    return secret_in(os.environ, variable)
+
+
+def _log(table: Table, name: str, path: Path, folder: Path) -> Path:
+    from servotwin.drives.replay import check_begin
+
+    check_begin(readable(table, name, path, folder))
+    return path
+
+
+def _certificate(table: Table, name: str, path: Path, folder: Path) -> Path:
+    from servotwin.drives.opcua.settings import check_certificate
+
+    check_certificate(readable(table, name, path, folder))
+    return path
+
+
+def _private_key(table: Table, name: str, path: Path, folder: Path) -> Path:
+    from servotwin.drives.opcua.settings import check_private_key
+
+    check_private_key(readable(table, name, path, folder))
+    return path
+
+
 def _controlled(
     address: Annotated[str, key(parse=_socket, help=_ADDRESS)],
     silence_s: Annotated[float, key(minimum=0.0, help=_SILENCE)] = 5.0,
@@ -64,7 +92,7 @@ def _supervised(
 
 
 def _replay(
-    log: Annotated[Path, key(help="CSV as `servotwin simulate` writes it.")],
+    log: Annotated[Path, key(parse=_log, help="CSV as `servotwin simulate` writes it.")],
     speed: Annotated[float, key(minimum=0.0, help="Seconds of the log per second; 0: as fast as it is read.")] = 1.0,
     loop: Annotated[bool, key(help="Begin again at the end.")] = False,
     block_s: Annotated[float, key(above=0.0, help="Length of a block.")] = 0.05,
@@ -81,13 +109,22 @@ def _opcua(
         str | None, key(help="Browse name of the drive's object below Objects; the model's where absent.")
     ] = None,
     user: Annotated[str | None, key(help="User; without certificates on this machine only.")] = None,
-    password_file: Annotated[Path | None, key(help="File of mode 0600 with the user's password.")] = None,
-    password_env: Annotated[str | None, key(help="Environment variable with the user's password.")] = None,
-    certificate: Annotated[
-        Path | None, key(help="The edge's certificate, PEM or DER; all three files or none.")
+    password: Annotated[
+        str | None,
+        key("password_file", form=Form.PATH, parse=secret_file, help="File of mode 0600 with the user's password."),
     ] = None,
-    private_key: Annotated[Path | None, key(help="Its private key.")] = None,
-    server_certificate: Annotated[Path | None, key(help="Certificate of the server.")] = None,
+    password_env: Annotated[
+        str | None, key(parse=_variable, help="Environment variable with the user's password.")
+    ] = None,
+    certificate: Annotated[
+        Path | None,
+        key(
+            parse=_certificate,
+            help="The edge's certificate: NAME.pem in PEM, any other in DER; all three files or none.",
+        ),
+    ] = None,
+    private_key: Annotated[Path | None, key(parse=_private_key, help="Its private key.")] = None,
+    server_certificate: Annotated[Path | None, key(parse=_certificate, help="Certificate of the server.")] = None,
     poll_s: Annotated[
         float,
         key(above=0.0, help="Interval between two readings of the samples; the rings must hold several times as much."),
@@ -96,14 +133,14 @@ def _opcua(
 ) -> SupervisedDrive:
     """OPC UA drive."""
     from servotwin.drives.opcua.drive import OpcUaDrive
-    from servotwin.drives.opcua.settings import OpcUaSettings, read_password
+    from servotwin.drives.opcua.settings import OpcUaSettings
 
     return OpcUaDrive(
         OpcUaSettings(
             url=url,
             node=OpcUaSettings.node if node is None else node,
             user=user,
-            password=read_password(password_file, password_env),
+            password=password if password_env is None else password_env,
             certificate=certificate,
             private_key=private_key,
             server_certificate=server_certificate,

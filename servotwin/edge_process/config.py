@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import os
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 from urllib.parse import urlsplit
 
+from servotwin.config.files import read_secret, secret_in
 from servotwin.config.keys import check, key, settings
 from servotwin.config.own_units import COMMANDS, POSITIONS, OwnUnits
-from servotwin.config.table import Table
+from servotwin.config.table import Table, of_key
+from servotwin.config.toml import values_of
 from servotwin.control.laws import AnyController
 from servotwin.control.running_law import RunningLaw
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import is_mqtt
-from servotwin.link.url import in_clear
+from servotwin.link.url import in_clear, is_encrypted, tls_context
 
 ROLES = ("control", "supervise")
 UNBOOTED = "unbooted"
@@ -231,6 +232,11 @@ class EdgeConfig:
         """Table [drive], which the drive's own reader parses."""
         return Table(self.source, self.drive, "drive")
 
+    @property
+    def link_table(self) -> Table:
+        """Table [twin], to name its keys in errors."""
+        return Table(self.source, {} if self.twin is None else values_of(self.twin), "twin")
+
     def path(self, name: str) -> Path:
         """Path of a file that the configuration names."""
         return self.folder / name
@@ -246,22 +252,42 @@ class EdgeConfig:
         return RunningLaw(chosen, tolerance)
 
 
-def token_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.environ) -> str:
-    """Read the servo's token.
+def token_of(config: EdgeConfig, environment: Mapping[str, str] = os.environ) -> str:
+    """Read the servo's token; empty where there is no twin.
 
     Raises
     ------
     InvalidInput
-        It is missing, or others may read its file; the message never shows the token.
+        It is missing, or others may read its file; the message names file and key, and never shows the token.
     """
-    return _secret("token", twin.token_file, twin.token_env, folder, environment)
+    if config.twin is None:
+        return ""
+    return _secret(config, config.twin.token_file, "token", environment, in_header=True)
 
 
-def password_of(twin: TwinLink, folder: Path, environment: Mapping[str, str] = os.environ) -> str | None:
+def password_of(config: EdgeConfig, environment: Mapping[str, str] = os.environ) -> str | None:
     """Read the password of the edge's user at the broker; None without a user. Raises InvalidInput as `token_of`."""
-    if twin.user is None:
+    if config.twin is None or config.twin.user is None:
         return None
-    return _secret("password", twin.password_file, twin.password_env, folder, environment)
+    return _secret(config, config.twin.password_file, "password", environment, in_header=False)
+
+
+def check_certificates(config: EdgeConfig) -> None:
+    """Check the certificates against which the twin's is checked, where the link is encrypted; raises InvalidInput."""
+    twin = config.twin
+    if twin is not None and twin.ca_file is not None and is_encrypted(twin.url):
+        with of_key(config.link_table, "ca_file"):
+            tls_context(str(config.path(twin.ca_file)))
+
+
+def _secret(config: EdgeConfig, file: str | None, name: str, environment: Mapping[str, str], *, in_header: bool) -> str:
+    """Read a secret from the file `NAME_file` of [twin], or from the environment variable `NAME_env`."""
+    table = config.link_table
+    if file is not None:
+        with of_key(table, f"{name}_file"):
+            return read_secret(config.path(file), in_header=in_header)
+    with of_key(table, f"{name}_env"):
+        return secret_in(environment, str(table.values[f"{name}_env"]), in_header=in_header)
 
 
 def _is_http(url: str) -> bool:
@@ -271,26 +297,3 @@ def _is_http(url: str) -> bool:
         return bool(good) and parts.username is None and (parts.port is None or parts.port > 0)
     except ValueError:
         return False
-
-
-def _secret(what: str, file: str | None, variable: str | None, folder: Path, environment: Mapping[str, str]) -> str:
-    """Read a secret from a private file or the environment."""
-    if variable is not None:
-        return _checked(what, environment.get(variable, "").strip(), f"environment variable {variable}")
-    assert file is not None
-    path = folder / file
-    try:
-        mode = path.stat().st_mode
-        if stat.S_ISDIR(mode):
-            raise InvalidInput(f"{path}: holds no {what}: it is a folder")
-        if mode & 0o077:
-            raise InvalidInput(f"{path}: others than its owner may open it; give it mode 0600")
-        return _checked(what, path.read_text(encoding="utf-8").strip(), str(path))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(f"{path}: the {what} cannot be read ({getattr(error, 'strerror', None) or error})") from None
-
-
-def _checked(what: str, secret: str, where: str) -> str:
-    if not secret or not secret.isascii() or not secret.isprintable() or " " in secret:
-        raise InvalidInput(f"{where}: holds no {what}; printable characters without spaces are allowed")
-    return secret

@@ -24,7 +24,7 @@ from typing import Any
 
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge_process import frames
-from servotwin.edge_process.config import EdgeConfig
+from servotwin.edge_process.config import EdgeConfig, token_of
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
 from servotwin.edge_process.live_view import LiveView
@@ -40,7 +40,7 @@ from servotwin.edge_process.monitoring import (
     write_status,
 )
 from servotwin.edge_process.shared_samples import SampleReader
-from servotwin.edge_process.transports import exclusive_transport, link_token, live_link
+from servotwin.edge_process.transports import exclusive_transport, live_link
 from servotwin.edge_process.twin_limits import limits_told, window_trouble
 from servotwin.errors import InvalidInput
 from servotwin.link.claim import ExclusiveTransport
@@ -80,7 +80,7 @@ class LinkProcess:
         self._run, self.outbox = run, _outbox(config, last)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
-        self._token, self._token_replaced = link_token(config), False
+        self._token, self._token_replaced = token_of(config), False
         self._transport = exclusive_transport(config, self.outbox, run)
         self._session = Session(self.outbox, config.agent.retry, random.random)
         self._sender = self._receiver = None
@@ -193,7 +193,7 @@ class LinkProcess:
         if self._token_replaced or self._receiver is None or not (self._session.trouble or self._receiver.trouble):
             return
         with suppress(InvalidInput):  # it is being replaced just now
-            self._token_replaced = link_token(self._config) != self._token
+            self._token_replaced = token_of(self._config) != self._token
         if self._token_replaced:
             log("token replaced")
 

@@ -67,14 +67,14 @@ def run(path: str | os.PathLike[str]) -> None:
     InvalidInput
         The configuration, the token or the drive is invalid, or another edge runs on the same files.
     """
-    config = load(path)
+    config, file = load(path), Path(path).resolve()
     check(config)
+    drive = _drive_of(config, file)  # before a file is made, for what its table names may be wrong
     with exclusive(config):
-        _run(config, Path(path).resolve())
+        _run(config, file, drive)
 
 
-def _run(config: EdgeConfig, path: Path) -> None:
-    drive = _drive_of(config, path)
+def _run(config: EdgeConfig, path: Path, drive: Drive) -> None:
     first = permitted(stored_parameters(config.path(config.files.parameters)), config.agent, config.units)
     # Before the first sample: counts of samples begin at 0 in each boot, so two starts must not share a name.
     boot = next_boot(config.path(config.files.boots), os.urandom(8))

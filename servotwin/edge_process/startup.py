@@ -12,10 +12,9 @@ from servotwin.edge.parameters import Parameters
 from servotwin.edge.settings import AgentSettings
 from servotwin.edge.store import FileParameterStore
 from servotwin.edge.supervisor import Rules
-from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
+from servotwin.edge_process.config import EdgeConfig, check_certificates, password_of, token_of
 from servotwin.edge_process.monitoring import log
 from servotwin.errors import InvalidInput
-from servotwin.link.url import is_encrypted, tls_context
 from servotwin.runtime.extras import check_extra
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.locks import locked
@@ -30,10 +29,11 @@ def check(config: EdgeConfig) -> None:
         The token, the broker's password, the certificates, a library of the link or a folder is missing.
     """
     _check_files(config)
-    if config.twin is not None:
-        token_of(config.twin, config.folder)
-        password_of(config.twin, config.folder)
-        _check_link(config, config.twin)
+    token_of(config)
+    password_of(config)
+    check_certificates(config)
+    if config.twin is not None and config.twin.over_mqtt:
+        check_extra("paho", f"{config.source}: [twin]: url = {config.twin.url!r}")
 
 
 def _check_files(config: EdgeConfig) -> None:
@@ -54,14 +54,6 @@ def _check_files(config: EdgeConfig) -> None:
             raise InvalidInput(f"{where}: cannot be used ({error.strerror})") from None
         if (other := taken.setdefault(path.resolve(), key)) != key:
             raise InvalidInput(f"{where}: is {other}; give another name")
-
-
-def _check_link(config: EdgeConfig, twin: TwinLink) -> None:
-    if twin.over_mqtt:
-        check_extra("paho", f"{config.source}: [twin]: url = {twin.url!r}")
-    if twin.ca_file is None or not is_encrypted(twin.url):
-        return
-    tls_context(str(config.path(twin.ca_file)))
 
 
 @contextmanager

@@ -41,7 +41,7 @@ def live_link(config: EdgeConfig, run: str) -> LiveLink | None:
     twin = config.twin
     if twin is None or not twin.live:
         return None
-    servo, token = config.agent.servo, link_token(config)
+    servo, token = config.agent.servo, token_of(config)
     if twin.over_mqtt:
         from servotwin.link.mqtt import LiveMqtt
 
@@ -59,27 +59,22 @@ def _http(config: EdgeConfig, twin: TwinLink, _run: str) -> ClaimingTransport:
     from servotwin.link.http import HttpTransport
 
     return HttpTransport(
-        twin.url, config.agent.servo, link_token(config), _ca_file(config, twin), twin.timeout_s, twin.wait_s
+        twin.url, config.agent.servo, token_of(config), _ca_file(config, twin), twin.timeout_s, twin.wait_s
     )
 
 
 def _mqtt(config: EdgeConfig, twin: TwinLink, run: str) -> ClaimingTransport:
     from servotwin.link.mqtt import MqttTransport
 
-    servo, token = config.agent.servo, link_token(config)
+    servo, token = config.agent.servo, token_of(config)
     return MqttTransport(_broker(config, twin), servo, token, twin.timeout_s, twin.wait_s, run)
 
 
 def _broker(config: EdgeConfig, twin: TwinLink) -> Broker:
     from servotwin.link.broker import Broker
 
-    return Broker(twin.url, twin.user, password_of(twin, config.folder), _ca_file(config, twin))
+    return Broker(twin.url, twin.user, password_of(config), _ca_file(config, twin))
 
 
 _TRANSPORTS: dict[str, Callable[[EdgeConfig, TwinLink, str], ClaimingTransport]] = {"http": _http, "mqtt": _mqtt}
 """Transports by name; each is imported when it is used."""
-
-
-def link_token(config: EdgeConfig) -> str:
-    """Token of the servo; empty where there is no twin."""
-    return "" if config.twin is None else token_of(config.twin, config.folder)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import ipaddress
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import urlsplit
 
+from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
 
 if TYPE_CHECKING:
     import ssl
+
+_Path = TypeVar("_Path", str, Path)
 
 
 def is_here(host: str) -> bool:
@@ -33,6 +37,12 @@ def in_clear(url: str) -> bool:
     return parts.scheme == "http" and not is_here(parts.hostname or "")
 
 
+def certificates(_table: Table, _name: str, path: _Path, _folder: Path) -> _Path:
+    """Return the path of a file of certificates, for `config.keys.key(parse=...)`; raises as `tls_context` does."""
+    tls_context(str(path))
+    return path
+
+
 def tls_context(ca_file: str | None) -> ssl.SSLContext:
     """Make the context of a client that checks certificates against those of a file; None: the system's.
 
@@ -47,4 +57,4 @@ def tls_context(ca_file: str | None) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=ca_file)
     except OSError as error:  # ssl.SSLError is one
         reason = error.strerror or error
-        raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({reason})") from None
+        raise InvalidInput(f"{ca_file}: holds no certificates that can be read ({reason}); give a PEM file") from None

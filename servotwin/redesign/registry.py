@@ -107,7 +107,12 @@ def _certified(servo: Plant, options: PolicyOptions) -> Policy:
     policy = certified_policy(servo, options)
     if options.table is not None and not isinstance(servo.controller, Controller):
         raise InvalidInput(f"table = {options.table!r}: tables hold settings of a filtered PID; leave the table out")
-    return policy if options.table is None else TablePolicy(policy, load(Path(options.table), policy))
+    if options.table is None:
+        return policy
+    try:
+        return TablePolicy(policy, load(Path(options.table), policy))
+    except InvalidInput as error:
+        raise InvalidInput(f"table = {options.table!r}: {error}") from None
 
 
 def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:

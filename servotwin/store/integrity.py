@@ -16,14 +16,17 @@ import sqlalchemy as sa
 from servotwin.messages import MAX_BYTES, InvalidMessage
 from servotwin.messages.codec import decompress
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, is_damage, sqlite_file, transaction
+from servotwin.store.migrate import VERSIONS
 from servotwin.store.postgresql_tables import table_faults
 from servotwin.store.schema import WINDOWS, bodies, messages, metadata
 from servotwin.store.store import Store
 
 log = logging.getLogger(__name__)
 
-_TABLES = ("twins", "states", "contexts", "outgoing", "evidence", "messages", "bodies")
-"""By size, the smallest first: in a bounded time as many as possible are checked."""
+_OWN_TABLES = ("sqlite_sequence", VERSIONS)
+_TABLES = (*_OWN_TABLES, "twins", "claims", "states", "contexts", "outgoing", "evidence", "messages", "bodies")
+"""By size, the smallest first: in a bounded time as many as possible are checked. The first two are SQLite's, which
+counts ids there, and that of the migrations."""
 _STEPS = 20_000
 """Instructions of SQLite's machine between two looks at the time: a few ms."""
 _CHUNK = 2047

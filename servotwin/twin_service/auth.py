@@ -10,12 +10,12 @@ import hmac
 import logging
 import re
 import secrets
-import stat
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from servotwin.config.files import check_private
 from servotwin.config.table import Table, check_complete, read_toml, with_end
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
@@ -283,7 +283,7 @@ def read_tokens(path: Path) -> Verifiers:
     """
     if not path.exists():
         raise InvalidInput(f"{path}: there is no such file of tokens; `servotwin enroll` makes it")
-    _check_private(path)
+    check_private(path)
     if not path.read_bytes().strip():
         raise InvalidInput(f"{path}: is empty; copy it again, or remove it, so that `servotwin enroll` makes a new one")
     check_complete(path, "copy it again")
@@ -348,35 +348,6 @@ def _read_verifier(table: Table, name: str) -> bytes:
             f"{table.source}: {table.path(name)} is no verifier: `servotwin enroll` writes 64 hex digits"
         )
     return bytes.fromhex(value)
-
-
-def read_secret(path: Path) -> str:
-    """Read a private file, without surrounding white space.
-
-    Raises
-    ------
-    InvalidInput
-        It cannot be read, or others than its owner may read it.
-    """
-    _check_private(path)
-    try:
-        return path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InvalidInput(f"{path}: cannot be read ({error})") from None
-
-
-def _check_private(path: Path) -> None:
-    """Refuse a file that others than its owner may read or write; raises InvalidInput."""
-    try:
-        mode = path.stat().st_mode
-    except OSError as error:
-        raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
-    if stat.S_ISDIR(mode):
-        raise InvalidInput(f"{path}: is a folder; give the name of a file")
-    if mode & 0o077:
-        raise InvalidInput(
-            f"{path}: has mode {stat.S_IMODE(mode):04o}, so that others may open it; make it 0600: chmod 600 {path}"
-        )
 
 
 def write_private(path: Path, text: str) -> None:

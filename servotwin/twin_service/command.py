@@ -11,6 +11,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
+from servotwin.config.table import named, of_key
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import check_broker
 from servotwin.runtime.locks import lock_beside, locked
@@ -36,9 +37,7 @@ def run(path: Path, port: int | None = None) -> None:
         The file, the tokens, the store or the address cannot be used, or another process uses the store.
     """
     twin = read_twin(path, models=False)
-    check_tls(twin.service)
-    if twin.service.mqtt is not None:
-        check_broker(twin.service.mqtt.broker)
+    _check(twin)
     configure_logging(twin.service.log_level)
     pool = pool_of(twin)
     with (
@@ -50,6 +49,18 @@ def run(path: Path, port: int | None = None) -> None:
     ):
         check_fleet(store, twin.service.tokens)
         serve(twin, store, listener, pool)
+
+
+def _check(twin: TwinFile) -> None:
+    """Check what the service needs besides its store, before that is made; raises InvalidInput."""
+    config, table = twin.service, twin.service_table
+    with named(table):
+        check_tls(config)
+    if config.tokens is not None:
+        with of_key(table, "tokens"):
+            read_tokens(config.tokens)
+    if config.mqtt is not None:
+        check_broker(config.mqtt.broker)
 
 
 def serve(twin: TwinFile, store: Store, listener: socket.socket, pool: WorkerPool) -> None:

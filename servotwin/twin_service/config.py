@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.files import readable, secret_file
+from servotwin.config.keys import Form, check, key, settings
 from servotwin.config.table import Table, read_inner
 from servotwin.config.toml import attribute, read
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import Broker
-from servotwin.link.url import is_here
+from servotwin.link.url import certificates, is_here
 from servotwin.messages import MAX_BYTES
-from servotwin.twin_service.auth import read_secret
 from servotwin.twin_service.webhook import WebhookConfig, webhook_table
 
 PASSWORD = "SERVOTWIN_STORE_PASSWORD"
@@ -59,17 +59,27 @@ def mqtt_table(
     environment: Mapping[str, str],
     url: Annotated[str, key(help="mqtt(s)://host[:port].")],
     user: Annotated[str | None, key(help="Name of the service at the broker.")] = None,
-    password_file: Annotated[
-        Path | None, key(help=f"File of mode 0600 with its password; where absent the environment's {MQTT_PASSWORD}.")
+    password: Annotated[
+        str | None,
+        key(
+            "password_file",
+            form=Form.PATH,
+            parse=secret_file,
+            help=f"File of mode 0600 with its password; where absent the environment's {MQTT_PASSWORD}.",
+        ),
     ] = None,
     ca_file: Annotated[
         str | None,
-        key(relative=True, help="Certificates that the broker's is checked against; the system's where absent."),
+        key(
+            relative=True,
+            parse=certificates,
+            help="Certificates that the broker's is checked against; the system's where absent.",
+        ),
     ] = None,
     group: Annotated[str, key(parse=_group, help="Twin processes of one group share the work.")] = GROUP,
 ) -> MqttConfig:
     """Broker over which edges may reach the service as well."""
-    password = read_secret(password_file) if password_file is not None else environment.get(MQTT_PASSWORD)
+    password = environment.get(MQTT_PASSWORD) if password is None else password
     return MqttConfig(Broker(url, user, password if user is not None else None, ca_file), group)
 
 
@@ -78,12 +88,6 @@ def _address(table: Table, name: str, address: str, _folder: Path) -> str:
         return str(ipaddress.ip_address("127.0.0.1" if address == "localhost" else address))
     except ValueError:
         raise table.invalid(name, "an IP address of this machine, such as 127.0.0.1 or 0.0.0.0") from None
-
-
-def _file(table: Table, name: str, path: Path, _folder: Path) -> Path:
-    if not path.is_file():
-        raise table.invalid(name, "the path of a file, relative to this one")
-    return path
 
 
 def _store_url(table: Table, name: str, url: str, _folder: Path) -> str:
@@ -139,14 +143,14 @@ class ServiceConfig:
     store_ca: Annotated[
         Path | None,
         key(
-            parse=_file,
+            parse=certificates,
             help="PEM file with the certificates against which PostgreSQL's is checked, with its host's name "
             "(sslmode=verify-full); where absent, the connection is as the URL says.",
         ),
     ] = None
     workers: Annotated[int, key(minimum=1, maximum=256, help="Processes that estimate.")] = 2
-    tls_certificate: Annotated[Path | None, key(parse=_file, help="PEM file; both or none.")] = None
-    tls_key: Annotated[Path | None, key(parse=_file, help="PEM file with the certificate's key.")] = None
+    tls_certificate: Annotated[Path | None, key(parse=readable, help="PEM file; both or none.")] = None
+    tls_key: Annotated[Path | None, key(parse=readable, help="PEM file with the certificate's key.")] = None
     behind_proxy: Annotated[bool, key(help="A proxy in front of the service does TLS; this requires tokens too.")] = (
         False
     )
@@ -319,20 +323,33 @@ def read_service(table: Table, folder: Path, environment: Mapping[str, str] = os
     if "webhook" in table.values:
         webhook = read_inner(table, "webhook", lambda inner: read(inner, webhook_table, folder))
     table.known("webhook")
-    file = read(table, store_password_table, folder)
     store = _sqlite_in(attribute(table, ServiceConfig, "store", folder), folder)
-    password = environment.get(PASSWORD) if file is None else read_secret(file)
+    password = read(table, store_password_table, folder)
     service: ServiceConfig = read(
-        table, ServiceConfig, folder, store=store, store_password=password, mqtt=mqtt, webhook=webhook
+        table,
+        ServiceConfig,
+        folder,
+        store=store,
+        store_password=environment.get(PASSWORD) if password is None else password,
+        mqtt=mqtt,
+        webhook=webhook,
     )
     return service
 
 
 def store_password_table(
-    store_password_file: Annotated[Path | None, key(help="File of mode 0600 with the store's password.")] = None,
-) -> Path | None:
-    """Return the file with the store's password."""
-    return store_password_file
+    password: Annotated[
+        str | None,
+        key(
+            "store_password_file",
+            form=Form.PATH,
+            parse=secret_file,
+            help="File of mode 0600 with the store's password.",
+        ),
+    ] = None,
+) -> str | None:
+    """Return the store's password, where a file holds it."""
+    return password
 
 
 def _sqlite_in(url: str, folder: Path) -> str:

@@ -69,9 +69,7 @@ class StoreWatch:
         beside: Path,
     ) -> None:
         self._store, self._executor = store, executor
-        shared = store.engines.writer.dialect.name == POSTGRESQL
-        file = beside if shared else sqlite_file(store.engines.writer.url)
-        self._mark_file = None if file is None else file.with_name(f"{file.name}-{_MARK}")
+        self._mark_file = _mark_file(store, beside)
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
@@ -155,13 +153,13 @@ class StoreWatch:
 
     def _compare_mark(self) -> None:
         noted, newest = _read_mark(self._mark_file), newest_message(self._store)
-        if newest < noted:
+        if _loss(noted, newest):
             self._lost(noted, newest)
 
     def _lost(self, had: int, has: int) -> None:
         """Ask all edges for the windows that they still keep: the store lacks messages that it once had."""
         log.error("the store has lost messages", extra={"had": had, "has": has})
-        self.lost = f"its newest message is number {has}, and it once had number {had}"
+        self.lost = _loss(had, has)
         self._asked.clear()
         self._ask_for_windows()
 
@@ -195,6 +193,22 @@ class StoreWatch:
         if result.faults and not self.fault:
             self.fault, self._store.damaged = result.faults[0], True
             log.error("store damaged: it is not written any more", extra={"why": "; ".join(result.faults)})
+
+
+def lost_messages(store: Store, beside: Path) -> str:
+    """Messages that a store had when a twin noted the newest one, and has no more; empty: none."""
+    return _loss(_read_mark(_mark_file(store, beside)), newest_message(store))
+
+
+def _loss(had: int, has: int) -> str:
+    return f"its newest message is number {has}, and it once had number {had}" if has < had else ""
+
+
+def _mark_file(store: Store, beside: Path) -> Path | None:
+    """File with the number of the newest message; None: the store is in memory."""
+    shared = store.engines.writer.dialect.name == POSTGRESQL
+    file = beside if shared else sqlite_file(store.engines.writer.url)
+    return None if file is None else file.with_name(f"{file.name}-{_MARK}")
 
 
 def _read_mark(file: Path | None) -> int:

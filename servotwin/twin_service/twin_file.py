@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from servotwin.config.table import read_inner, read_toml
+from servotwin.config.table import Table, parse_toml, read_inner, read_toml
 from servotwin.errors import InvalidInput
 from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.config import ServiceConfig, read_service
@@ -44,6 +44,11 @@ class TwinFile:
         from servotwin.twin.model_registry import ModelRegistry
 
         return ModelRegistry.loads(self.text, str(self.path), self.path.parent)
+
+    @property
+    def service_table(self) -> Table:
+        """Table [service] as it is in the file, to name its keys in errors."""
+        return parse_toml(self.text, str(self.path)).table("service")
 
     @property
     def start(self) -> WorkerStart:

@@ -13,11 +13,11 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from servotwin.config.keys import key
+from servotwin.config.files import header_secret_file
+from servotwin.config.keys import Form, key
 from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
-from servotwin.link.url import in_clear, is_encrypted, tls_context
-from servotwin.twin_service.auth import read_secret
+from servotwin.link.url import certificates, in_clear, is_encrypted, tls_context
 
 _REPEAT_S, _TIMEOUT_S = 3600.0, 10.0
 """s in which an alarm is posted once; for one post."""
@@ -80,12 +80,22 @@ def _url(table: Table, name: str, url: str, _folder: Path) -> str:
 
 def webhook_table(
     url: Annotated[str, key(parse=_url, help="https://host[:port]/path, or http:// on this machine.")],
-    secret_file: Annotated[
-        Path | None, key(help="File of mode 0600; its content is sent as Authorization: Bearer CONTENT.")
+    secret: Annotated[
+        str | None,
+        key(
+            "secret_file",
+            form=Form.PATH,
+            parse=header_secret_file,
+            help="File of mode 0600; its content is sent as Authorization: Bearer CONTENT.",
+        ),
     ] = None,
     ca_file: Annotated[
         str | None,
-        key(relative=True, help="Certificates that the webhook's is checked against; the system's where absent."),
+        key(
+            relative=True,
+            parse=certificates,
+            help="Certificates that the webhook's is checked against; the system's where absent.",
+        ),
     ] = None,
     repeat: Annotated[
         float,
@@ -93,9 +103,6 @@ def webhook_table(
     ] = _REPEAT_S,
 ) -> WebhookConfig:
     """Address to which each alarm is posted as JSON, until it is taken."""
-    secret = None if secret_file is None else read_secret(secret_file)
-    if secret is not None and not (secret and secret.isascii() and secret.isprintable()):
-        raise InvalidInput(f"{secret_file}: must hold one line of printable ASCII characters")
     return WebhookConfig(url, secret, ca_file, repeat)
 
 

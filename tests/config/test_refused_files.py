@@ -12,6 +12,7 @@ import pytest
 from selfsigned import self_made
 
 from servotwin.edge_process.config_file import load
+from servotwin.edge_process.run import run as run_edge
 from servotwin.edge_process.startup import check
 from servotwin.errors import InvalidInput
 from servotwin.twin_service import command
@@ -145,17 +146,17 @@ TOKEN = 'token_file = "token"\n'
         ),
         (
             '[twin]\nurl = "https://h"\ntoken_file = "none"',
-            "none: the token cannot be read (No such file or directory)",
+            "none: cannot be read (No such file or directory)",
         ),
         (
             '[twin]\nurl = "https://h"\ntoken_file = "open"',
-            "open: others than its owner may open it; give it mode 0600",
+            "open: has mode 0644, so that others may open it; make it 0600: chmod 600 ",
         ),
         (
             '[twin]\nurl = "https://h"\ntoken_env = "SERVOTWIN_NOT_SET"',
-            "environment variable SERVOTWIN_NOT_SET: holds no",
+            "environment variable SERVOTWIN_NOT_SET: is empty",
         ),
-        (f'[twin]\nurl = "mqtt://h"\n{TOKEN}user = "u"\npassword_file = "none"', "none: the password cannot be read"),
+        (f'[twin]\nurl = "mqtt://h"\n{TOKEN}user = "u"\npassword_file = "none"', "none: cannot be read"),
         ('[keep]\noutbox = "no/outbox.sqlite"', "[keep]: outbox = 'no/outbox.sqlite': there is no folder "),
         ('[keep]\nstatus = "/no/status.json"', "[keep]: status = '/no/status.json': there is no folder /no"),
         ("[own]\nkp_v_per_m = 1.0", "edge.toml: [own] has gains, which need update_gains = true; set that, or"),
@@ -167,7 +168,7 @@ TOKEN = 'token_file = "token"\n'
             f'[twin]\nurl = "https://h"\n{TOKEN}[keep]\nboots = "./token"',
             "boots = './token': is token_file; give another",
         ),
-        ('[twin]\nurl = "https://h"\ntoken_file = ""', ": holds no token: it is a folder"),
+        ('[twin]\nurl = "https://h"\ntoken_file = ""', ": is a folder; give the name of a file"),
     ],
 )
 def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, expected: str) -> None:
@@ -179,6 +180,81 @@ def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, e
         check(load(tmp_path / "edge.toml"))
     assert expected in str(refused.value)
     assert "secret-token" not in str(refused.value)
+
+
+def faulty(path: Path, fault: str) -> None:
+    if fault == "a folder":
+        path.mkdir()
+    elif fault != "missing":
+        path.write_bytes(b"" if fault == "empty" else bytes(range(256)))
+        path.chmod(0o600)
+
+
+FAULTS = pytest.mark.parametrize("fault", ["missing", "empty", "a folder", "rubbish"])
+
+
+@FAULTS
+@pytest.mark.parametrize(
+    ("table", "key", "more"),
+    [
+        ("service", "tokens", ""),
+        ("service", "store_password_file", ""),
+        ("service", "store_ca", 'store = "postgresql://u@h/d"\n'),
+        ("service.mqtt", "password_file", 'url = "mqtt://127.0.0.1"\nuser = "u"\n'),
+        ("service.mqtt", "ca_file", 'url = "mqtts://127.0.0.1"\n'),
+        ("service.webhook", "secret_file", 'url = "https://127.0.0.1"\n'),
+        ("service.webhook", "ca_file", 'url = "https://127.0.0.1"\n'),
+    ],
+)
+def test_a_twin_names_the_key_of_a_file_that_cannot_be_used_and_makes_no_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, table: str, key: str, more: str, fault: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(command, "configure_logging", lambda *_: None)
+    monkeypatch.setattr(command.WorkerPool, "launched", lambda _: pytest.fail("it starts"))
+    faulty(tmp_path / "named", fault)
+    file = twin_file(tmp_path, f'[{table}]\n{more}{key} = "named"\n'.removeprefix("[service]\n"))
+    before = set(tmp_path.iterdir())
+    with pytest.raises(InvalidInput) as refused:
+        command.run(file.relative_to(tmp_path))
+    assert str(refused.value).startswith(f"twin.toml: {table}.{key} = 'named': ")
+    assert "\n" not in str(refused.value)
+    assert set(tmp_path.iterdir()) == before
+
+
+OPC_UA = 'kind = "opcua"\nurl = "opc.tcp://127.0.0.1:1"\n'
+
+
+@FAULTS
+@pytest.mark.parametrize(
+    ("key", "more"),
+    [
+        ("twin.token_file", 'url = "http://127.0.0.1"\n'),
+        ("twin.ca_file", f'url = "https://127.0.0.1"\n{TOKEN}'),
+        ("twin.password_file", f'url = "mqtt://127.0.0.1"\n{TOKEN}user = "u"\n'),
+        ("drive.password_file", 'user = "u"\n'),
+        ("drive.log", 'kind = "replay"\n'),
+        ("drive.certificate", 'private_key = "token"\nserver_certificate = "token"\n'),
+    ],
+)
+def test_an_edge_names_the_key_of_a_file_that_cannot_be_used(tmp_path: Path, key: str, more: str, fault: str) -> None:
+    (tmp_path / "token").write_text("t\n")
+    (tmp_path / "token").chmod(0o600)
+    faulty(tmp_path / "named", fault)
+    table, _, name = key.partition(".")
+    text = EDGE.replace('role = "control"', 'role = "supervise"')
+    if table == "drive":
+        simulated = text[text.index("[drive]") : text.index("[controller]")]
+        kind = "" if more.startswith("kind") else OPC_UA
+        text = text.replace(simulated, f'[drive]\n{kind}{more}{name} = "named"\n')
+    else:
+        text += f'[{table}]\n{more}{name} = "named"\n'
+    (tmp_path / "edge.toml").write_text(text)
+    with pytest.raises(InvalidInput) as refused:
+        run_edge(tmp_path / "edge.toml")
+    assert str(refused.value).startswith(f"{tmp_path / 'edge.toml'}: {key} = 'named': ")
+    assert {each.name for each in tmp_path.iterdir()} <= {"edge.toml", "token", "named"}
+    assert "\n" not in str(refused.value)
 
 
 def test_a_broker_without_its_library_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -251,7 +251,7 @@ def test_samples_wait_for_their_reader_for_a_limited_time(tmp_path: Path) -> Non
     assert plant.read(5000, 1) is None
 
 
-def test_the_clients_need_neither_numpy_nor_asyncua() -> None:
+def test_the_clients_need_neither_numpy_nor_asyncua(tmp_path: Path) -> None:
     program = """
 import sys
 for name in ("numpy", "scipy", "numba", "asyncua", "typer", "rich"):
@@ -260,6 +260,7 @@ from servotwin.drives.table import control_drive, supervised_drive
 from servotwin.drives.opcua.drive import OpcUaDrive
 from servotwin.config.table import Table
 from pathlib import Path
+Path("x.csv").write_text("time_s,reference_m,theta_m_rad,position_m,voltage_v\\n0,0,0,0,0\\n")
 drives = [
     control_drive(Table("t", {"kind": "simulated", "address": "unix:x"}), Path()),
     supervised_drive(Table("t", {"kind": "replay", "log": "x.csv"}), Path()),
@@ -269,7 +270,7 @@ for drive in drives:
     drive.close()
 print(*(type(drive).__name__ for drive in drives))
 """
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, cwd=tmp_path)
     assert (ended.stdout, ended.stderr) == ("SimulatedControl Replay OpcUaDrive\n", "")
 
 

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from machines import plant_file
 from numpy.typing import NDArray
+from selfsigned import self_made
 
 from servotwin.config.table import Table
 from servotwin.control.gains import gains_of
@@ -224,16 +225,18 @@ URL = "opc.tcp://127.0.0.1:4840"
         ({"url": "opc.tcp://user:word@127.0.0.1"}, "is not allowed"),
         ({"url": "opc.tcp://plc.example:4840"}, "beyond this machine certificate"),
         ({"url": URL, "user": "edge"}, "both are needed, or neither"),
-        ({"url": URL, "certificate": "c.pem"}, "all of them are needed, or none"),
-        ({"url": URL, "user": "edge", "password_file": "open.txt"}, "a file of mode 0600"),
-        ({"url": URL, "user": "edge", "password_file": "none.txt"}, "a text file that can be read"),
-        ({"url": URL, "user": "edge", "password_env": "NOT_THERE"}, "an environment variable that is set"),
+        ({"url": URL, "certificate": "made.pem"}, "all of them are needed, or none"),
+        ({"url": URL, "certificate": "open.txt"}, "open.txt: holds no certificate; give NAME.pem in PEM, or"),
+        ({"url": URL, "user": "edge", "password_file": "open.txt"}, "make it 0600"),
+        ({"url": URL, "user": "edge", "password_file": "none.txt"}, "none.txt: cannot be read"),
+        ({"url": URL, "user": "edge", "password_env": "NOT_THERE"}, "environment variable NOT_THERE: is empty"),
         ({"url": URL, "password": "secret"}, "unknown key 'drive.password'"),
         ({"url": URL, "poll_s": 0.0}, "poll_s = 0.0 is not allowed"),
     ],
 )
 def test_an_error_in_the_drive_table_is_named(tmp_path: Path, values: dict[str, object], message: str) -> None:
     (tmp_path / "open.txt").write_text("secret")
+    self_made(tmp_path)[0].rename(tmp_path / "made.pem")
     (tmp_path / "open.txt").chmod(0o644)
     with pytest.raises(InvalidInput) as error:
         supervised_drive(Table("edge.toml", {"kind": "opcua", **values}, "drive"), tmp_path)
@@ -244,6 +247,7 @@ def test_an_error_in_the_drive_table_is_named(tmp_path: Path, values: dict[str, 
 def test_the_table_of_each_kind(tmp_path: Path) -> None:
     (tmp_path / "word.txt").write_text("secret\n")
     (tmp_path / "word.txt").chmod(0o600)
+    (tmp_path / "run.csv").write_text("time_s,reference_m,theta_m_rad,position_m,voltage_v\n0,0,0,0,0\n")
     tables = (
         {"kind": "opcua", "url": URL, "user": "edge", "password_file": "word.txt"},
         {"kind": "replay", "log": "run.csv", "speed": 0.0},

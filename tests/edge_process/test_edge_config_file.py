@@ -165,15 +165,17 @@ def test_a_token_is_read_from_a_private_file_or_the_environment(tmp_path: Path) 
     file = tmp_path / "token"
     file.write_text("s3cret\n")
     file.chmod(0o644)
-    link = TwinLink("https://h", token_file="token")
-    with pytest.raises(InvalidInput, match="mode 0600") as refused:
-        token_of(link, tmp_path)
+    config = replace(read_config(parse_toml(PLAIN, "edge.toml")), folder=tmp_path)
+    from_file = replace(config, twin=TwinLink("https://h", token_file="token"))
+    with pytest.raises(InvalidInput, match=r"edge.toml: twin.token_file = 'token': .* make it 0600") as refused:
+        token_of(from_file)
     assert "s3cret" not in str(refused.value)
     file.chmod(0o600)
-    assert token_of(link, tmp_path) == "s3cret"
-    assert token_of(TwinLink("https://h", token_env="T"), tmp_path, {"T": "other"}) == "other"
-    with pytest.raises(InvalidInput, match="variable T: holds no token"):
-        token_of(TwinLink("https://h", token_env="T"), tmp_path, {})
+    assert token_of(from_file) == "s3cret"
+    from_environment = replace(config, twin=TwinLink("https://h", token_env="T"))
+    assert token_of(from_environment, {"T": "other"}) == "other"
+    with pytest.raises(InvalidInput, match=r"twin.token_env = 'T': environment variable T: is empty"):
+        token_of(from_environment, {})
 
 
 def test_a_file_of_the_version_before_is_read_and_written_as_it_was() -> None:

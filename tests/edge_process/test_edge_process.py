@@ -266,13 +266,15 @@ def test_a_wrong_configuration_ends_with_one_sentence(edge: RunningEdge, machine
     edge.start()
     assert edge.process is not None
     assert edge.process.wait(60) == 2
-    assert "mode 0600" in edge.log()
+    assert "twin.token_file = 'token': " in edge.log()
+    assert "has mode 0644" in edge.log()
     assert "Traceback" not in edge.log()
 
 
 @pytest.mark.slow
 def test_probing_moves_are_refused_where_the_drive_cannot_make_them(edge: RunningEdge) -> None:
     agent = replace(edge.config.agent, controller=None, probe=ProbeLimits(1e-4))
+    (edge.folder / "run.csv").write_text("time_s,reference_m,theta_m_rad,position_m,voltage_v\n0,0,0,0,0\n")
     edge.write(role="supervise", controller=None, agent=agent, drive={"kind": "replay", "log": "run.csv"})
     edge.start()
     assert edge.process is not None

@@ -2,6 +2,8 @@
 
 import math
 import os
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -60,6 +62,28 @@ def test_twenty_pages_of_rubbish_are_found(url: str) -> None:
     assert found.faults
     assert not found.complete
     store.close()
+
+
+def test_a_page_of_zeros_is_found_in_every_table_and_index(url: str) -> None:
+    file = filled(url, 2)
+    with closing(sqlite3.connect(file)) as connection:
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    whole = file.read_bytes()
+    for page in range(1, len(whole) // PAGE):  # the first one has the schema, without which no store opens
+        file.write_bytes(whole[: page * PAGE] + bytes(PAGE) + whole[(page + 1) * PAGE :])
+        assert faults(url), page + 1
+    file.write_bytes(whole)
+    assert faults(url) == ()
+
+
+def faults(url: str) -> tuple[str, ...]:
+    """Faults of a store's pages and bodies, or that it does not open."""
+    try:
+        store = open_store(url)
+    except InvalidInput as error:
+        return (str(error),)
+    with closing(store):
+        return check_pages(store, math.inf).faults or check_bodies(store, 0, 10)[0].faults
 
 
 @pytest.mark.parametrize("changed", [b"other samples", b""])

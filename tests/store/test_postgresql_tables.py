@@ -52,6 +52,18 @@ def test_rows_that_are_gone_with_their_page_are_missed(filled: Store, lost: str,
     assert fault in check_pages(filled, math.inf).faults
 
 
+def test_an_index_that_does_not_have_the_rows_of_its_table_is_found(filled: Store) -> None:
+    # As superuser: the server does not enter the row, as where a page of the index, or of the table, is lost.
+    entered = "UPDATE pg_index SET indisready = {} WHERE indexrelid = 'ix_evidence_message'::regclass"
+    run(filled, entered.format("false"))
+    run(
+        filled, "INSERT INTO evidence (servo, message, kind, status, created, body) VALUES ('a', 1, 'trend', '', 0, '')"
+    )
+    run(filled, entered.format("true"))
+    expected = "table evidence: 4 rows, and 3 in its index ix_evidence_message"
+    assert check_pages(filled, math.inf).faults == (expected,)
+
+
 def test_a_check_of_tables_ends_in_time_and_says_so(filled: Store) -> None:
     run(filled, "INSERT INTO evidence (servo, kind, status, created, body) "
         "SELECT 'a', 'trend', '', 0, '' FROM generate_series(1, 300000)")  # fmt: skip

@@ -39,11 +39,12 @@ def shown(words: str) -> str:
 def test_the_files_that_the_guide_shows_are_read(tmp_path: Path) -> None:
     for name in ("token", "broker-password"):
         write_private(tmp_path / name, "secret")
+    self_made(tmp_path)[0].rename(tmp_path / "broker-ca.pem")
     text = 'servo = "axis-1"\nrole = "supervise"\nsample_rate_hz = 100.0\n[drive]\nkind = "simulated"\n'
     (tmp_path / "edge.toml").write_text(text + shown("[twin]"))
     config = load_edge_config(tmp_path / "edge.toml")
     assert config.twin is not None
-    assert (config.twin.over_mqtt, password_of(config.twin, tmp_path)) == (True, "secret")
+    assert (config.twin.over_mqtt, password_of(config)) == (True, "secret")
     (tmp_path / "tokens").touch(0o600)
     twin_file = '[service]\ntokens = "tokens"\n' + shown("[service.mqtt]")
     result = read_service(parse_toml(twin_file, "twin.toml").table("service"), tmp_path, {})

@@ -10,7 +10,7 @@ from service_system import SERVO, twin_file
 from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
 from servotwin.link.seal import verifier_of
-from servotwin.twin_service.auth import Verifiers, read_secret, read_tokens, write_private, write_tokens
+from servotwin.twin_service.auth import Verifiers, read_tokens, write_private, write_tokens
 from servotwin.twin_service.config import PASSWORD, ServiceConfig, read_service
 from servotwin.twin_service.twin_file import read_twin
 
@@ -73,8 +73,8 @@ def test_the_password_of_a_store_comes_from_a_file_or_the_environment_and_is_not
             config(tmp_path, {"store": holding})
         assert "hunter2" not in str(error.value)
     (tmp_path / "password").chmod(0o604)
-    with pytest.raises(InvalidInput, match="others"):
-        read_secret(tmp_path / "password")
+    with pytest.raises(InvalidInput, match=r"store_password_file = 'password': .* others"):
+        config(tmp_path, {"store": url, "store_password_file": "password"})
 
 
 def test_another_address_needs_tokens_and_tls_or_a_proxy(tmp_path):

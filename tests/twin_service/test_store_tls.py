@@ -50,11 +50,12 @@ def test_only_the_server_of_the_certificate_is_trusted(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("service", "fault"),
     [
-        ('store_ca = "no.pem"', "the path of a file"),
-        ('store_ca = "twin.toml"', "store_ca is for PostgreSQL"),
-        ('store = "postgresql://h/d?sslmode=require"\nstore_ca = "twin.toml"', "exclude each other"),
+        ('store_ca = "no.pem"', "no.pem: holds no certificates that can be read"),
+        ('store_ca = "made.crt"', "store_ca is for PostgreSQL"),
+        ('store = "postgresql://h/d?sslmode=require"\nstore_ca = "made.crt"', "exclude each other"),
     ],
 )
 def test_settings_that_contradict_each_other_are_refused(tmp_path: Path, service: str, fault: str) -> None:
+    self_made(tmp_path)
     with pytest.raises(InvalidInput, match=fault):
         service_of(twin_file(tmp_path, service, tokens=False))

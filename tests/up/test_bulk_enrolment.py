@@ -54,7 +54,7 @@ def test_each_row_enrolls_a_servo_with_what_it_says_and_the_options_for_the_rest
     assert (first.role, first.agent.sample_rate, first.twin.url) == ("control", 1000.0, URL)
     assert (second.role, second.agent.sample_rate, second.drive["kind"]) == ("supervise", 5000.0, "opcua")
     assert (second.agent.servo, second.twin.url) == ("ax-2", "https://other:2")
-    tokens = {name: token_of(each.twin, each.folder) for name, each in (("ax-1", first), ("ax-2", second))}
+    tokens = {name: token_of(each) for name, each in (("ax-1", first), ("ax-2", second))}
     known = read_tokens(folder / "tokens.toml")
     assert known.servos == {"ax-old": b"\1" * 32, **{name: verifier_of(token) for name, token in tokens.items()}}
     assert known.operators == {"me": b"\2" * 32}

@@ -46,7 +46,7 @@ def test_a_servo_is_enrolled_and_its_edge_can_begin(tmp_path):
     done = run("enroll", "ax-7", "--twin", twin, "--edge", edge, "--url", "https://twin:1", "--role", "control")
     assert done.exit_code == 0, done.output
     config = load(edge / "edge.toml")
-    token = token_of(config.twin, edge)
+    token = token_of(config)
     assert token not in done.output
     assert (config.agent.servo, config.role, config.twin.url) == ("ax-7", "control", "https://twin:1")
     assert isinstance(config.agent, AgentSettings)
@@ -175,6 +175,11 @@ def test_a_servo_that_nobody_knows_is_told_from_one_without_windows_and_a_store_
     assert (silent.exit_code, "has sent messages, but no window yet" in silent.stderr) == (2, True)
     checked = run("twin", "check", "--config", twin)
     assert (checked.exit_code, "is sound (1 messages agree" in checked.stdout) == (0, True), checked.output
+    (tmp_path / "twin.db-newest").write_text("2\n")  # as a twin noted it
+    short = run("twin", "check", "--config", twin)
+    assert short.exit_code == 2
+    assert "number 1, and it once had number 2" in " ".join(short.stderr.split())
+    (tmp_path / "twin.db-newest").unlink()
     database = sqlite3.connect(tmp_path / "twin.db")
     with closing(database), database:
         database.execute("UPDATE bodies SET body = x'00'")

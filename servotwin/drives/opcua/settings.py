@@ -1,8 +1,9 @@
 """Address and credentials of an OPC UA drive."""
 
-import os
+import asyncio
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 from servotwin.drives.opcua.model import OBJECT
@@ -59,27 +60,24 @@ class OpcUaSettings:
             )
 
 
-def read_password(path: Path | None, variable: str | None) -> str | None:
-    """The password in a file of mode 0600, or in an environment variable.
+def check_certificate(path: Path) -> None:
+    """Check that a file holds a certificate; raises InvalidInput."""
+    _check(path, "load_certificate", "certificate")
 
-    Raises
-    ------
-    InvalidInput
-        There is none, or others may read the file.
-    """
-    if variable is not None:
-        if variable not in os.environ:
-            raise InvalidInput(
-                f"password_env = {variable!r} is not allowed; give the name of an environment variable that is set"
-            )
-        return os.environ[variable]
-    if path is None:
-        return None
+
+def check_private_key(path: Path) -> None:
+    """Check that a file holds a private key without a password; raises InvalidInput."""
+    _check(path, "load_private_key", "private key without a password")
+
+
+def _check(path: Path, load: str, what: str) -> None:
+    """Load a file as the client does, which takes NAME.pem for PEM and any other for DER."""
     try:
-        mode, text = path.stat().st_mode, path.read_text(encoding="utf-8").strip()
-    except (OSError, UnicodeDecodeError):
-        raise InvalidInput(f"password_file = {str(path)!r} is not allowed; give a text file that can be read") from None
-    if mode & 0o077:
-        allowed = "give a file of mode 0600: this one is open to others"
-        raise InvalidInput(f"password_file = {str(path)!r} is not allowed; {allowed}")
-    return text
+        from asyncua.crypto import uacrypto
+    except ModuleNotFoundError:
+        return  # the drive says so
+    loader: Any = getattr(uacrypto, load)
+    try:
+        asyncio.run(loader(path))
+    except (ValueError, TypeError):
+        raise InvalidInput(f"{path}: holds no {what}; give NAME.pem in PEM, or another in DER") from None

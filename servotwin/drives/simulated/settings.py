@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 from servotwin.config.keys import Form, check, key, settings
-from servotwin.config.table import Table, did_you_mean, named, read_toml
+from servotwin.config.table import Table, did_you_mean, named, of_key, read_toml
 from servotwin.config.toml import read
 from servotwin.cosim.scenario import PRESETS, Scenario
 from servotwin.drives.simulated import wire
@@ -146,7 +146,7 @@ class MachineSettings:
         table, folder = read_toml(path), Path(path).parent
         machine: MachineSettings = read(table, cls, folder)
         table.done()
-        with named(table):
+        with named(table) if machine.state_file is None else of_key(table, "state_file"):
             return machine.resumed()
 
     def resumed(self) -> MachineSettings:
