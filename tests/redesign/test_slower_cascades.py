@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from worm_table import WORM_TABLE
 
 import servotwin as st
 from servotwin.commissioning.edge_settings import Commissioning
@@ -19,37 +20,6 @@ from servotwin.redesign.certified.trial import trial_for
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.twin.settings import TwinSettings
 
-# Its table swings at 92 Hz with hardly any damping: three samples of delay make the own cascade unstable there.
-WORM_TABLE = st.Axis.loads(
-    """
-[actuator]
-kind = "torque"
-inertia_kg_m2 = 6e-4
-current_loop_time_s = 5e-4
-coulomb_friction_n_m = 0.25
-viscous_friction_n_m_s_per_rad = 5e-4
-torque_limit_n_m = 8.0
-[transmission]
-kind = "gear"
-ratio = 90.0
-stiffness_n_m_per_rad = 4e5
-[load]
-kind = "rotary"
-inertia_kg_m2 = 1.2
-damping_n_m_s_per_rad = 5.0
-[sensors]
-encoder_resolution_rad = 4.8e-5
-position_resolution_rad = 4.8e-6
-[controller]
-kind = "cascade"
-position_gain_per_s = 18.35
-velocity_gain_n_m_s_per_rad = 0.07
-integral_time_s = 0.0244
-torque_limit_n_m = 8.0
-sample_rate_hz = 2000.0
-""",
-    "worm.toml",
-)
 KNOWN = Uncertainty(gap=(0.0, 0.2), step=(0.035, 0.07), input_bias=(-0.08, 0.08))
 FEW = Demands(machines=40, settled=0.9, beyond=Beyond(machines=10), attempts=2)
 
