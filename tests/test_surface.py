@@ -31,4 +31,4 @@ def test_results_are_shown_in_one_line():
 
 def test_a_range_of_gaps_in_degrees_is_refused():
     with pytest.raises(InvalidInput, match=r"uncertainty gap = 60 rad \(3438 deg\).*did you mean math.radians\(60\)"):
-        st.Uncertainty(gap=(0.0, 60.0))
+        st.certify(st.Servo.preset("paper"), st.Uncertainty(gap=(0.0, 60.0)))

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from rich.console import Console
+from rich.progress import Progress
 from rich.table import Table
 
 from servotwin.errors import InvalidInput
@@ -19,6 +20,7 @@ from servotwin.estimation.gap import is_motors_position
 from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
+from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.estimation.window import Window
 from servotwin.logs.log import Log, read_log
 from servotwin.plant.axis import Axis
@@ -33,6 +35,11 @@ from servotwin.twin.settings import TwinSettings
 WINDOW = 1.0  # s of the servo's own
 _WEAR = 40.0  # windows in which the gap of an axis grows by itself, where the log is shorter
 _FREE = 8.0  # windows: a load behind a free shaft needs so much longer to come to rest
+Report: TypeAlias = Callable[[int, int], None]
+
+
+def _silent(_done: int, _total: int) -> None:
+    """Report nothing."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +82,14 @@ class Identification:
     until_limit: Passage | None
 
 
-def identify(options: IdentifyOptions) -> Identification:
+def identify(options: IdentifyOptions, progress: Report = _silent) -> Identification:
     """Read a log, cut windows, estimate their gaps and follow the trend.
+
+    Parameters
+    ----------
+    options : IdentifyOptions
+    progress : callable
+        Called with the number of estimated windows and that of all, from the start again where the wear is not known.
 
     Raises
     ------
@@ -88,20 +101,21 @@ def identify(options: IdentifyOptions) -> Identification:
     settings, windows = stated.on(servo), cut(log, options, servo)
     seen = _with_seen_load(servo, log.whole)
     if isinstance(servo, Axis) and options.wear_deg is None:
-        estimates, trend = _followed_without_wear(log, windows, seen, settings)
+        estimates, trend = _followed_without_wear(log, windows, seen, settings, progress)
     else:
-        estimates, trend = _followed(windows, seen, settings)
+        estimates, trend = _followed(windows, seen, settings, progress)
     until = None if settings.gap_limit is None or trend is None else trend.time_until(settings.gap_limit)
     return Identification(servo, windows, estimates, trend, until)
 
 
 def _followed(
-    windows: Iterable[Window], seen: Plant, settings: TwinSettings
+    windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report
 ) -> tuple[tuple[GapEstimate, ...], Trend | None]:
     """Estimates of windows in the order of time, and the trend after the last one."""
     wear, estimator = Wear(settings.initial_gap), estimator_of(seen, settings)
     estimates = []
-    for window in windows:
+    for done, window in enumerate(windows):
+        progress(done, len(windows))
         now = window.mid_time
         estimates.append(estimator(window, wear.expect(settings.trend, "log", now, now, settings.learning)))
         wear, _ = wear.update(settings.trend, "log", estimates[-1], now, settings.learning)
@@ -109,7 +123,7 @@ def _followed(
 
 
 def _followed_without_wear(
-    log: Log, windows: Sequence[Window], seen: Plant, settings: TwinSettings
+    log: Log, windows: Sequence[Window], seen: Plant, settings: TwinSettings, progress: Report
 ) -> tuple[tuple[GapEstimate, ...], Trend | None]:
     """The same of an axis of which nobody states the wear: it grows by what the log shows, and by itself in 40 windows.
 
@@ -119,7 +133,7 @@ def _followed_without_wear(
     share = min(1.0, over / (_WEAR * windows[0].duration))
     trend = TrendSettings(rate_std_rad_per_s=0.0)
     while True:
-        estimates, found = _followed(windows, seen, replace(settings, trend=trend))
+        estimates, found = _followed(windows, seen, replace(settings, trend=trend), progress)
         shown = _growth([estimate for estimate in estimates if estimate.ok], share)
         if shown <= 2.0 * growth:
             return estimates, found
@@ -148,7 +162,7 @@ def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
             f"{whole.where}there is no column 'reference_{position_unit(servo).si}' to find the steps in: "
             "give --start and --duration"
         )
-    length = _option("window", options.window, log.metadata.get("window_s"), _usual_window(servo))
+    length = _option("window", options.window, log.metadata.get("window_s"), _usual_window(servo, whole.sample_rate))
     before = _option("pre-trigger", options.pre_trigger, log.metadata.get("pre_trigger_s"), 0.0)
     if not 0.0 <= before < length:
         raise InvalidInput(f"--pre-trigger {before!r} s: must be at least 0 and below the window's {length!r} s")
@@ -159,9 +173,10 @@ def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
     return tuple(whole.slice(whole.start + first / whole.sample_rate, length) for first in firsts)
 
 
-def _usual_window(servo: Plant) -> float:
-    """Length of windows where neither command nor log states one, s."""
-    return WINDOW * scales(servo).time * (_FREE if servo.backlash_kind is BacklashKind.FREE else 1.0)
+def _usual_window(servo: Plant, rate: float) -> float:
+    """Length of windows where neither command nor log states one, s; of an axis enough samples at a rate (Hz)."""
+    usual = WINDOW * scales(servo).time * (_FREE if servo.backlash_kind is BacklashKind.FREE else 1.0)
+    return max(usual, SHORTEST / rate) if isinstance(servo, Axis) else usual
 
 
 def window_starts(reference: Sequence[float] | np.ndarray[Any, Any], length: int, before: int) -> list[int]:
@@ -234,7 +249,7 @@ def _settings(options: IdentifyOptions) -> TwinSettings:
 
 def show(options: IdentifyOptions, as_json: bool) -> None:
     """Print tables, or one JSON object, on the standard output."""
-    identification = identify(options)
+    identification = _identified(options)
     if as_json:
         print(json.dumps(as_dict(identification, options), indent=2, allow_nan=False))
         return
@@ -247,6 +262,18 @@ def show(options: IdentifyOptions, as_json: bool) -> None:
     console.print(_table(identification), highlight=False)
     for line in _trend_lines(identification, options):
         console.print(line, highlight=False)
+
+
+def _identified(options: IdentifyOptions) -> Identification:
+    """Estimate under a progress bar on the standard error: a window from the motor's side takes up to a minute."""
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        bar = progress.add_task("reading", total=None)
+
+        def report(done: int, total: int) -> None:
+            progress.update(bar, description=f"window {done + 1} of {total}", completed=done, total=total)
+
+        return identify(options, report)
 
 
 def _table(identification: Identification) -> Table:
@@ -272,7 +299,11 @@ def _cells(estimate: GapEstimate) -> tuple[str, str]:
 def _trend_lines(identification: Identification, options: IdentifyOptions) -> list[str]:
     trend = identification.trend
     if trend is None:
-        return ["no window shows the gap, so there is no trend"]
+        words = "no window shows the gap, so there is no trend"
+        reasons = [reason for estimate in identification.estimates for reason in estimate.reasons]
+        if any("one flank" in reason or "needed both ways" in reason for reason in reasons):
+            words += "; a window with two steps, to and fro, shows both flanks: give its length with --window"
+        return [words]
     low, high = map(math.degrees, trend.gap_interval)
     slow, fast = map(math.degrees, trend.rate_interval)
     lines = [f"gap at {trend.time:.2f} s: {math.degrees(trend.gap):.3f} deg (95 %: {low:.3f} .. {high:.3f})"]

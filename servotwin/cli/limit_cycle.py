@@ -20,6 +20,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, position_unit
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant, resolve_plant
+from servotwin.plant.signals import turn_in_words
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
 _EVENTS = 12  # shown of an orbit
@@ -77,8 +78,10 @@ def print_limit_cycle(
     servo = servo if enter is None else servo.replace(enter=enter)
     servo = servo if leave is None else servo.replace(leave=leave)
     tolerance = None if tolerance_shown is None else unit.si_of(tolerance_shown)
-    if not 0.0 <= gap_deg <= 360.0:
-        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be from 0 to 360, one turn")
+    most = math.degrees(servo.largest_gap)
+    if not 0.0 <= gap_deg <= most * (1.0 + 1e-12):
+        turn = turn_in_words(servo.largest_gap)
+        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be from 0 to {most:g}, {turn}")
     computed = findings(servo, math.radians(gap_deg), tolerance, unit.si_of(step_shown))
     if as_json:
         print(json.dumps(as_dict(computed, unit), indent=2))

@@ -25,6 +25,7 @@ from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.messages import Setting
 from servotwin.novelty.score import model_of
 from servotwin.novelty.settings import NoveltyRules, NoveltySettings
+from servotwin.plant.axis import Axis
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
@@ -177,8 +178,9 @@ class Commissioning:
         if window is not None:
             return window
         usual, second = CALM_WINDOW if self.calm else WINDOW, scales(self.servo).time
-        # A fast machine needs short windows only, but the estimator needs some samples.
-        needed = 0.0 if second >= 1.0 else min(usual, self._shortest_window[0])
+        # A fast machine needs short windows only, but the estimator needs some samples: of a slow law a long time.
+        shortest = self._shortest_window[0]
+        needed = shortest if isinstance(self.servo, Axis) else 0.0 if second >= 1.0 else min(usual, shortest)
         return self._whole(max(usual * second, needed))
 
     def with_longest(self, window: float, pre_trigger: float, samples: int) -> Commissioning:
@@ -222,7 +224,7 @@ class Commissioning:
         twin = self.twin
         model = servo_for(self.servo)
         if model is None:
-            return SHORTEST / self.recording.sample_rate, f"a window needs {SHORTEST} samples"
+            return SHORTEST / self.recording.sample_rate, f"an estimate, which needs {SHORTEST} samples"
         return shortest_window(twin.method, model, self.recording.sample_rate, twin.estimator)
 
     def check_window(self) -> None:

@@ -90,6 +90,16 @@ def scaled(own: AnyController, scale: float, shape: tuple[float, float], share: 
     )
 
 
+def slowed(own: Cascade, share: float) -> Cascade:
+    """The cascade with this share of its speed: both loops are slower alike, and a rigid axis keeps the margins."""
+    if own.velocity_gain is None:
+        return own.replace(position_gain=own.position_gain * share)
+    time = None if own.integral_time is None else own.integral_time / share
+    return own.replace(
+        position_gain=own.position_gain * share, velocity_gain=own.velocity_gain * share, integral_time=time
+    )
+
+
 def law_for_margins(law: AnyController) -> AnyController:
     """The law without feedforwards and thresholds, on which margins do not depend: equal ones share a stored result."""
     plain = law.replace(feedforward=0.0, enter=1.0, leave=1.0, integral_only=False)

@@ -106,7 +106,7 @@ class Scenario:
         check(self)
         self._check_rates()
         as_pieces(self.reference, self.duration)
-        as_gap(self.gap, self.duration)
+        as_gap(self.gap, self.duration, self.servo.largest_gap)
         self.commissioning.check_window()
         self.commissioning.check_recorder(self.name, BOOT)
 

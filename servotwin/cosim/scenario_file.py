@@ -19,11 +19,12 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.edge.settings_file import read_supervision
+from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.plants import Plant
-from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
+from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step, turn_in_words
 from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
@@ -31,10 +32,9 @@ CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
 )
 EDGE, UP, DOWN = "edge", "up", "down"
 """Tables of the file, beside those that `Scenario` declares."""
+GAP = "gap"
 PAPER = "paper"
 """Policy that begins with the servo's own controller, and needs nothing verified."""
-
-_TURN = 2.0 * math.pi
 
 
 def square_wave(
@@ -83,15 +83,15 @@ REFERENCES: Mapping[str, Maker] = {
 
 
 def constant_gap(
-    total: Annotated[float, key("total_deg", minimum=0.0, maximum=_TURN, help="Total gap.")],
+    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap.")],
 ) -> SignalLike:
     """Constant gap."""
     return total
 
 
 def growing_gap(
-    begin_value: Annotated[float, key("from_deg", minimum=0.0, maximum=_TURN, help="First total gap.")],
-    end_value: Annotated[float, key("to_deg", minimum=0.0, maximum=_TURN, help="Last total gap.")],
+    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap.")],
+    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
     begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
 ) -> SignalLike:
@@ -117,6 +117,7 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
+    _check_gap(table, servo)
     inner = table.table(CONTROLLER)
     with named(inner):
         controller = _changed(inner, servo.controller)
@@ -140,6 +141,15 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
         "downlink": downlink,
         "twin": read_inner(table, TWIN, lambda inner: _twin(inner, folder, servo)),
     }
+
+
+def _check_gap(table: Table, servo: Plant) -> None:
+    """Refuse a gap that is larger than that of the machine can be."""
+    given, most = table.values.get(GAP), math.degrees(servo.largest_gap)
+    for name, value in given.items() if isinstance(given, Mapping) else ():
+        if name.endswith("_deg") and isinstance(value, int | float) and value > most * (1.0 + 1e-12):
+            allowed = f"a number, at least 0, at most {most:g}, {turn_in_words(servo.largest_gap)}"
+            raise InvalidInput(f"{table.source}: {GAP}.{name} = {value} is not allowed; give {allowed}")
 
 
 def _twin(table: Table, folder: Path, servo: Plant) -> TwinSettings:

@@ -28,13 +28,13 @@ from servotwin.plant.basis import BacklashKind, Guide, Stribeck
 from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
 from servotwin.plant.law_loop import LawLoop, check_encoders
 from servotwin.plant.linear import LinearSystem
-from servotwin.plant.load import LINEAR, Load
+from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.numbers import tolerance_of
 from servotwin.plant.rest import Rest, rest_under_force
 from servotwin.plant.scaled_parts import scaled_parts
 from servotwin.plant.sensors import MOTOR, Sensors
-from servotwin.plant.signals import Array
+from servotwin.plant.signals import LARGEST_GAP, Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission
 
@@ -340,9 +340,14 @@ class Axis:
         Raises
         ------
         InvalidInput
-            The gap or k_dz is negative or not finite, or the gap is above one turn.
+            The gap or k_dz is negative or not finite, or the gap is above `largest_gap`.
         """
-        return tolerance_of(self.p, gap, k_dz)
+        return tolerance_of(self.p, gap, k_dz, self.largest_gap)
+
+    @property
+    def largest_gap(self) -> float:
+        """Largest total gap, rad at the motor: one turn of the motor, of a gear that reduces one turn of the load."""
+        return LARGEST_GAP / min(1.0, self.p) if self.load.motion == ROTARY else LARGEST_GAP
 
     def G2(self) -> LinearSystem:
         """Angle of the driven end to the position of the last mass."""

@@ -7,21 +7,21 @@ import math
 import numpy as np
 
 from servotwin.errors import InvalidInput
-from servotwin.plant.signals import check_gap
+from servotwin.plant.signals import LARGEST_GAP, check_gap
 
 
-def tolerance_of(p: float, gap: float, k_dz: float) -> float:
+def tolerance_of(p: float, gap: float, k_dz: float, largest: float = LARGEST_GAP) -> float:
     """Dead-zone half-width (m) for a total gap (rad) behind a pitch (m/rad): k_dz p gap (Eq 21).
 
     Raises
     ------
     InvalidInput
-        The gap or k_dz is negative or not finite, or the gap is above one turn.
+        The gap or k_dz is negative or not finite, or the gap is above the largest one.
     """
     for name, value, unit in (("gap", gap, "rad"), ("k_dz", k_dz, "tolerances per gap")):
         if not (math.isfinite(value) and value >= 0.0):
             raise InvalidInput(f"{name} = {value} {unit}: must be finite and 0 or more")
-    check_gap(gap)
+    check_gap(gap, largest=largest)
     return k_dz * p * gap
 
 

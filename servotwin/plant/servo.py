@@ -29,7 +29,7 @@ from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
 from servotwin.plant.numbers import tolerance_of
 from servotwin.plant.servo_changes import PerMass, ServoChanges
-from servotwin.plant.signals import Array
+from servotwin.plant.signals import LARGEST_GAP, Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.runtime.notebook import html_table
 
@@ -269,6 +269,11 @@ class Servo:
             The gap or k_dz is negative or not finite, or the gap is above one turn.
         """
         return tolerance_of(self.p, gap, k_dz)
+
+    @property
+    def largest_gap(self) -> float:
+        """Largest total gap, rad: one turn of the motor."""
+        return LARGEST_GAP
 
     @property
     def masses(self) -> Array:

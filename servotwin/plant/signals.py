@@ -309,32 +309,39 @@ def as_nonnegative(signal: SignalLike, duration: float, name: str = "gap", unit:
     return pieces
 
 
-def as_gap(signal: SignalLike, duration: float) -> PiecewiseCubic:
-    """Convert as `as_nonnegative`, and refuse a total gap (rad) above one turn.
+def as_gap(signal: SignalLike, duration: float, largest: float = LARGEST_GAP) -> PiecewiseCubic:
+    """Convert as `as_nonnegative`, and refuse a total gap (rad) above the largest one of the machine.
 
     Raises
     ------
     InvalidInput
-        As `as_nonnegative`; also for a gap above 2 pi rad, nearly always an angle in degrees.
+        As `as_nonnegative`; also for a larger gap, nearly always an angle in degrees.
     """
     pieces = as_nonnegative(signal, duration)
-    check_gap(-pieces.scaled(-1.0).minimum(duration)[1])
+    check_gap(-pieces.scaled(-1.0).minimum(duration)[1], largest=largest)
     return pieces
 
 
-def check_gap(gap: float, name: str = "gap") -> None:
-    """Refuse a total gap (rad) above one turn.
+def check_gap(gap: float, name: str = "gap", largest: float = LARGEST_GAP) -> None:
+    """Refuse a total gap (rad) above the largest one: one turn of the motor, of a gear one turn of the load.
 
     Raises
     ------
     InvalidInput
         The message shows the angle in degrees and suggests math.radians.
     """
-    if gap > LARGEST_GAP:
+    # The rounding of degrees to radians.
+    if gap > largest * (1.0 + 1e-12):
         raise InvalidInput(
-            f"{name} = {gap:.6g} rad ({math.degrees(gap):.0f} deg): the total gap is an angle in rad of at most one "
-            f"turn (2 pi); did you mean math.radians({gap:.6g})?"
+            f"{name} = {gap:.6g} rad ({math.degrees(gap):.0f} deg): the total gap is an angle in rad of at most"
+            f" {turn_in_words(largest)} ({'2 pi' if largest == LARGEST_GAP else f'{largest:.6g}'});"
+            f" did you mean math.radians({gap:.6g})?"
         )
+
+
+def turn_in_words(largest: float) -> str:
+    """The largest gap of a machine (rad) in words."""
+    return "one turn" if largest == LARGEST_GAP else "one turn of the load"
 
 
 def reference_changes(signal: SignalLike, duration: float) -> Array:

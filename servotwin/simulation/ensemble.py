@@ -17,7 +17,7 @@ from servotwin.hybrid.ensemble import FigureOptions, Members, figures_of_family,
 from servotwin.hybrid.members import Figures
 from servotwin.plant.automaton import Shape, without_feedforward
 from servotwin.plant.plants import Plant, structure_of
-from servotwin.plant.signals import check_gap
+from servotwin.plant.signals import LARGEST_GAP, check_gap
 from servotwin.plant.stack import LoopStack, continuous_loops
 from servotwin.simulation.continuous import controller_constants
 from servotwin.simulation.ensemble_starts import starts_of, zones_at
@@ -265,7 +265,7 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     values = [np.asarray(value, dtype=float) for value in cases]
     shape = np.broadcast_shapes(plants.shape, laws.shape, *(value.shape for value in values))
     constants = {name: np.broadcast_to(value, shape).ravel() for name, value in zip(Cases._fields, values, strict=True)}
-    check_constants(constants)
+    check_constants(constants, plants)
     every_servo = list(np.broadcast_to(plants, shape).ravel())
     given = np.broadcast_to(laws, shape).ravel()
     every_law = [
@@ -278,13 +278,14 @@ def members_of(servos: Any, controllers: Any, cases: Cases) -> EnsembleMembers:
     return EnsembleMembers(shape, every_servo, every_law, with_forces(constants, every_servo))
 
 
-def check_constants(constants: dict[str, Array]) -> None:
+def check_constants(constants: dict[str, Array], plants: NDArray[Any]) -> None:
     """Refuse constants that are not finite, or negative where they must not be."""
     for name, values in constants.items():
         allowed = "finite and 0 or more" if name in NOT_NEGATIVE else "finite"
         if not np.isfinite(values).all() or (name in NOT_NEGATIVE and values.min(initial=0.0) < 0.0):
             raise InvalidInput(f"{name}: every value of an ensemble must be {allowed}")
-    check_gap(float(constants["gap"].max(initial=0.0)))
+    largest = max((plant.largest_gap for plant in plants.ravel()), default=LARGEST_GAP)
+    check_gap(float(constants["gap"].max(initial=0.0)), largest=largest)
 
 
 def _structure_of(servo: Plant, law: Controller) -> tuple[object, ...]:

@@ -198,7 +198,7 @@ def sampled_members(servos: Any, controllers: Any, cases: SampledCases) -> Sampl
     shape = np.broadcast_shapes(plants.shape, laws.shape, *(value.shape for value in values))
     names = SampledCases._fields
     constants = {name: np.broadcast_to(value, shape).ravel() for name, value in zip(names, values, strict=True)}
-    check_constants({name: constants[name] for name in Cases._fields})
+    check_constants({name: constants[name] for name in Cases._fields}, plants)
     delays, resolutions = constants["delay"], constants["resolution"]
     if not np.isin(delays, np.arange(LARGEST_DELAY + 1)).all():
         raise InvalidInput(f"delay: every value of an ensemble must be an integer of 0 to {LARGEST_DELAY} samples")

@@ -107,7 +107,7 @@ class Simulation:
         self.samples = round(duration * sample_rate) + 1
         self.inputs = RunInputs(
             as_pieces(reference, duration),
-            as_gap(gap, duration),
+            as_gap(gap, duration, servo.largest_gap),
             None if tolerance is None else as_nonnegative(tolerance, duration, "tolerance", "m"),
             sample_rate,
             float(input_bias),

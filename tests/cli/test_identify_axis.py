@@ -6,8 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
+from worm_table import WORM_TABLE
 
 import servotwin as st
+from servotwin.cli.app import app
 from servotwin.cli.identify import IdentifyOptions, identify
 from servotwin.errors import InvalidInput
 from servotwin.logs.columns import SignalTable
@@ -153,3 +156,24 @@ def test_a_log_of_a_motor_that_shows_nothing_is_refused(motor_logs: Path, name: 
     named = str(motor_logs / servo) if servo.endswith(".toml") else servo
     with pytest.raises(InvalidInput, match=words):
         identify(IdentifyOptions(motor_logs / f"{name}.csv", named))
+
+
+def test_windows_of_one_flank_each_say_that_two_steps_show_both(tmp_path: Path) -> None:
+    """The table goes straight to its place behind a worm that holds the gap: each step leaves it on one flank."""
+    gap = math.radians(7.5)
+    run = st.simulate(WORM_TABLE, 8.0, reference=st.SquareWave(0.035, 4.0), gap=gap, sample_rate=2000.0)
+    path = tmp_path / "log.npz"
+    write_log(SignalTable(run.columns, {"servo": WORM_TABLE.dumps()}), path)
+    once = " ".join(CliRunner().invoke(app, ["identify", str(path)]).output.split())
+    assert "4 windows, 0 OK" in once
+    assert "a window with two steps, to and fro, shows both flanks: give its length with --window" in once
+    both = " ".join(CliRunner().invoke(app, ["identify", str(path), "--window", "3.9"]).output.split())
+    assert "2 windows, 2 OK" in both
+    assert "--window" not in both
+
+
+def test_the_estimates_of_a_log_are_reported_one_by_one(two_steps: Path) -> None:
+    reported: list[tuple[int, int]] = []
+    options = IdentifyOptions(two_steps, window=1.9, wear_deg=0.1, wear_over_s=10.0)
+    found = identify(options, lambda done, total: reported.append((done, total)))
+    assert reported == [(done, len(found.estimates)) for done in range(len(found.estimates))]

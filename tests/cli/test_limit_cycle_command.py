@@ -51,6 +51,7 @@ def test_a_describing_function_that_predicts_nothing_is_said() -> None:
     [
         (("papre",), "papre"),
         (("--gap-deg", -1), "--gap-deg -1 deg: must be from 0 to 360, one turn"),
+        (("telescope", "--gap-deg", 1e7), "--gap-deg 1e+07 deg: must be from 0 to"),
         (("--gap-deg", "nan"), "--gap-deg nan deg: must be from 0 to 360, one turn"),
         (("--step-mm", 0), "--step-mm 0 mm: must be finite and not 0"),
         (("telescope", "--step-deg", 0), "--step-deg 0 deg: must be finite and not 0"),

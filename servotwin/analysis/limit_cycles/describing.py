@@ -19,6 +19,7 @@ from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
+from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.law_loop import check_encoders
 from servotwin.plant.linear import Complex, LinearSystem
@@ -86,9 +87,10 @@ def _solutions(loop: LinearSystem, low: float, high: float) -> list[float]:
 def _check(servo: Plant, law: Law, gap: float) -> None:
     check_encoders(servo, law)
     if servo.backlash_kind is BacklashKind.HELD:
+        elastic = "the stiffness of the transmission" if isinstance(servo, Axis) else "servo k_d"
         raise InvalidInput(
-            "servo k_d is finite: the describing function needs a rigid screw (k_d = inf), or a shaft that is free in "
-            "the gap, since behind a held elastic screw the motor rests on its flank, which is no harmonic motion"
+            f"{elastic} is finite: the describing function needs a rigid screw (inf), or a shaft that is free in the "
+            "gap, since behind a held elastic screw the motor rests on its flank, which is no harmonic motion"
         )
     if servo.at_motor and servo.rigid:
         raise InvalidInput(

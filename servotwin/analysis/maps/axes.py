@@ -54,13 +54,16 @@ class RatioAxes:
         _check("tolerance", self.tolerance, "p b", positive=False)
         _check("amplitude", self.amplitude, "p b", positive=True)
         _check("gap", (self.gap,), "rad", positive=True)
-        check_gap(self.gap)
         _check_size(self)
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Cells along each axis."""
         return len(self.tolerance), len(self.amplitude)
+
+    def check_gap(self, servo: Plant) -> None:
+        """Refuse a gap that is larger than that of a machine can be."""
+        check_gap(self.gap, largest=servo.largest_gap)
 
     def cells(self, servo: Plant) -> Cells:
         """Every cell in SI units."""
@@ -97,10 +100,8 @@ class PhysicalAxes:
 
     def __post_init__(self) -> None:
         _check("gap", self.gap, "rad", positive=False)
-        check_gap(max(self.gap))
         if self.estimate:
             _check("estimate", self.estimate, "rad", positive=False)
-            check_gap(max(self.estimate), "estimate")
         _check("k_dz", self.k_dz, "tolerances per gap", positive=False)
         _check("amplitude", self.amplitude, "m", positive=True)
         _check_size(self)
@@ -109,6 +110,11 @@ class PhysicalAxes:
     def shape(self) -> tuple[int, ...]:
         """Cells along each axis: gap, estimate, k_dz, amplitude."""
         return len(self.gap), max(1, len(self.estimate)), len(self.k_dz), len(self.amplitude)
+
+    def check_gap(self, servo: Plant) -> None:
+        """Refuse gaps and estimates that are larger than those of a machine can be."""
+        check_gap(max(self.gap), largest=servo.largest_gap)
+        check_gap(max(self.estimate, default=0.0), "estimate", servo.largest_gap)
 
     def cells(self, servo: Plant) -> Cells:
         """Every cell in SI units."""

@@ -74,6 +74,7 @@ class MapSettings:
     still: float | None = None
 
     def __post_init__(self) -> None:
+        self.axes.check_gap(self.servo)
         _check_law(self.law)
         self.servo.check_loop(self.law)
         for name, least in (("members", 1), ("seed", 0)):

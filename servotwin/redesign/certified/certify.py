@@ -19,6 +19,7 @@ from servotwin.control.gains import gains_of
 from servotwin.control.laws import AnyController
 from servotwin.control.retuning import integrates
 from servotwin.plant.plants import Plant, check_gap_in_loop
+from servotwin.plant.signals import check_gap
 from servotwin.redesign.certified.attempt import Attempt, Question
 from servotwin.redesign.certified.candidates import candidates_of, last_resort
 from servotwin.redesign.certified.certificate import Certificate, NotVerified
@@ -89,6 +90,7 @@ def certify(
     """
     begin = clock()
     check_gap_in_loop(servo)
+    check_gap(uncertainty.gap[1], "uncertainty gap", servo.largest_gap)
     demands = demands or Demands()
     trial = trial or trial_for(servo, uncertainty, demands)
     disturbed = is_disturbed(servo, uncertainty, demands, feedforward)

@@ -19,6 +19,7 @@ from servotwin.control.retuning import (
     law_for_margins,
     only_integrates,
     scaled,
+    slowed,
     static_gain,
     strength,
     without_integral,
@@ -39,6 +40,9 @@ from servotwin.redesign.certified.uncertainty import Uncertainty
 # of `Demands.integral` are tried.
 _WHOLE_INTEGRAL = (0.0, 0.1, 0.3, 1.0)
 _SLOW_INTEGRAL = 0.25
+# The same of a cascade whose gain must be less than half of the own one: its integral stays slower than the position
+# loop, and still takes away what friction leaves.
+_LITTLE_INTEGRAL = (0.03,)
 AnyPlantSet: TypeAlias = PlantSet | LawSet
 # Plants within the ranges, beside the model and the corners.
 _WITHIN = 32
@@ -176,6 +180,14 @@ def laws_within(
     if servo.at_motor and isinstance(own, Controller) and _all_slow(within, own):
         laws += _scaled_laws(own, demands, demands.motor_shapes, integral)
         within = _lively(laws, passes, always)
+    if isinstance(own, Cascade) and own.velocity_gain is not None and _all_slow(within, own):
+        slow = _slowed_laws(own, demands, integral)
+        slow += _scaled_laws(own, demands, demands.shapes, _LITTLE_INTEGRAL) if max(integral) > 0.0 else []
+        if notched is not None:
+            assert isinstance(notched, Cascade)
+            slow += _slowed_laws(notched, demands, integral)
+        within = list(dict.fromkeys([*within, *_lively(slow, passes, set())]))
+        laws += slow
     if notched is not None and (uncertainty.learnt is not None or not within):
         with_it = _scaled_laws(notched, demands, demands.notch_shapes, integral)
         within += _lively(with_it, passes, set())
@@ -192,6 +204,14 @@ def _scaled_laws(
     scales = [each for each in demands.scales if each <= 1.0] if only_integrates(own) else demands.scales
     laws = [scaled(own, scale, shape, share) for share in integral for shape in shapes for scale in scales]
     return list(dict.fromkeys(laws))
+
+
+def _slowed_laws(own: Cascade, demands: Demands, integral: tuple[float, ...]) -> list[AnyController]:
+    """The cascade with less speed, with its integral action and without: a lower velocity gain alone brings the
+    velocity loop down to the position loop and to its own integral, which then leave no margin."""
+    shares = [scale for scale in demands.scales if scale <= 1.0]
+    laws = [slowed(own, share) for share in shares] if max(integral) > 0.0 else []
+    return [*laws, *(without_integral(slowed(own, share)) for share in shares)]
 
 
 def _lively(

@@ -14,7 +14,6 @@ from servotwin.hybrid.automaton import Array
 from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
-from servotwin.plant.signals import check_gap
 
 Range = tuple[float, float]
 LARGEST_DELAY = 64
@@ -185,7 +184,6 @@ class Uncertainty:
 
     def __post_init__(self) -> None:
         check(self)
-        check_gap(self.gap[1], "uncertainty gap")
 
     def own_friction_of(self, plant: Plant) -> Range:
         """Range of the friction at standstill that a model states, as a torque on the motor, N m."""
