@@ -19,13 +19,12 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.edge.probe import ProbeLimits
 from servotwin.edge.settings import Supervision
 from servotwin.edge.settings_file import read_supervision
-from servotwin.errors import InvalidInput
 from servotwin.link.simulated import LinkSettings
 from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.plants import Plant
-from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step, turn_in_words
-from servotwin.twin.settings import TwinSettings, read_twin_settings
+from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
+from servotwin.twin.settings import TwinSettings, check_gaps, read_twin_settings
 
 CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
     name_of(each) for each in (Controller, Recording, ProbeLimits, NoveltyRules, LinkSettings, TwinSettings)
@@ -117,7 +116,8 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
     InvalidInput
         A key is unknown or missing, or its value is not allowed.
     """
-    _check_gap(table, servo)
+    gaps = table.table(GAP)
+    check_gaps(gaps, [name for name in gaps.values if name.endswith("_deg")], servo)
     inner = table.table(CONTROLLER)
     with named(inner):
         controller = _changed(inner, servo.controller)
@@ -141,15 +141,6 @@ def read_parts(table: Table, folder: Path, servo: Plant) -> dict[str, Any]:
         "downlink": downlink,
         "twin": read_inner(table, TWIN, lambda inner: _twin(inner, folder, servo)),
     }
-
-
-def _check_gap(table: Table, servo: Plant) -> None:
-    """Refuse a gap that is larger than that of the machine can be."""
-    given, most = table.values.get(GAP), math.degrees(servo.largest_gap)
-    for name, value in given.items() if isinstance(given, Mapping) else ():
-        if name.endswith("_deg") and isinstance(value, int | float) and value > most * (1.0 + 1e-12):
-            allowed = f"a number, at least 0, at most {most:g}, {turn_in_words(servo.largest_gap)}"
-            raise InvalidInput(f"{table.source}: {GAP}.{name} = {value} is not allowed; give {allowed}")
 
 
 def _twin(table: Table, folder: Path, servo: Plant) -> TwinSettings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +20,7 @@ from servotwin.plant.axis import Axis
 from servotwin.plant.own_units import INPUT_BIAS_KEYS
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
+from servotwin.plant.signals import turn_in_words
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
@@ -301,6 +302,23 @@ class TwinSettings:
         return replace(self, **changes)
 
 
+def check_gaps(table: Table, names: Sequence[str], plant: Plant) -> None:
+    """Refuse gaps of a table, numbers or ranges in degrees, that are larger than those of the machine can be.
+
+    Raises
+    ------
+    InvalidInput
+    """
+    most = math.degrees(plant.largest_gap)
+    for name in names:
+        given = table.values.get(name)
+        angles = given if isinstance(given, list) else [given]
+        if any(isinstance(angle, int | float) and angle > most * (1.0 + 1e-12) for angle in angles):
+            numbers = "two numbers" if isinstance(given, list) else "a number"
+            allowed = f"{numbers}, at least 0, at most {most:g} deg, {turn_in_words(plant.largest_gap)}"
+            raise table.invalid(name, allowed)
+
+
 def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None = None) -> TwinSettings:
     """Read [twin] with its inner tables; the method declares the keys of [estimator].
 
@@ -316,6 +334,8 @@ def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None 
     estimator = part(table, "estimator", METHODS[attribute(table, TwinSettings, "method")].settings)
     given = table.values.get("uncertainty", {})
     settings: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
+    if plant is not None:
+        check_gaps(table.table("uncertainty"), ["gap_deg"], plant)
     if not isinstance(plant, Axis) or not isinstance(given, Mapping):
         return settings
     known, own = settings.uncertainty, scales(plant)

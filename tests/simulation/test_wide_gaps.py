@@ -76,8 +76,16 @@ def test_a_gap_of_more_than_a_turn_of_the_load_is_refused(tmp_path: Path) -> Non
     (tmp_path / "valve.toml").write_text(VALVE)
     path = tmp_path / "scenario.toml"
     path.write_text(SCENARIO.replace("total_deg = 1200.0", "total_deg = 145000.0"))
-    with pytest.raises(InvalidInput, match=r"gap.total_deg = 145000.* at most 144000, one turn of the load"):
+    with pytest.raises(InvalidInput, match=r"gap.total_deg = 145000.* at most 144000 deg, one turn of the load"):
         Scenario.load(path)
     path.write_text(SCENARIO.replace("valve.toml", "paper").replace("amplitude_deg", "amplitude_mm"))
-    with pytest.raises(InvalidInput, match=r"gap.total_deg = 1200.* at most 360, one turn"):
+    with pytest.raises(InvalidInput, match=r"gap.total_deg = 1200.* at most 360 deg, one turn"):
+        Scenario.load(path)
+
+
+def test_a_stated_range_of_more_than_a_turn_is_refused_with_its_key(tmp_path: Path) -> None:
+    (tmp_path / "valve.toml").write_text(VALVE)
+    path = tmp_path / "scenario.toml"
+    path.write_text(SCENARIO + "[twin.uncertainty]\ngap_deg = [0.0, 145000.0]\n")
+    with pytest.raises(InvalidInput, match=r"twin.uncertainty.gap_deg = .*145000.* at most 144000 deg, one turn of"):
         Scenario.load(path)
