@@ -71,6 +71,13 @@ def test_a_model_with_the_true_numbers_predicts_the_motor_best(run: Run, window:
     assert left(0.0) > 100.0 * left(1.0)
 
 
+def test_runs_at_once_are_those_one_by_one(window: Window) -> None:
+    problem, half = problem_of(window, SCREW, motor_side.MotorSideSettings()), 0.5 * SCREW.p * GAP
+    points = [problem.start(half * share, place) for share in (0.9, 1.0, 1.1) for place in (-1.0, 0.0, 1.0)]
+    for one, other in zip(problem.misfits(points, 0.15), [problem.misfit(each, 0.15) for each in points], strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("start", "good"), [(1.5, False), (1.08, True)])
 def test_beside_a_minimum_that_leaves_more_than_counts_another_is_found(

@@ -258,6 +258,10 @@ class DrivenLoad:
         position = self.model.simulate(drive, self.position, self.interval, values, rate).position
         return self.without_cycles(position - self.position)
 
+    def misfits(self, points: list[Array], rate: float = 0.0) -> list[Array]:
+        """`misfit` (m,) at several points."""
+        return [self.misfit(values, rate) for values in points]
+
     def without_cycles(self, left: Array) -> Array:
         """(m,) less what is cyclic in it."""
         return np.asarray(left - self._cyclic @ (self._cyclic.T @ left))

@@ -71,7 +71,7 @@ class FitProblem(Protocol):
     """A window and a model of it: `Problem`, or the one of `servotwin.estimation.motor_side`.
 
     Its first unknown is the half gap at the load. `sizes` (u,) are usual sizes of the unknowns, `limits` (u,) their
-    largest ones, `misfit` (m,) is what the model leaves, `grid` and `on_one_flank` are those of `Problem`.
+    largest ones, `misfit` (m,) is what the model leaves, `misfits` the same of several points, `grid` and `on_one_flank` are those of `Problem`.
     """
 
     @property
@@ -93,6 +93,7 @@ class FitProblem(Protocol):
     def sizes(self) -> Array: ...
     def limits(self) -> Array: ...
     def misfit(self, values: Array, rate: float = 0.0) -> Array: ...
+    def misfits(self, points: list[Array], rate: float = 0.0) -> list[Array]: ...
     def grid(self, gap: float) -> list[list[Array]]: ...
     def on_one_flank(self, values: Array) -> list[list[Array]]: ...
 
@@ -109,10 +110,10 @@ def whitened_rows(
     steps, raw = _STEP * problem.sizes(), problem.misfit(values, rate) if misfit is None else misfit
     table = np.zeros((values.size + 1, raw.size))
     table[0] = raw
-    for i in np.flatnonzero(free):
-        moved = values.copy()
-        moved[i] += steps[i]
-        table[i + 1] = (problem.misfit(moved, rate) - raw) / steps[i]
+    places = np.flatnonzero(free)
+    moved = values + np.diag(steps)[places]
+    for i, other in zip(places, problem.misfits(list(moved), rate), strict=True):
+        table[i + 1] = (other - raw) / steps[i]
     white = noise.whiten(table)
     root = problem.model.root
     rows = np.hstack([white[1:], root.T * free[:, None]])

@@ -99,6 +99,10 @@ class Problem:
             self.model.position(self._late_drive(values), self.position, self.interval, values, rate)
         )
 
+    def misfits(self, points: list[Array], rate: float = 0.0) -> list[Array]:
+        """`misfit` (m,) at several points."""
+        return [self.misfit(values, rate) for values in points]
+
     def misfit_in_growing_gap(self, values: Array, sizes: Array) -> Array:
         """`misfit` (m,) of a model without dynamics whose gap has `sizes` (N,), shares of the one in the unknowns."""
         assert isinstance(self.model, PlayModel)
