@@ -30,6 +30,7 @@ from servotwin.estimation.output_error.sampling import too_slow
 from servotwin.estimation.output_error.search import search
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.taught import taught
+from servotwin.estimation.output_error.unexplained import slow_error
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.channels import corrected, faults, refused
@@ -49,6 +50,7 @@ _LATE = 0.1  # rad of the shaft's own frequency: usual delay between the channel
 _SAMPLES_LATE = 3.0
 _GAPS = np.linspace(0.0, 0.3, 16)  # of the motor's travel; with wider ones a gap looks like another ratio
 _COASTS = 0.1  # of the position's motion: what play leaves of a load that coasts in the gap, and no wrong ratio does
+_MUCH_LESS = 0.5  # of the errors with what was learnt: another shaft that leaves no more than this is the machine's
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -140,6 +142,8 @@ def fitted(
     verdict = judge(found, settings, unit, possible, axis.p * noise)
     if verdict.status is not GapStatus.OK and (wrong := _wrong_channel(window, theta_m, axis)):
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
+    if verdict.status is GapStatus.OK and (other := _other_shaft(found, window, theta_m, axis, settings, machine)):
+        verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=other)
     stated = _stated(blank, found, verdict, unit)
     told = _with_machine(stated, found, possible, settings, machine)
     return FittedWindow(told, found, possible, settings if verdict.one_flank else None)
@@ -162,6 +166,28 @@ def _with_machine(
     if stated.std > settings.largest_share * stated.gap:
         return stated
     return replace(stated, machine=taught(machine, found, possible, settings.calibration))
+
+
+def _other_shaft(
+    found: Search,
+    window: Window,
+    theta_m: Array,
+    axis: Axis,
+    settings: OutputErrorSettings,
+    machine: FactorPrior | None,
+) -> tuple[str, ...]:
+    """Sentence for a fit that another shaft than the learnt one beats by far.
+
+    The search ends a few per cent from what was learnt. There a shaft of another machine fits best in a wrong gap, and
+    leaves slow motion.
+    """
+    if machine is None or not is_learnt(machine, settings) or slow_error(found) == 0.0:
+        return ()
+    other, _ = _fit(window, theta_m, axis, None, settings, None)
+    less = float(np.linalg.norm(other.best.raw) / np.linalg.norm(found.best.raw))
+    if less > _MUCH_LESS:
+        return ()
+    return (f"another shaft than the one that was learnt leaves {100.0 * less:.2g} % of the errors only",)
 
 
 def _broken(window: Window, axis: Axis) -> tuple[str, ...]:
