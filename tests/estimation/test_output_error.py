@@ -1,6 +1,7 @@
 """Gaps of shafts that are free in the gap and of one mass on a rigid screw."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,12 +16,12 @@ from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings, estimate
 from servotwin.estimation.output_error.estimator import _problem, fit
-from servotwin.estimation.output_error.fit import one_flank
+from servotwin.estimation.output_error.fit import descend, one_flank
 from servotwin.estimation.output_error.learnt_shaft import adapted_shaft
 from servotwin.estimation.output_error.mismatches import grown
 from servotwin.estimation.output_error.models import HALF, Priors, ShaftModel
 from servotwin.estimation.output_error.possible import possible_half
-from servotwin.estimation.output_error.search import one_flank_without_a_gap, search
+from servotwin.estimation.output_error.search import also_from, one_flank_without_a_gap, search
 from servotwin.estimation.whitened import WhitenedSettings
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
@@ -125,6 +126,17 @@ def test_another_machine_than_the_learnt_one_is_refused_where_a_wrong_gap_hides_
         else:
             assert made.status is GapStatus.MODEL_MISMATCH
             assert "another shaft than the one that was learnt" in made.reasons[0]
+
+
+def test_one_more_start_finds_what_a_search_has_missed_and_spoils_nothing() -> None:
+    found = fit(recorded(TWO_MASS, 0.01), TWO_MASS, None, OutputErrorSettings())
+    values = found.best.values.copy()
+    values[HALF] *= 1.3
+    rate = found.problem.model.slowing[-1] * found.problem.model.speed
+    missed = replace(found, best=descend(found.problem, values, found.noise, found.free, 0, rate), others=())
+    again = also_from(missed, found.best.values)
+    assert again.best.values[HALF] == pytest.approx(found.best.values[HALF], rel=1e-3)
+    assert also_from(found, values).best.values[HALF] == pytest.approx(found.best.values[HALF], rel=1e-3)
 
 
 def test_a_load_that_friction_holds_does_not_creep() -> None:
