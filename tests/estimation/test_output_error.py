@@ -1,6 +1,7 @@
 """Gaps of shafts that are free in the gap and of one mass on a rigid screw."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,15 +14,16 @@ from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.output_error import OutputErrorSettings
+from servotwin.estimation.output_error import OutputErrorSettings, estimate
 from servotwin.estimation.output_error.estimator import _problem, fit
-from servotwin.estimation.output_error.fit import one_flank
+from servotwin.estimation.output_error.fit import descend, one_flank
 from servotwin.estimation.output_error.learnt_shaft import adapted_shaft
 from servotwin.estimation.output_error.mismatches import grown
 from servotwin.estimation.output_error.models import HALF, Priors, ShaftModel
 from servotwin.estimation.output_error.possible import possible_half
-from servotwin.estimation.output_error.search import one_flank_without_a_gap, search
+from servotwin.estimation.output_error.search import also_from, one_flank_without_a_gap, search
 from servotwin.estimation.whitened import WhitenedSettings
+from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import TorqueDrive, VelocityDrive
 from servotwin.plant.axis import Axis
@@ -107,6 +109,34 @@ def test_a_shaft_is_adapted_by_its_own_numbers_alone() -> None:
     assert (shaft.k_d, shaft.c_d, shaft.p) == pytest.approx((1.1 * own.k_d, 0.7 * own.c_d, 1.01 * own.p))
     assert made.load.m == pytest.approx((3.0, 1.2 * 2.6))
     assert (made.load.k, made.load.c) == (TWO_LOADS.load.k, TWO_LOADS.load.c)
+
+
+def test_another_machine_than_the_learnt_one_is_refused_where_a_wrong_gap_hides_its_shaft() -> None:
+    """Within what was learnt a gap that is 18 % too wide fits best, with an interval of 47 % of it to either side."""
+    joint, gap = Axis.preset("robot-joint"), 0.5
+    learnt = FactorPrior(np.zeros(4), np.diag(np.square([0.0105, 0.5, 0.005, 0.05])))
+    for stiffness in (1.0, 0.7):
+        run = simulate(
+            joint.scaled({"k": stiffness}), 18.0, reference=SquareWave(0.0438, 32.0), gap=gap, sample_rate=1000.0
+        )
+        made = estimate(Window.from_run(run, 15.8, 2.0), joint, None, OutputErrorSettings(gap_rate=0.01), learnt)
+        if stiffness == 1.0:
+            assert made.ok
+            assert made.gap == pytest.approx(gap, rel=2e-3)
+        else:
+            assert made.status is GapStatus.MODEL_MISMATCH
+            assert "another shaft than the one that was learnt" in made.reasons[0]
+
+
+def test_one_more_start_finds_what_a_search_has_missed_and_spoils_nothing() -> None:
+    found = fit(recorded(TWO_MASS, 0.01), TWO_MASS, None, OutputErrorSettings())
+    values = found.best.values.copy()
+    values[HALF] *= 1.3
+    rate = found.problem.model.slowing[-1] * found.problem.model.speed
+    missed = replace(found, best=descend(found.problem, values, found.noise, found.free, 0, rate), others=())
+    again = also_from(missed, found.best.values)
+    assert again.best.values[HALF] == pytest.approx(found.best.values[HALF], rel=1e-3)
+    assert also_from(found, values).best.values[HALF] == pytest.approx(found.best.values[HALF], rel=1e-3)
 
 
 def test_a_load_that_friction_holds_does_not_creep() -> None:

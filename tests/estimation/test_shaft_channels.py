@@ -100,6 +100,17 @@ def test_a_load_that_breaks_loose_by_a_count_has_not_slipped_where_samples_were_
     assert faults(Window(position, motor, sample_rate=1000.0), ROTARY) == ()
 
 
+def test_noise_that_moves_one_sample_by_two_counts_is_no_fault() -> None:
+    """In a motor's counts, whose differences are whole numbers of them but for the last digits."""
+    counts = np.round(np.linspace(0.0, 100.0, 3000))
+    counts[1501] += 2.0
+    angle = 2.0 * math.pi / 4096.0 * counts
+    position = np.linspace(0.0, 1e-2, 3000)
+    assert faults(Window(position, angle, sample_rate=2000.0)) == ()
+    angle[1501] += 2.0 * math.pi / 4096.0
+    assert any("theta_m leaves its neighbours" in each for each in faults(Window(position, angle, sample_rate=2000.0)))
+
+
 def test_noise_of_few_counts_that_repeats_by_chance_was_not_held() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):

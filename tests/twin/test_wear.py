@@ -89,6 +89,21 @@ def test_windows_that_no_machine_explains_are_counted_until_one_does():
     assert wear.wear.mismatches == 0
 
 
+@pytest.mark.parametrize(("between", "alarms"), [(1, [4]), (2, [6]), (3, [])])
+def test_windows_of_another_machine_by_turns_raise_one_alarm(between: int, alarms: list[int]) -> None:
+    """At the third turn, unless as many windows between them fit as it takes to learn a machine."""
+    wear, raised, learning = worn(), [], LearningSettings()
+    for number in range(12):
+        other = number % (between + 1) == 0
+        made = replace(seen(13.0, 120.0 + number), reasons=("too soft",)) if other else seen(13.0, 120.0 + number)
+        made = replace(made, status=GapStatus.MODEL_MISMATCH) if other else made
+        before = wear.wear
+        wear.learn("boot-1", made, 122.0 + number)
+        sentences = wear.wear.alarms(before, made, SETTINGS, learning)
+        raised += [number] * any("come by turns with others (too soft)" in each for each in sentences)
+    assert raised == alarms
+
+
 def test_an_older_window_moves_nothing_and_is_expected_as_things_stand():
     wear = worn()
     before = wear.wear

@@ -136,6 +136,9 @@ class Wear(Struct, frozen=True):
         None before a window told of the motor's numbers.
     mismatches : int
         Windows in a row that no model within what is known explains; windows that show too little do not count.
+    lapses, fitting : int
+        Such rows that windows that fit have ended, and how many of these came since, up to `restart_after` in a row,
+        which ends the count.
     at_limit, limited : int, float
         Windows in a row that tell nothing of the motor because its commands were at the drive's limit, and the share of
         the last one's commands that were.
@@ -150,6 +153,8 @@ class Wear(Struct, frozen=True):
     machine: LearntMachine | None = None
     motor: LearntMotor | None = None
     mismatches: int = 0
+    lapses: int = 0
+    fitting: int = 0
     at_limit: int = 0
     limited: float = 0.0
     contact: LastContact | None = None
@@ -210,8 +215,7 @@ class Wear(Struct, frozen=True):
             Knowledge after the window, and the reason for which no update may follow from it; empty: it may.
         """
         wear, rejection = self._update_trend(settings, boot, estimate, now)
-        if wear.mismatches != (mismatches := self._mismatches(estimate)):
-            wear = replace(wear, mismatches=mismatches)
+        wear = self._with_mismatches(wear, estimate, learning.restart_after)
         if (contact := estimate.contact) is not None and self._is_newer(contact, boot):
             wear = replace(wear, contact=contact, contact_boot=boot)
         if motor is not None and window is not None:
@@ -244,11 +248,16 @@ class Wear(Struct, frozen=True):
         `before` is the knowledge before the window, and `estimate` its estimate.
         """
         sentences, count = list[str](), learning.restart_after
-        if self.mismatches == count > before.mismatches and self.machine == before.machine:
-            because = "; ".join(estimate.reasons)
+        because, unknown = "; ".join(estimate.reasons), self.machine == before.machine
+        if self.mismatches == count > before.mismatches and unknown:
             sentences.append(
                 f"{count} windows in a row fit no machine within what is known of this one ({because}): check the "
                 "nameplate (stiffness, damping, pitch, masses), the channels' units, and what may be loose"
+            )
+        elif self.mismatches == 1 > before.mismatches and self.lapses == count - 1 and unknown:
+            sentences.append(
+                f"windows that fit no machine within what is known of this one come by turns with others ({because}): "
+                "two machines may have its name, or it is one with two loads"
             )
         if motor is not None and self.at_limit == count > before.at_limit:
             sentences.append(
@@ -264,11 +273,17 @@ class Wear(Struct, frozen=True):
             )
         return sentences
 
-    def _mismatches(self, estimate: GapEstimate) -> int:
-        """`mismatches` after an estimate."""
+    def _with_mismatches(self, wear: Wear, estimate: GapEstimate, enough: int) -> Wear:
+        """`wear` with the count of windows that fit no machine; `enough` that fit in a row end that of lapses."""
         if estimate.status is GapStatus.MODEL_MISMATCH:
-            return self.mismatches + 1
-        return 0 if estimate.ok else self.mismatches
+            return replace(wear, mismatches=self.mismatches + 1)
+        if not estimate.ok or self.mismatches == self.lapses == 0:
+            return wear
+        ended = self.mismatches > 0
+        fitting = 1 if ended else self.fitting + 1
+        if fitting >= enough:
+            return replace(wear, mismatches=0, lapses=0, fitting=0)
+        return replace(wear, mismatches=0, lapses=self.lapses + ended, fitting=fitting)
 
     def _update_trend(self, settings: TrendSettings, boot: str, estimate: GapEstimate, now: float) -> tuple[Wear, str]:
         """Return the wear after an estimate, and the reason for which no update may follow from it; empty: it may.

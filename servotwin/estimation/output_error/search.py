@@ -64,7 +64,20 @@ def search(problem: SearchProblem, gap: float) -> Search:
     if rounded is not None:
         return rounded
     fits = _in_white_noise(problem, starts(problem, gap))
-    fits = [_beside(problem, fits[0]), *fits]
+    return _in_own_noise(problem, [_beside(problem, fits[0]), *fits])
+
+
+def also_from(found: Search, values: Array) -> Search:
+    """The search with one more start, at unknowns (u,) within their limits; as it is where that does not leave less."""
+    problem = cast(SearchProblem, found.problem)
+    start, rate = np.clip(values, -problem.limits(), problem.limits()), _last_rate(problem)
+    noise = _white(problem, min(plain_cost(problem, start, rate), _left(found.best)))
+    fit = descend(problem, start, noise, problem.free, _LAST_STEPS, rate, _ROUGH)
+    return found if _left(fit) >= _left(found.best) else _in_own_noise(problem, [fit, found.best, *found.others])
+
+
+def _in_own_noise(problem: SearchProblem, fits: list[Fit]) -> Search:
+    """Fits from minima in the noise that the first of them leaves, which is learnt anew at the best one."""
     for _ in range(_PASSES):
         noise = noise_in(problem, fits[0])
         fits = [descend(problem, fit.values, noise, problem.free, _LEARNT_STEPS, _last_rate(problem)) for fit in fits]

@@ -31,8 +31,10 @@ from servotwin.plant.signals import Array
 # before it; share of the fastest motion there.
 _FLAT, _CREST, _RUN, _STEEP = 20, 10, 6, 0.05
 _JUMP = 50.0  # times the usual fastest motion
-_SPIKE, _SHOWN, _SPIKE_COUNTS = 8.0, 0.01, 2.0  # of the median step, of the motion's range; counts
-_SLIP_SHOWN, _SLIP_COUNTS = 0.001, 5.0  # of the motion's range; counts, of which noise and rounding make three
+# Of the median step, of the motion's range; counts, of which noise makes two. A half more: whole counts differ in their
+# last digits.
+_SPIKE, _SHOWN, _SPIKE_COUNTS = 8.0, 0.01, 2.5
+_SLIP_SHOWN, _SLIP_COUNTS = 0.001, 5.5  # of the motion's range; counts, of which noise and rounding make three
 _SLIP_BESIDE, _BESIDE = 3.0, 10  # of the changes of the steps beside it; so many on each side
 # Equal samples; times the usual change of speed there, at which motion begins or ends; times the next steps.
 _REPEATED, _ABRUPT, _LEAP = 4, 4.0, 2.0
