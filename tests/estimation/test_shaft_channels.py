@@ -11,7 +11,7 @@ from benchmarks.random_axes import random_axis, step_window
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
-from servotwin.estimation.whitened.channels import faults
+from servotwin.estimation.whitened.channels import faults, other_units
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import ROTARY
@@ -116,3 +116,18 @@ def test_noise_of_few_counts_that_repeats_by_chance_was_not_held() -> None:
     for _ in range(20):
         noisy = np.round(rng.normal(0.0, 2.0, (2, 2000)) + 20.0 * np.sin(np.arange(2000) / 300.0))
         assert faults(Window(*noisy, sample_rate=1000.0)) == ()
+
+
+@pytest.mark.parametrize(("angle", "position"), [(57.2958, 57.2958), (57.2958, 1e3), (1.0 / math.tau, 1e3)])
+def test_channels_that_are_both_in_other_units_are_told_by_their_counts(angle: float, position: float) -> None:
+    """A ball screw moves alike at any scale: in degrees both its gap was 57 times too wide, and accepted."""
+    _, window = screw()
+    assert window.theta_m is not None
+    angle_count, position_count = SCREW.encoder_resolution, SCREW.sensors.position_resolution
+    assert other_units(window, angle_count, position_count) == ()
+    other = window.replace(theta_m=angle * window.theta_m, position=position * window.position)
+    made = estimate_gap(other, SCREW)
+    assert made.status is GapStatus.MODEL_MISMATCH
+    assert "both seem to be in other units" in made.reasons[0]
+    # One channel alone may come in steps of the log.
+    assert other_units(window.replace(position=position * window.position), angle_count, position_count) == ()

@@ -33,7 +33,7 @@ from servotwin.estimation.output_error.taught import taught
 from servotwin.estimation.output_error.unexplained import slow_error
 from servotwin.estimation.output_error.verdict import JudgedFit, judge
 from servotwin.estimation.paper.zero_phase import ZeroPhase
-from servotwin.estimation.whitened.channels import corrected, faults, refused
+from servotwin.estimation.whitened.channels import corrected, faults, other_units, refused
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
@@ -195,7 +195,8 @@ def _beside_what_was_learnt(
 def _broken(window: Window, axis: Axis) -> tuple[str, ...]:
     """Faults of the channels; of a load that is the screw dead ones only: that stops as abruptly as they do."""
     sentences = faults(window, axis.load.motion)
-    return tuple(sentence for sentence in sentences if "constant" in sentence) if follows(axis) else sentences
+    found = tuple(sentence for sentence in sentences if "constant" in sentence) if follows(axis) else sentences
+    return found or other_units(window, axis.encoder_resolution, axis.sensors.position_resolution)
 
 
 def _wrong_channel(window: Window, theta_m: Array, axis: Axis) -> tuple[str, ...]:

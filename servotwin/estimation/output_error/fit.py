@@ -71,7 +71,8 @@ class FitProblem(Protocol):
     """A window and a model of it: `Problem`, or the one of `servotwin.estimation.motor_side`.
 
     Its first unknown is the half gap at the load. `sizes` (u,) are usual sizes of the unknowns, `limits` (u,) their
-    largest ones, `misfit` (m,) is what the model leaves, `misfits` the same of several points, `grid` and `on_one_flank` are those of `Problem`.
+    largest ones, `misfit` (m,) is what the model leaves, `misfits` the same of several points, `grid` and
+    `on_one_flank` are those of `Problem`.
     """
 
     @property

@@ -283,8 +283,33 @@ _EXPLAINS, _BETTER = 0.05, 0.2  # share left that counts as a fit; of what the c
 _POSITION_UNITS = {"mm": 1e-3, "micrometres": 1e-6, "units of 1000 m": 1e3}
 _ROTARY_UNITS = {"degrees": math.pi / 180.0, "turns": 2.0 * math.pi}
 _ANGLE_UNITS = _ROTARY_UNITS | {"units of 57.3 rad": 180.0 / math.pi}
+_WIDER = (180.0 / math.pi, 1e3, 1e6, 0.5 / math.pi)  # counts in degrees, in thousandths, in millionths, in turns
+_ALIKE = 0.02
 _PITCHES = (0.5, 2.0)
 _RATES = (0.1, 0.2, 0.5, 2.0, 5.0, 10.0)
+
+
+def other_units(window: Window, angle_count: float, position_count: float) -> tuple[str, ...]:
+    """Sentence for channels both of whose counts are those of other units; empty where a count is unknown or unseen.
+
+    A machine moves alike at any scale, so that nothing else in a window tells units by which both channels are wrong.
+
+    Parameters
+    ----------
+    window : Window
+    angle_count, position_count : float
+        One count of each encoder as stated, rad and m (rotary: rad); 0: unknown.
+    """
+    assert window.theta_m is not None
+    if not (angle_count > 0.0 and position_count > 0.0):
+        return ()
+    wider = counted(window.theta_m) / angle_count, counted(window.position) / position_count
+    if not all(any(abs(each / unit - 1.0) < _ALIKE for unit in _WIDER) for each in wider):
+        return ()
+    return (
+        f"theta_m counts in steps {wider[0]:.3g} times as wide as its encoder's, and position {wider[1]:.3g} times: "
+        "both seem to be in other units",
+    )
 
 
 def likely_fault(window: Window, theta_m: Array, servo: Servo, unexplained: float, second: float) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.core.contacts import Travel, travel
 from servotwin.estimation.core.visible import counted, least_bound
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, no_estimate
-from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle, refused
+from servotwin.estimation.whitened.channels import faults, likely_fault, motor_angle, other_units, refused
 from servotwin.estimation.whitened.doubt import gap_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit, align_and_fit, coarse_search
 from servotwin.estimation.whitened.free_model import FREEDOM, ContactEvidence, FactorPrior, adapted
@@ -308,7 +308,7 @@ def _unfitted(
     _check(window)
     assert window.theta_m is not None
     blank = _nothing(window, servo, prior)
-    broken = faults(window)
+    broken = faults(window) or other_units(window, servo.encoder_resolution, servo.position_resolution)
     if broken:
         blank = refused(blank, broken)
     angle = window.theta_m if broken else motor_angle(window, servo.encoder_resolution, settings, second)
