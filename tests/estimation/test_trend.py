@@ -362,3 +362,19 @@ def test_a_jump_to_several_turns_of_the_motor_starts_the_trend_afresh_there() ->
         found = found.update(seen(time, gap, 0.15 * gap))
     assert found.afresh
     assert found.gap == pytest.approx(gap, rel=0.03)
+
+
+def test_a_gap_that_closed_is_not_followed_below_zero() -> None:
+    """A new screw within the spread of a rate that is not known yet: the next windows were outliers."""
+    settings = TrendSettings(rate_std_rad_per_s=0.2 * DEG)
+    trend = Trend.start(0.0, settings)
+    for time, gap in ((0.0, 3.0), (20.0, 3.0), (40.0, 0.02)):
+        trend = trend.update(seen(time, gap * DEG, 0.05 * DEG))
+    assert trend.refused == 0
+    assert trend.rate < 0.0
+    later = trend.predict(60.0)
+    assert later.mean[0] == later.mean[1] == 0.0
+    assert later.predict(80.0).covariance == pytest.approx(trend.predict(80.0).covariance)
+    trend = trend.update(seen(60.0, 0.02 * DEG, 0.05 * DEG))
+    assert trend.refused == 0
+    assert trend.gap == pytest.approx(0.02 * DEG, abs=0.05 * DEG)

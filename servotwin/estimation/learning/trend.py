@@ -172,7 +172,7 @@ class Trend:
         return cls(_time(time), np.zeros(3), np.diag(spread**2), given)
 
     def predict(self, time: float) -> Trend:
-        """The state at a later time, s.
+        """The state at a later time, s; a gap that would shrink below zero has closed, and stays so.
 
         Raises
         ------
@@ -183,9 +183,12 @@ class Trend:
         if step < 0.0:
             raise InvalidInput(f"trend: time {time:.9g} s lies before {self.time:.9g} s; windows must come in order")
         flow = transition(step)
+        mean = flow @ self.mean
+        if mean[GAP] < 0.0 > mean[RATE]:
+            mean[[GAP, RATE]] = 0.0
         covariance = flow @ self.covariance @ flow.T + process_noise(step, self.settings)
         rival = self.rival and self.rival.predict(time)
-        return replace(self, time=float(time), mean=flow @ self.mean, covariance=covariance, reasons=(), rival=rival)
+        return replace(self, time=float(time), mean=mean, covariance=covariance, reasons=(), rival=rival)
 
     def update(self, estimate: GapEstimate, offset: OffsetReading | CarriedOffset | None = None) -> Trend:
         """The state at the estimate's time, corrected by it.
