@@ -1,4 +1,4 @@
-"""The flank that the motor touches in a window of a free shaft in which it touches one only.
+"""The flank that the motor touches in a window in which it touches one only.
 
 Such a window does not show the gap, but it tells the place of that flank: of the driven end, unloaded, for an angle of
 the motor. Stiffness, friction, ratio and delay are free within what is known of them, so that their doubt is in its
@@ -15,8 +15,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import NORMAL_95
-from servotwin.estimation.output_error.fit import Fit, Search, descend, on_each_flank
+from servotwin.estimation.output_error.fit import Fit, FitProblem, Search, descend, noise_in, on_each_flank
+from servotwin.estimation.output_error.flank_models import Flank, FlankModel, OwnModel, by_flank
+from servotwin.estimation.output_error.held_chain import HeldChainModel
 from servotwin.estimation.output_error.jitter import time_jitter
 from servotwin.estimation.output_error.mismatches import (
     APART,
@@ -25,7 +28,8 @@ from servotwin.estimation.output_error.mismatches import (
     between_halves,
     unusual_numbers,
 )
-from servotwin.estimation.output_error.models import HALF, OFFSET, RATIO, PreparedShaft, ShaftModel, other_friction
+from servotwin.estimation.output_error.models import HALF, OFFSET, RATIO, ShaftModel, other_friction
+from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.settings import OutputErrorSettings
@@ -40,32 +44,6 @@ _ROUNDED = 0.5  # of a count: error of a flank's place that does not average out
 _LEAST = 0.02  # of the window: contact that tells a flank
 _LEAST_FRICTION = 0.02  # half-width of the stated friction
 _WOUND_UP = 2.0  # times the stated friction: what may wind up the shaft against the other flank
-
-
-@dataclass(frozen=True)
-class FlankModel(ShaftModel):
-    """A free shaft whose second unknown is the place of one flank in place of the offset.
-
-    Attributes
-    ----------
-    side : float
-        1: the flank on which the motor pushes the load forwards; -1: backwards.
-    at : float
-        Motor at the load (m or rad) for which the place is that of the driven end, unloaded on that flank.
-    """
-
-    side: float = 1.0
-    at: float = 0.0
-
-    def from_flank(self, values: Array) -> float:
-        """Place of the flank less the offset, for unknowns (u,)."""
-        return math.exp(float(values[RATIO])) * (self.at - self.side * float(values[HALF]))
-
-    def prepared(self, drive: Array, interval: float, values: Array) -> PreparedShaft:
-        """As that of `ShaftModel`."""
-        own = values.copy()
-        own[OFFSET] -= self.from_flank(values)
-        return super().prepared(drive, interval, own)
 
 
 class FlankPlace(NamedTuple):
@@ -102,7 +80,7 @@ class OneFlank:
     likely : tuple of Fit
         Others that explain the window nearly as well.
     side : float
-        As of `FlankModel`.
+        As of `Flank`.
     settings : OutputErrorSettings
     """
 
@@ -116,17 +94,21 @@ class OneFlank:
     def of(cls, found: Search, settings: OutputErrorSettings) -> OneFlank | None:
         """Read the flank from the fit of a window that one flank explains; None where it is not told for certain."""
         model, problem = found.problem.model, found.problem
-        if not isinstance(model, ShaftModel) or not isinstance(problem, Problem) or not model.axis.load.free:
+        if not isinstance(model, OwnModel) or not isinstance(problem, Problem):
             return None
-        known = max(_LEAST_FRICTION, settings.friction) / NORMAL_95
-        found = _in(replace(problem, model=replace(model, friction=known)), found)
-        flanks = on_each_flank(found)
-        lower, upper = (min(fits, key=lambda fit: fit.cost) for fits in flanks)
-        side, single, other = (1.0, upper, lower) if upper.cost < lower.cost else (-1.0, lower, upper)
-        variance = single.variance()
-        if not other.cost - single.cost >= BELIEVED * variance:
+        if isinstance(model, ShaftModel) and not model.axis.load.free:
             return None
-        fits = (found.best, *found.others, *flanks[0], *flanks[1])
+        if not isinstance(model, PlayModel):
+            known = max(_LEAST_FRICTION, settings.friction) / NORMAL_95
+            found = _in(replace(problem, model=replace(model, friction=known)), found)
+        flanks = [fit for fits in on_each_flank(found) for fit in fits]
+        single = min(flanks, key=lambda fit: fit.cost)
+        side, variance = _side(found.problem, single), single.variance()
+        # A fit may end on the flank opposite to the one on which it began.
+        others = (fit.cost for fit in flanks if _side(found.problem, fit) != side)
+        if not min(others, default=math.inf) - single.cost >= BELIEVED * variance:
+            return None
+        fits = (found.best, *found.others, *flanks)
         likely = tuple(fit for fit in fits if fit is not single and fit.cost - single.cost < RIVAL * variance)
         made = cls(found, single, likely, side, settings)
         return made if made._is_sure() else None
@@ -134,9 +116,13 @@ class OneFlank:
     @property
     def axis(self) -> Axis:
         """The axis with the numbers that are known best."""
+        return self._model.axis
+
+    @property
+    def _model(self) -> OwnModel:
         model = self.found.problem.model
-        assert isinstance(model, ShaftModel)
-        return model.axis
+        assert isinstance(model, OwnModel)
+        return model
 
     @property
     def problem(self) -> Problem:
@@ -181,19 +167,24 @@ class OneFlank:
         free[HALF] = False
         return replace(self.found, best=fit, others=(), free=free)
 
-    def fitted(self, at: float, half: float | None = None) -> Search:
-        """Fit with the flank's place, with the motor at the load `at`, as its second unknown; `half`: gap that is
-        given, m or rad at the load."""
-        known = self.problem.model
-        assert isinstance(known, ShaftModel)
-        model = FlankModel(known.axis, known.priors, known.learnt, known.friction, side=self.side, at=at)
+    def fitted(self, at: float) -> Search:
+        """Fit with the flank's place, with the motor at the load `at`, as its second unknown.
+
+        The noise is learnt anew: what a fit with two flanks bends its numbers to is no noise there.
+        """
+        known = self._fitted(at, self.found.noise)
+        return self._fitted(at, noise_in(known.problem, known.best))
+
+    def _fitted(self, at: float, noise: Autoregression, half: float | None = None) -> Search:
+        """As `fitted`, in a noise; `half`: gap that is given, m or rad at the load."""
+        model = by_flank(self._model, Flank(self.side, at))
         values, problem = self.single.values.copy(), replace(self.problem, model=model)
-        values[OFFSET] += model.from_flank(values)
+        values[OFFSET] += model.flank.less_offset(values)
         if half is not None:
             values[HALF] = half
         alone = self._search_of(self.single)
-        fit = descend(problem, values, self.found.noise, alone.free, _STEPS, self._rate)
-        return replace(alone, problem=problem, best=fit)
+        fit = descend(problem, values, noise, alone.free, _STEPS, self._rate)
+        return replace(alone, problem=problem, best=fit, noise=noise)
 
     def at(self, at: float) -> FlankPlace:
         """The flank's place, with the motor at the load `at` (m or rad)."""
@@ -209,9 +200,9 @@ class OneFlank:
         """Largest difference between the flank's place and that of other fits that explain the window."""
         model, fits = found.problem.model, [fit.values for fit in self.likely]
         assert isinstance(model, FlankModel)
-        places = [float(values[OFFSET]) + model.from_flank(values) for values in fits]
+        places = [float(values[OFFSET]) + model.flank.less_offset(values) for values in fits]
         # A shaft that is always in contact, with other friction, moves alike.
-        without = self.fitted(model.at, 0.0).best
+        without = self._fitted(model.flank.at, found.noise, 0.0).best
         if without.cost - found.best.cost < RIVAL * found.best.variance():
             places.append(float(without.values[OFFSET]))
         return max((abs(place - float(found.best.values[OFFSET])) for place in places), default=0.0)
@@ -225,7 +216,10 @@ class OneFlank:
     @property
     def _softness(self) -> float:
         """From the motor to the last mass, m/N (rotary: rad per N m)."""
-        return 1.0 / self.axis.transmission.k_d + float(np.sum(1.0 / self.axis.load.stiffnesses[1:]))
+        model = self._model
+        if isinstance(model, ShaftModel):
+            return 1.0 / self.axis.transmission.k_d + float(np.sum(1.0 / self.axis.load.stiffnesses[1:]))
+        return model.moving.flexibility() if isinstance(model, HeldChainModel) else 0.0
 
     def _lead(self, found: Search, std: float) -> float:
         """Way of the motor off the flank at least, m or rad at the load, less what may wind up the shaft beyond."""
@@ -233,10 +227,19 @@ class OneFlank:
         assert isinstance(problem, Problem)
         assert isinstance(problem.model, FlankModel)
         motion = problem.motion(values, self._rate)
-        flank = float(values[OFFSET]) + math.exp(float(values[RATIO])) * (problem.drive - problem.model.at)
+        flank = float(values[OFFSET]) + math.exp(float(values[RATIO])) * (
+            problem.late_drive(values) - problem.model.flank.at
+        )
         load = self.axis.load
         wound_up = _WOUND_UP * self._softness * max(load.friction, load.static or 0.0)
         return max(0.0, float(np.max(self.side * (motion.driven - flank))) - wound_up - NORMAL_95 * std)
+
+
+def _side(problem: FitProblem, fit: Fit) -> float:
+    """The flank that the motor touches in most samples of a fit, as of `Flank`; 0: none."""
+    assert isinstance(problem, Problem)
+    rate = problem.model.slowing[-1] * problem.model.speed
+    return float(np.sign(np.sum(problem.motion(fit.values, rate).sides, dtype=int)))
 
 
 def _in(problem: Problem, found: Search) -> Search:

@@ -105,10 +105,13 @@ class HeldChainModel:
     axis : Axis
         With a transmission that is held in the gap.
     priors : Priors
+    friction : float, optional
+        As of `ShaftModel`.
     """
 
     axis: Axis
     priors: Priors
+    friction: float | None = None
 
     @cached_property
     def moving(self) -> MovingChain:
@@ -139,7 +142,8 @@ class HeldChainModel:
         if any(self.moving.c) or self.moving.c_d > 0.0:
             factors.append(Unknown(DAMPING, known.damping, "damping"))
         if load.friction > 0.0:
-            factors.append(Unknown(FRICTION, known.damping, "damping"))
+            unit = "damping" if self.friction is None else "factor"
+            factors.append(Unknown(FRICTION, self.friction or known.damping, unit))
         if load.force != 0.0:
             factors.append(Unknown(FORCE, known.stiffness, "factor"))
         if n > 1:

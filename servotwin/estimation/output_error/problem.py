@@ -91,12 +91,12 @@ class Problem:
 
         The motor's angle is delayed in place of the position: the load's motion begins with the first sample.
         """
-        return self.model.simulate(self._late_drive(values), self.position, self.interval, values, rate)
+        return self.model.simulate(self.late_drive(values), self.position, self.interval, values, rate)
 
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
         return self._less_measured(
-            self.model.position(self._late_drive(values), self.position, self.interval, values, rate)
+            self.model.position(self.late_drive(values), self.position, self.interval, values, rate)
         )
 
     def misfits(self, points: list[Array], rate: float = 0.0) -> list[Array]:
@@ -106,10 +106,10 @@ class Problem:
     def misfit_in_growing_gap(self, values: Array, sizes: Array) -> Array:
         """`misfit` (m,) of a model without dynamics whose gap has `sizes` (N,), shares of the one in the unknowns."""
         assert isinstance(self.model, PlayModel)
-        drive = self._late_drive(values)
+        drive = self.late_drive(values)
         return self._less_measured(self.model.position_in_growing_gap(drive, self.interval, values, sizes))
 
-    def _late_drive(self, values: Array) -> Array:
+    def late_drive(self, values: Array) -> Array:
         """Motor (N,) as late as the unknowns (u,) say; most derivatives move another unknown than the delay."""
         samples, known = float(values[DELAY]) / self.interval, self._late
         if samples not in known:

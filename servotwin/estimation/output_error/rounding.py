@@ -12,6 +12,7 @@ from servotwin.estimation.output_error.models import HALF
 from servotwin.plant.signals import Array
 
 _EVENLY = 1.0 / math.sqrt(12.0)  # standard deviation of a place anywhere in an interval, of its length
+_NOTHING, _ALIKE = 1e-10, 1e-6  # of the best shown direction: none; share of an unknown in directions of which none is
 
 
 def on_samples(found: Search, weights: Array) -> Array:
@@ -42,15 +43,18 @@ def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple
     size = np.linalg.norm(rows, axis=1)
     size[size == 0.0] = 1.0
     scaled = rows / size[:, None]
-    inverse = np.linalg.pinv(scaled @ scaled.T, rcond=1e-10, hermitian=True)
-    if not inverse[at, at] > 0.0:
+    values, vectors = np.linalg.eigh(scaled @ scaled.T)
+    shown = values > _NOTHING * values[-1]
+    # Of two unknowns that move these residuals alike neither is shown.
+    if float(np.sum(vectors[at, ~shown] ** 2)) > _ALIKE:
         return 0.0, math.inf, math.inf
-    weights = -(inverse[at] @ scaled) / size[at]
+    inverse = (vectors[at, shown] / values[shown]) @ vectors[:, shown].T
+    weights = -(inverse @ scaled) / size[at]
     white = np.zeros(data)
     seen = keep < data
     white[keep[seen]] = weights[seen]
     rounding = problem.count * _EVENLY * float(np.linalg.norm(per_count(found, white[None])))
-    std = math.sqrt(inverse[at, at] * fit.variance()) / size[at]
+    std = math.sqrt(inverse[at] * fit.variance()) / size[at]
     return float(weights @ fit.residual[keep]), std, rounding
 
 

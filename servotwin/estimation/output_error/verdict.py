@@ -21,6 +21,7 @@ from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
 from servotwin.estimation.output_error.unexplained import unexplained
+from servotwin.plant.signals import Array
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
@@ -139,7 +140,8 @@ def _single(found: Search, known: _KnownHalf) -> tuple[Fit, bool]:
 def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
     """Decide on a window that shows one flank, for a reason in words."""
     count = found.problem.count
-    bound = _BOUND * 2.0 * (smallest_half(found, single) - _hidden_friction(found, single)) - count
+    hidden = _hidden_friction(found, single) + float(np.max(_between_samples(found)))
+    bound = _BOUND * 2.0 * (smallest_half(found, single) - hidden) - count
     enough = bound > _BOUND_COUNTS * count
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
     return JudgedFit(status, 0.5 * bound if enough else math.nan, reasons=(words,))
@@ -266,17 +268,22 @@ def _of_jitter(times: TimeJitter, allowed: float, unit: float) -> str:
 
 def _hidden(found: Search, half: float) -> str:
     """Sentence for a motor that moves by a share of the gap between two samples, and the samples do not show how."""
-    problem = found.problem
-    if problem.model.speed == 0.0:
-        return ""
-    errors = _CUBIC * np.maximum(np.abs(np.diff(problem.drive, 4)) - _FOURTH * problem.count, 0.0)
-    error = float(np.sort(errors)[-_FEW])
+    error = float(np.sort(_between_samples(found))[-_FEW])
     if error <= _HIDDEN * half:
         return ""
     return (
         f"the motor turns so sharply between two samples that they leave its place open by "
         f"{100.0 * error / half:.0f} % of half the gap: a higher sample rate is needed"
     )
+
+
+def _between_samples(found: Search) -> Array:
+    """Errors (m or rad at the load) of the motor's place between samples; of a load without dynamics they do not count:
+    0."""
+    problem = found.problem
+    if problem.model.speed == 0.0:
+        return np.zeros(_FEW)
+    return np.asarray(_CUBIC * np.maximum(np.abs(np.diff(problem.drive, 4)) - _FOURTH * problem.count, 0.0))
 
 
 def _unknown_ratio(
