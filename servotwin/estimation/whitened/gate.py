@@ -15,8 +15,8 @@ from servotwin.estimation.core.contacts import Travel
 from servotwin.estimation.core.least_squares import spread
 from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
-from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
 from servotwin.estimation.whitened.doubt import way_doubt
+from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
 from servotwin.estimation.whitened.free_model import (
     COMPLIANCE,
     FREEDOM,
