@@ -22,6 +22,7 @@ from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
 from servotwin.estimation.linear_controller import (
     at_rate,
+    at_ticks,
     command_from_best_start,
     inputs_of,
     noise_in_command,
@@ -128,6 +129,7 @@ def compare_controller(window: Window, controller: AnyController, tolerance: flo
 
 def _compared_linear(window: Window, law: Cascade | LinearLaw, tolerance: float) -> ControllerComparison | None:
     """Compare as `compare_controller`, with a law that reads the motor's angle too."""
+    window = at_ticks(window, law)
     inputs, running, made = inputs_of(window), at_rate(law, window.sample_rate), None
     if inputs is None or running is None or window.voltage is None or len(inputs) < 2 * _FEWEST_BLOCKS + _DELAYS:
         return None

@@ -17,7 +17,7 @@ from servotwin.control import linear_tick
 from servotwin.control.cascade import Cascade
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearParameters, LinearState
-from servotwin.estimation.window import Window
+from servotwin.estimation.window import MINIMUM_SAMPLES, Window
 from servotwin.hybrid.compiled import compiled, verbatim
 from servotwin.plant.signals import Array
 
@@ -25,6 +25,7 @@ tick = verbatim(linear_tick.linear_tick)
 
 AT_LIMIT = 0.999  # of the limit
 _ROUNDS = 3  # fits of the first states: limits make the command nonlinear in them
+_TWICE, _NEAR = 2, 1e-3  # samples in a tick: fewest that count; of a whole number of them
 _DRAWS = 7  # seed of the noise whose effect on the command is computed
 
 
@@ -43,9 +44,32 @@ def at_rate(law: Cascade | LinearLaw, rate: float) -> LinearLaw | None:
     """The law as it runs at a rate (Hz); None for one that is stated in ticks of another rate."""
     if isinstance(law, Cascade):
         return law.replace(sample_rate=rate).linear()
-    if law.discrete and law.sample_rate != rate:
+    if law.discrete and law.sample_rate is not None and abs(rate / law.sample_rate - 1.0) > _NEAR:
         return None
-    return law.replace(sample_rate=rate)
+    return law if law.discrete else law.replace(sample_rate=rate)
+
+
+def at_ticks(window: Window, law: Cascade | LinearLaw) -> Window:
+    """The samples of a window at which a law of a slower rate gave its commands; the window, where there is none."""
+    if law.sample_rate is None or window.voltage is None:
+        return window
+    ratio = window.sample_rate / law.sample_rate
+    every = round(ratio)
+    if every < _TWICE or abs(ratio - every) > _NEAR * every or window.voltage.size < 2 * every * MINIMUM_SAMPLES:
+        return window
+    changes = np.flatnonzero(np.diff(window.voltage)) + 1
+    first = int(np.argmax(np.bincount(changes % every, minlength=every)))
+
+    def at(values: Array | None) -> Array | None:
+        return None if values is None else values[first::every]
+
+    return Window(
+        at(window.measured_position),
+        at(window.theta_m),
+        at(window.voltage),
+        at(window.reference),
+        sample_rate=window.sample_rate / every,
+    )
 
 
 def command_from_best_start(law: LinearLaw, tolerance: float, command: Array, inputs: Array) -> Array:

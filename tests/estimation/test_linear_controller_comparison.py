@@ -82,6 +82,15 @@ def test_a_command_that_is_recorded_two_samples_late_is_still_the_stated_laws():
     assert compare_controller(window.replace(voltage=late), LAW, 0.0).agrees
 
 
+def test_a_law_whose_ticks_are_slower_than_the_window_is_compared_at_its_ticks():
+    run = simulate(AXIS, 35.0, reference=SquareWave(0.1, 60.0), gap=0.02, sample_rate=4.0 * RATE)
+    window = Window.from_run(run, BEGIN + 1.0 / (4.0 * RATE), LENGTH)
+    for law in (LAW, LAW.linear()):
+        made = compare_controller(window, law, 0.0)
+        assert made.agrees
+        assert made.unexplained < 1e-6 * made.swing
+
+
 def test_a_law_in_ticks_of_another_rate_or_a_window_without_angle_is_not_compared():
     window = loop(LAW)
     other = LAW.replace(sample_rate=500.0).linear()
