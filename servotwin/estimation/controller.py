@@ -15,8 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from servotwin.control import law
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters, LawState
+from servotwin.control.laws import AnyController
+from servotwin.control.linear_law import LinearLaw
+from servotwin.estimation.linear_controller import (
+    at_rate,
+    at_ticks,
+    command_from_best_start,
+    inputs_of,
+    noise_in_command,
+    other_gains,
+)
 from servotwin.estimation.window import Window
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.compiled import compiled, verbatim
@@ -24,8 +35,10 @@ from servotwin.hybrid.compiled import compiled, verbatim
 tick = verbatim(law.tick)
 
 _BLOCKS = 250  # means of voltages that are compared: noise, delays and jitter of a few samples average out
+_FEWEST_BLOCKS = 100  # of two samples
 _TOLERATED = 0.1  # share of the voltage's swing: a discretisation or a rate that differs leaves less
 _ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, as volts, that are tolerated
+_NOISES = 2.0  # the same of noise as a linear law shows it in the means, from what it read and from what was recorded
 _LARGEST = 0.5  # share of the voltage's swing: a window whose noise needs more tolerance shows nothing
 _FILTERED = 5.0  # time constants of the loop filter after which the measurement before the window is forgotten
 _AT_LIMIT, _FEWEST = 0.999, 20  # of the limit; samples before the first one at the limit that show the initial state
@@ -78,13 +91,13 @@ class _Terms(NamedTuple):
     gains: dict[str, Array]
 
 
-def compare_controller(window: Window, controller: Controller, tolerance: float) -> ControllerComparison | None:
+def compare_controller(window: Window, controller: AnyController, tolerance: float) -> ControllerComparison | None:
     """Compare the voltage of a window with that of a controller at the window's rate.
 
     Parameters
     ----------
     window : Window
-    controller : Controller
+    controller : Controller, Cascade or LinearLaw
         As stated; it may be continuous.
     tolerance : float
         Half-width of its dead zone, m; 0: none.
@@ -97,6 +110,8 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
     """
     if window.voltage is None or window.reference is None:
         return None
+    if not isinstance(controller, Controller):
+        return _compared_linear(window, controller, tolerance)
     parameters = controller.replace(sample_rate=window.sample_rate).law(tolerance)
     if _largest(parameters, window.voltage, window.reference, window.position) > _VAST:
         return None
@@ -107,6 +122,33 @@ def compare_controller(window: Window, controller: Controller, tolerance: float)
         asked = made is None or not made.factors
         later = _compared(parameters, fading, voltage, window.reference[:rest], window.position[:rest], asked)
         if later is None or later.agrees:
+            return later
+        made = later if made is None or (later.factors and not made.factors) else made
+    return made
+
+
+def _compared_linear(window: Window, law: Cascade | LinearLaw, tolerance: float) -> ControllerComparison | None:
+    """Compare as `compare_controller`, with a law that reads the motor's angle too."""
+    window = at_ticks(window, law)
+    inputs, running, made = inputs_of(window), at_rate(law, window.sample_rate), None
+    if inputs is None or running is None or window.voltage is None or len(inputs) < 2 * _FEWEST_BLOCKS + _DELAYS:
+        return None
+    spreads = np.array([0.0, *(_noise(each) + _rounding(each) for each in inputs.T[1:])])
+    for delay in range(_DELAYS):
+        voltage, rest = window.voltage[delay:], inputs[: len(inputs) - delay]
+        means = _means(voltage, 0)
+        swing = _rms(means - means.mean())
+        noise = _rms(_means(noise_in_command(running, tolerance, rest, spreads), 0))
+        tolerated = _TOLERATED * swing + _ROUNDING * _rounding(voltage) + _NOISES * noise
+        if tolerated >= _LARGEST * swing:
+            return None
+        unexplained = _rms(_means(voltage - command_from_best_start(running, tolerance, voltage, rest), 0))
+        factors: dict[str, float] = {}
+        if unexplained > tolerated and (made is None or not made.factors):
+            fitting, left = other_gains(law, tolerance, voltage, rest, window.sample_rate)
+            factors = fitting if _rms(_means(left, 0)) <= tolerated else {}
+        later = ControllerComparison(unexplained, swing, tolerated, factors)
+        if later.agrees:
             return later
         made = later if made is None or (later.factors and not made.factors) else made
     return made
@@ -128,7 +170,7 @@ def _compared(
         False: the factors are not computed.
     """
     first = _forgotten(parameters)
-    if position.size - first < 2 * _BLOCKS:
+    if position.size - first < 2 * _FEWEST_BLOCKS:
         return None
     given = _voltage_from_best_start(parameters, fading, voltage, reference, position)
     means = _means(voltage, first)
@@ -318,8 +360,9 @@ def _forgotten(parameters: LawParameters) -> int:
 
 def _means(values: Array, first: int) -> Array:
     """Means over equal blocks from a sample on."""
-    length = (values.size - first) // _BLOCKS
-    return values[first : first + _BLOCKS * length].reshape(_BLOCKS, length).mean(axis=1)
+    length = max(2, (values.size - first) // _BLOCKS)
+    count = min(_BLOCKS, (values.size - first) // length)
+    return values[first : first + count * length].reshape(count, length).mean(axis=1)
 
 
 def _rounding(values: Array) -> float:

@@ -10,8 +10,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from servotwin import messages
-from servotwin.control.controller import Controller
 from servotwin.control.gains import with_gains
+from servotwin.control.laws import AnyController
 from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side, output_error, whitened
 from servotwin.estimation.axis_model import servo_for
@@ -258,7 +258,9 @@ class DecodedWindow(NamedTuple):
                 problem = str(error)
         return nothing_known(math.nan, problem)
 
-    def compare_controller(self, controller: Controller | None, stated: Setting | None) -> ControllerComparison | None:
+    def compare_controller(
+        self, controller: AnyController | None, stated: Setting | None
+    ) -> ControllerComparison | None:
         """Compare the voltage with that of a servo's controller with the gains and the dead zone stated for the window.
 
         None: one of the two is not known, or the window does not tell.

@@ -7,7 +7,7 @@ from functools import partial
 
 from msgspec.structs import replace
 
-from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController
 from servotwin.estimation.disturbance import disturbance
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Wear
@@ -50,7 +50,7 @@ class TwinModel:
         Learns the motor's numbers; None: the model's are taken as they are.
     responses : Responses, optional
         Sends the learnt structure to edges that can use it.
-    controller : Controller, optional
+    controller : Controller, Cascade or LinearLaw, optional
         The servo's, with which windows are compared; None: they are not.
     """
 
@@ -64,7 +64,7 @@ class TwinModel:
     lookups: Lookups | None = None
     motor: MotorLearning | None = None
     responses: Responses | None = None
-    controller: Controller | None = None
+    controller: AnyController | None = None
 
     @classmethod
     def of(
@@ -97,7 +97,7 @@ class TwinModel:
             triage=Triage.of(servo, settings.triage),
             responses=Responses.of(servo, settings),
             lookups=Lookups(chosen) if isinstance(chosen, TablePolicy) else None,
-            controller=servo.controller if isinstance(servo.controller, Controller) else None,
+            controller=servo.controller,
         )
 
     def initial_state(self, servo: str) -> TwinState:

@@ -145,6 +145,18 @@ def test_scales_do_not_matter():
     assert small.unexplained / small.swing == pytest.approx(usual.unexplained / usual.swing, rel=1e-6)
 
 
+def test_a_window_of_few_samples_tells_another_controller_too():
+    """Those of the ball screw have 400."""
+    window = by_hand(LAW, 0.0)
+    short = Window(
+        window.position[:400], voltage=window.voltage[:400], reference=window.reference[:400], sample_rate=2000.0
+    )
+    assert compare_controller(short, LAW, 0.0).agrees
+    made = compare_controller(short, LAW.replace(Kp=4.0 * LAW.Kp, Kd=4.0 * LAW.Kd), 0.0)
+    assert not made.agrees
+    assert "not that of the stated controller" in made.sentence
+
+
 def test_a_window_that_shows_nothing_gives_no_verdict():
     window = by_hand(LAW, 0.0)
     noise = np.random.default_rng(3).normal(0.0, 1e-3, window.position.size)
@@ -153,7 +165,7 @@ def test_a_window_that_shows_nothing_gives_no_verdict():
     assert compare_controller(still, LAW, 0.0) is None
     assert compare_controller(Window(window.position, sample_rate=2000.0), LAW, 0.0) is None
     short = Window(
-        window.position[:400], voltage=window.voltage[:400], reference=window.reference[:400], sample_rate=2000.0
+        window.position[:190], voltage=window.voltage[:190], reference=window.reference[:190], sample_rate=2000.0
     )
     assert compare_controller(short, LAW, 0.0) is None
 

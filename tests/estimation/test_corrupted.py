@@ -1,6 +1,7 @@
 """Estimates from windows of machines and sensors that are not as assumed; the whole sweep is `bench windows`."""
 
 import math
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from exploration import extent
 
 from benchmarks import windows as bench
 from benchmarks.corrupted import KINDS, corrupted_windows
+from servotwin.estimation import whitened
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.reduced import reduced_response
 from servotwin.estimation.core.response import response
@@ -15,6 +17,7 @@ from servotwin.estimation.core.variants import variants
 from servotwin.estimation.core.whitening import burg
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
+from servotwin.estimation.learning.machine import LearningSettings, nameplate
 from servotwin.estimation.whitened.channels import faults
 from servotwin.estimation.whitened.nearby import Neighbour, motions
 from servotwin.estimation.window import Window
@@ -35,6 +38,19 @@ def test_no_corrupted_window_gives_a_confident_wrong_gap(view):
     clean = tallies["clean"]
     assert clean.two_contacts > 0
     assert clean.accepted == clean.two_contacts if view == bench.EXACT else clean.accepted > 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "place", "least_deg"), [("position cyclic 5 um", 10, 2.0), ("position drifts", 17, 20.0)]
+)
+def test_a_bound_contains_what_sensors_that_are_not_as_assumed_do_to_the_way_to_one_contact(kind, place, least_deg):
+    """The first windows of machines that are not known; the bounds were 1.0 and 1.1 deg above the gap."""
+    *_, case = islice(corrupted_windows(kind, place + 1, 30130202), place + 1)
+    machine = nameplate(LearningSettings(), 0.15, 0.5, 0.1)
+    settings = whitened.WhitenedSettings(gap_rate=bench.RATE)
+    made = whitened.fit(case.window, case.servo, None, settings, machine).concluded()
+    assert made.status is GapStatus.LOWER_BOUND
+    assert math.radians(least_deg) < made.gap < case.gap
 
 
 def softened(servo, compliance, angles):

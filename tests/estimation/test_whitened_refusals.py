@@ -229,7 +229,7 @@ def test_bounds_are_below_the_gap():
     """Calm loops show one contact: what they say of the gap is a bound, and never more than the gap."""
     found = [(estimate_gap(window, SERVO), gap) for window, gap in one_contact()]
     bounds = [(estimate.gap, gap) for estimate, gap in found if estimate.status is GapStatus.LOWER_BOUND]
-    assert len(bounds) >= 8  # of 36; without noise the processor's rounding decides on one or two
+    assert len(bounds) >= 6  # of 36; without noise the processor's rounding decides on one or two
     assert all(bound <= gap for bound, gap in bounds), bounds
 
 

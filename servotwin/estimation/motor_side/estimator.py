@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.errors import InvalidInput
+from servotwin.estimation.core.upsampling import upsampled
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapEstimate, GapStatus, interval_95, no_estimate
 from servotwin.estimation.motor_side.held_motion import HeldShaft
@@ -109,6 +110,8 @@ def estimate(
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     if float(np.ptp(theta_m)) == 0.0:
         return replace(blank, reasons=("theta_m is constant: nothing moved, or the sensor is dead",))
+    if slow := upsampled({"theta_m": theta_m}, window.sample_rate):
+        return replace(blank, status=GapStatus.MODEL_MISMATCH, reasons=slow)
     unit = 2.0 / axis.p
     found = fit(window, axis, prior, settings)
     verdict = judge(found, settings, unit)

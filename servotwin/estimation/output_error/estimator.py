@@ -15,6 +15,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.motor_angle import MotorAngle, without_noise
+from servotwin.estimation.core.upsampling import upsampled
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
 from servotwin.estimation.output_error.fit import Search
@@ -36,6 +37,7 @@ from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.channels import corrected, faults, other_units, refused
 from servotwin.estimation.whitened.free_model import FactorPrior
 from servotwin.estimation.window import Window
+from servotwin.plant.actuator import Stepper
 from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
 from servotwin.plant.basis import BacklashKind
@@ -193,9 +195,13 @@ def _beside_what_was_learnt(
 
 
 def _broken(window: Window, axis: Axis) -> tuple[str, ...]:
-    """Faults of the channels; of a load that is the screw dead ones only: that stops as abruptly as they do."""
-    sentences = faults(window, axis.load.motion)
-    found = tuple(sentence for sentence in sentences if "constant" in sentence) if follows(axis) else sentences
+    """Faults of the channels; a load that is the screw stops as abruptly as they do: only dead and slow ones count."""
+    found = faults(window, axis.load.motion)
+    if follows(axis):
+        dead = tuple(sentence for sentence in found if "constant" in sentence)
+        # The counter of a stepper's steps changes with its command.
+        measured = ("position",) if isinstance(axis.actuator, Stepper) else ("theta_m", "position")
+        found = dead or upsampled({name: window.channels[name] for name in measured}, window.sample_rate)
     return found or other_units(window, axis.encoder_resolution, axis.sensors.position_resolution)
 
 

@@ -14,6 +14,7 @@ from servotwin.estimation.core.decimation import decimation
 from servotwin.estimation.core.least_squares import least_squares
 from servotwin.estimation.core.motor_angle import without_noise
 from servotwin.estimation.core.response import response
+from servotwin.estimation.core.upsampling import upsampled
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.paper.zero_phase import ZeroPhase
@@ -52,7 +53,8 @@ def faults(window: Window, motion: str = LINEAR) -> tuple[str, ...]:
     units = {"theta_m": degrees, "position": (1e3, "mm") if motion == LINEAR else degrees}
     channels = {name: (window.channels[name], *unit) for name, unit in units.items()}
     sentences = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
-    found = tuple(sentence for sentence in sentences if sentence)
+    slow = upsampled({name: window.channels[name] for name in channels}, window.sample_rate)
+    found = slow or tuple(sentence for sentence in sentences if sentence)
     return found or _slip(window.theta_m, window.position, *units["position"])
 
 
@@ -140,7 +142,7 @@ def _repeating(name: str, steps: Array) -> str:
     What comes to rest slows down, and what starts is no faster in its first sample than in the next ones, as a motor
     that friction held until its voltage stepped. A channel that stands still with the next sample, or leaves with a
     leap, was held: samples are missing. A count more or less is no motion, and a channel that is
-    recorded more often than measured repeats most values: nothing is said of it.
+    recorded more often than measured repeats most values: `upsampled` speaks of it.
     """
     begins, ends = _runs(steps == 0.0)
     long = ends - begins >= _REPEATED - 1

@@ -52,9 +52,11 @@ def gap_doubt(problem: FreeProblem, at: Array, variance: float, delay: float, ra
 def way_doubt(problem: FreeProblem, at: Array, variance: float, delay: float, ramp: float) -> float:
     """The same of the motor's way to the only contact of a window, in a gap so wide that it has no other.
 
-    Gap and place act alike there, through this way.
+    Gap and place act alike there, through this way; 0 where the motor is in contact from the first sample on.
     """
     residual, rows = _explained(problem, delay, ramp).rows(at, keep=True)
+    if not np.any(rows[_PLACE]):
+        return 0.0
     rows[_PLACE] /= 0.5 * at[0]
     known = 1 + len(FREEDOM)
     return spread_over(residual, rows[_PLACE:], known, _groups(known, delay, ramp), variance)

@@ -229,7 +229,8 @@ class WindowFit:
         """State a lower bound: one contact explains the window too, and then the gap is as wide as the motor's lead."""
         bound = lower_bound(evidence, self.settings) if sure_of_contact(evidence, self.settings) else 0.0
         if bound >= evidence.smallest:  # the lead, which costs far more, can only lower it
-            bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings))
+            ramp = fastest(evidence.aligned.whitened.reduction, self.second)
+            bound = min(bound, least_lead(evidence, contacts, self.servo, self.settings, ramp))
         return self._bounded(bound, reasons)
 
     def _bounded(self, bound: float, reasons: tuple[str, ...]) -> GapEstimate:

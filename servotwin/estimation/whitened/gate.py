@@ -15,6 +15,7 @@ from servotwin.estimation.core.contacts import Travel
 from servotwin.estimation.core.least_squares import spread
 from servotwin.estimation.core.visible import least_travel
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, Interval
+from servotwin.estimation.whitened.doubt import way_doubt
 from servotwin.estimation.whitened.fit import AlignedFit, WhitenedFit
 from servotwin.estimation.whitened.free_model import (
     COMPLIANCE,
@@ -247,12 +248,18 @@ def with_free_model(aligned: AlignedFit, servo: Servo) -> FreeProblem:
     return FreeProblem(result.reduction, result.noise, servo, usual, aligned.largest, COMPLIANCE)
 
 
-def least_lead(evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings) -> float:
-    """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error."""
-    problem = with_free_model(evidence.aligned, servo)
-    leads = possible_leads(problem, contacts.single, contacts.variance)
+def least_lead(
+    evidence: FitEvidence, contacts: ContactEvidence, servo: Servo, settings: WhitenedSettings, ramp: float
+) -> float:
+    """Lead (rad) of the motor that a window of one contact shows at least, with the model's usual error.
+
+    Other machines and sensors, and a gap that grows by `ramp` (rad/s), may move it as far as the window tells.
+    """
+    problem, single, variance = with_free_model(evidence.aligned, servo), contacts.single, contacts.variance
+    leads = possible_leads(problem, single, variance)
     sigmas = NORMAL_95 * evidence.caution
-    return min(lead.least(sigmas, settings.model_error) for lead in leads) - evidence.counts
+    doubt = way_doubt(problem, np.array([*single.point, *single.factors]), variance, evidence.aligned.delay, ramp)
+    return min(lead.least(sigmas, math.hypot(settings.model_error, doubt)) for lead in leads) - evidence.counts
 
 
 def lower_bound(evidence: FitEvidence, settings: WhitenedSettings) -> float:
