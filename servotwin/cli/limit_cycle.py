@@ -99,6 +99,7 @@ def as_dict(computed: Findings, unit: DisplayUnit = MILLIMETRES) -> dict[str, An
     return {
         "status": computed.result.status.value,
         "reason": computed.result.reason,
+        "settling_s": computed.result.settling,
         "orbit": _orbit(computed.result.orbit, unit),
         "describing_function": [
             {
