@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.control.controller import Controller
-from servotwin.control.retuning import static_gain
+from servotwin.control.retuning import check_zone_acts, static_gain
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
 from servotwin.plant.plants import Plant, check_gap_in_loop, check_homogeneous
@@ -120,8 +120,7 @@ def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
     _check_zone(servo, "margin")
     if not isinstance(servo.controller, Controller):
         raise InvalidInput(
-            "policy 'margin' reads its dead zone from a map, and maps are computed with the filtered PID: give another "
-            "policy"
+            "policy 'margin' designs for the filtered PID only, and this controller is another: give another policy"
         )
     if servo.pidf.voltage_limit is not None:
         raise InvalidInput(
@@ -147,7 +146,8 @@ def _paper(servo: Plant, options: PolicyOptions) -> PaperPolicy:
 
 
 def _check_zone(servo: Plant, policy: str) -> None:
-    """Refuse a dead zone whose command of zero moves the motor: a stepper goes to its angle zero."""
+    """Refuse a dead zone that changes nothing, or whose command of zero moves a stepper: it goes to its angle zero."""
+    check_zone_acts(servo.controller, f"policy {policy!r}: the dead zone that it sets")
     if holds_position(servo) and not servo.controller.integral_only:
         raise InvalidInput(
             f"policy {policy!r}: inside its dead zone the command is zero, and this axis's stepper would go to the "

@@ -57,6 +57,14 @@ def test_no_describing_function_is_said(axis: st.Axis, words: str) -> None:
         predictions(axis, 0.1)
 
 
+def test_a_dead_zone_without_anything_to_stop_is_refused() -> None:
+    axis = VELOCITY.replace(controller=st.Cascade(1.0, 1e-3 / math.pi))
+    for compute in (lambda: st.stability_map(axis, tolerance=(0.3, 1.2)), lambda: st.limit_cycle(axis, 0.2, 1e-5)):
+        with pytest.raises(InvalidInput, match="dead zone changes nothing: .*give integral_only = false"):
+            compute()
+    assert st.stability_map(axis, tolerance=(0.0,), members=2).grid("settled").all()
+
+
 def test_a_stage_that_goes_where_it_is_told_settles() -> None:
     axis = st.Axis.preset("stepper-stage").replace(sample_rate=None)
     assert st.limit_cycle(axis, 0.01, step=1e-4).status is CycleStatus.SETTLES

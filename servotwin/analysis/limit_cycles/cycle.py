@@ -21,6 +21,7 @@ from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section
 from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
 from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
+from servotwin.control.retuning import check_zone_acts
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
@@ -118,7 +119,10 @@ def limit_cycle(
     if not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
     loop = scaled_loop(servo, gap, tolerance, controller, step)
-    law = law_of(servo.controller if controller is None else controller)
+    own = servo.controller if controller is None else controller
+    law = law_of(own)
+    if tolerance:
+        check_zone_acts(own, "tolerance: the dead zone")
     limit = law.voltage_limit
     if gap == 0.0 and not tolerance and limit is None and servo.command_limit is None:
         return _linear(servo, law)
