@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.control.controller import Controller
+from servotwin.control.laws import kind_of
 from servotwin.control.retuning import check_zone_acts, static_gain
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
@@ -102,13 +103,27 @@ def check_verifiable(servo: Plant) -> None:
         )
 
 
+def check_tabled(servo: Plant, named: str) -> None:
+    """Refuse a table for a controller whose settings no table holds; the sentence opens with what is `named`.
+
+    Raises
+    ------
+    InvalidInput
+        The controller is no filtered PID.
+    """
+    if not isinstance(servo.controller, Controller):
+        raise InvalidInput(
+            f"{named}: tables hold settings of a filtered PID, and this controller is a {kind_of(servo.controller)} "
+            "one; leave the table out: the twin verifies each setting before it sends it"
+        )
+
+
 def _certified(servo: Plant, options: PolicyOptions) -> Policy:
     """Make the policy that verifies before every update or, with a table, looks settings up."""
     policy = certified_policy(servo, options)
-    if options.table is not None and not isinstance(servo.controller, Controller):
-        raise InvalidInput(f"table = {options.table!r}: tables hold settings of a filtered PID; leave the table out")
     if options.table is None:
         return policy
+    check_tabled(servo, f"table = {options.table!r}")
     try:
         return TablePolicy(policy, load(Path(options.table), policy))
     except InvalidInput as error:
