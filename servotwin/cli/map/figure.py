@@ -24,8 +24,8 @@ from servotwin.report import style
 from servotwin.runtime import files
 
 _LABELS = {
-    "gap": ("gap (deg)", math.degrees(1.0)),
-    "estimate": ("estimated gap (deg)", math.degrees(1.0)),
+    "gap": ("gap (deg at the motor)", math.degrees(1.0)),
+    "estimate": ("estimated gap (deg at the motor)", math.degrees(1.0)),
     "k_dz": ("$k_{DZ}$", 1.0),
 }
 _RATIO_LABELS = {"tolerance": ("tolerance / (p b)", 1.0), "amplitude": ("reference step / (p b)", 1.0)}
