@@ -98,7 +98,9 @@ def map_(
         str | None, typer.Option(help="Dead zone / (p b), with half gap b: LOW:HIGH:COUNT[:log] or VALUE,VALUE,...")
     ] = None,
     amplitude: Annotated[str | None, typer.Option(help="Reference step / (p b), in the same form.")] = None,
-    gap_deg: Annotated[str | None, typer.Option(help="Instead of --tolerance and --amplitude: total gap at the motor, deg.")] = None,
+    gap_deg: Annotated[
+        str | None, typer.Option(help="Instead of --tolerance and --amplitude: total gap at the motor, deg.")
+    ] = None,
     estimate_deg: Annotated[
         str | None, typer.Option(help="With --gap-deg: estimate of the gap, deg; by default the true gap.")
     ] = None,

@@ -70,7 +70,13 @@ def show(
     given = dates_of(dates, len(logs))
     answers = []
     asked = partial(
-        _answered, columns=columns, machine=machine, stiff=stiff, dynamics=dynamics, travel=travel, read_by_people=not as_json
+        _answered,
+        columns=columns,
+        machine=machine,
+        stiff=stiff,
+        dynamics=dynamics,
+        travel=travel,
+        read_by_people=not as_json,
     )
     for path in logs:
         with console.status(path.name) as status:

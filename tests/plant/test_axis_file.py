@@ -86,7 +86,11 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
             "stiffness_n_m_per_rad = 5e7",
             r"unknown key 'transmission.stiffness_n_m_per_rad'.*allows .*stiffness_n_per_m",
         ),
-        ('in_gap = "free"', 'in_gap = "held"', r"damping_n_s_per_m = 6000.0 N s/m: only with in_gap = \"free\""),
+        (
+            "stiffness_n_per_m = 50000000.0\ndamping_n_s_per_m = 6000.0\nin_gap = \"free\"",
+            "damping_n_s_per_m = 6000.0",
+            r"damping_n_s_per_m = 6000.0 N s/m: needs a finite stiffness_n_per_m, beside which it damps",
+        ),
         (
             "mass_kg = [20.0]\nstiffness_n_per_m = [0.0]\ndamping_n_s_per_m = [100.0]",
             "mass_kg = [20.0, 3.0]\nstiffness_n_per_m = [0.0, 0.0]\ndamping_n_s_per_m = [100.0, 0.0]",
