@@ -58,7 +58,7 @@ class Transmission:
             )
         if self.c_d > 0.0 and self.rigid:
             raise InvalidInput(
-                f"transmission damping (c_d) = {self.c_d!r}: needs a finite stiffness k_d; a rigid transmission has none"
+                f"transmission damping (c_d) = {self.c_d!r}: needs a finite k_d; a rigid transmission has none"
             )
 
     @property

@@ -60,7 +60,7 @@ def test_no_describing_function_is_said(axis: st.Axis, words: str) -> None:
 def test_a_dead_zone_without_anything_to_stop_is_refused() -> None:
     axis = VELOCITY.replace(controller=st.Cascade(1.0, 1e-3 / math.pi))
     for compute in (lambda: st.stability_map(axis, tolerance=(0.3, 1.2)), lambda: st.limit_cycle(axis, 0.2, 1e-5)):
-        with pytest.raises(InvalidInput, match="dead zone changes nothing: .*give integral_only = false"):
+        with pytest.raises(InvalidInput, match=r"dead zone changes nothing: .*give integral_only = false"):
             compute()
     assert st.stability_map(axis, tolerance=(0.0,), members=2).grid("settled").all()
 

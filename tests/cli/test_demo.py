@@ -21,7 +21,9 @@ def shown(tmp_path_factory):
 
 
 def test_another_machine_is_sent_to_the_command_that_shows_it(tmp_path):
-    with pytest.raises(InvalidInput, match="--preset 'gantry': the demo is of the paper's servo: .*servotwin simulate"):
+    with pytest.raises(
+        InvalidInput, match=r"--preset 'gantry': the demo is of the paper's servo: .*servotwin simulate"
+    ):
         demo.demo(tmp_path / "out", "gantry")
     assert not (tmp_path / "out").exists()
 

@@ -53,7 +53,7 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
         ("mass_kg = [20.0]", "mass_kg = [1e-300]", r"cannot be computed; farthest from 1 is load.mass_kg = 1e-300"),
         ("stiffness_n_per_m = 50000000.0", "stiffness_n_per_m = 1e300", "transmission.stiffness_n_per_m = 1e[+]300"),
         ("sample_rate_hz = 2000.0", "sample_rate_hz = 1e-300", "controller.sample_rate_hz = 1e-300: check its unit"),
-        ("pitch_m_per_rad", "pitch_mm_per_rad", "'transmission.pitch_m_per_rad' or 'transmission.lead_mm_per_rev' is missing"),
+        ("pitch_m_per_rad", "pitch_mm_per_rad", "pitch_m_per_rad' or 'transmission.lead_mm_per_rev' is missing"),
         ("mass_kg = [20.0]", "mass_kg = [20.0, 0.0]", r"load.mass_kg\[1\] = 0.0 is not allowed"),
         ("mass_kg = ", "inertia_kg_m2 = ", r"load.inertia_kg_m2 = \[20.0\]: this load is linear; give load.mass_kg"),
         ("pitch_m_per_rad = ", "lead_mm_per_rev = 5.0\npitch_m_per_rad = ", "give only one of them"),

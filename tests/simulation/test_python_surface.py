@@ -84,7 +84,7 @@ def test_a_run_and_a_window_plot_themselves(run):
     assert [ax.get_ylabel() for ax in figure.axes] == [
         "position, mm",
         "error, mm",
-        "total gap at the motor, deg",
+        "gap at the motor, deg",
         "voltage, V",
     ]
     assert np.array_equal(figure.axes[0].lines[1].get_ydata(), 1e3 * run.position)

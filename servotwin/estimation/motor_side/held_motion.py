@@ -1,6 +1,7 @@
 """Motion of a motor and a load behind an elastic screw that the gap holds, under the motor's command.
 
-In contact the screw's spring and damper act back on the motor; in the gap, and while the motor rests, the screw carries the load.
+In contact the screw's spring and damper act back on the motor; in the gap, and while the motor rests, the screw
+carries the load.
 """
 
 from __future__ import annotations
