@@ -70,7 +70,10 @@ class Units(NamedTuple):
 
     def of_command(self, value: float) -> str:
         """A small command with its unit."""
-        return f"{value * 1e3:.1f} mV" if self.command == "V" else f"{value:.4g} {self.command}".rstrip()
+        # A zero has no sign here.
+        if self.command == "V":
+            return f"{round(value * 1e3, 1) + 0.0:.1f} mV"
+        return f"{value + 0.0:.4g} {self.command}".rstrip()
 
 
 def lines_of(

@@ -33,7 +33,7 @@ from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.lookup import CertifiedTable, Grid
 from servotwin.redesign.certified.lookup_file import SUFFIX, build, load
 from servotwin.redesign.certified.policy import CertifiedPolicy
-from servotwin.redesign.registry import certified_policy
+from servotwin.redesign.registry import certified_policy, check_tabled
 from servotwin.twin.model_registry import models_of
 from servotwin.twin.settings import TwinSettings
 
@@ -177,7 +177,9 @@ def _models(table: Table, file: Path) -> dict[str, tuple[Plant, TwinSettings]]:
 def _table_job(name: str, servo: Plant, settings: TwinSettings, out: Path | None) -> _TableJob:
     if settings.policy != "certified":
         raise InvalidInput(f"model {name!r}: policy {settings.policy!r} verifies nothing; only 'certified' does")
-    return _TableJob(name, certified_policy(servo, settings), out or Path(settings.table or ""))
+    path = out or Path(settings.table or "")
+    check_tabled(servo, f"{path}: model {name!r}")
+    return _TableJob(name, certified_policy(servo, settings), path)
 
 
 def _verify(job: _TableJob, grid: Grid, console: Console) -> CertifiedTable:

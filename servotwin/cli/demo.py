@@ -14,7 +14,9 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 import servotwin as st
+from servotwin.errors import InvalidInput
 from servotwin.messages import Update
+from servotwin.plant.servo import PRESETS
 from servotwin.report import style
 from servotwin.report.page import page
 from servotwin.reproduction.figures import wear_panels
@@ -88,6 +90,11 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None) -> Pa
 
 def scenarios(preset: str) -> tuple[st.Scenario, st.Scenario]:
     """The same machine with the twin as published and with the certified one."""
+    if preset not in PRESETS:
+        raise InvalidInput(
+            f"--preset {preset!r}: the demo is of the paper's servo: give one of {', '.join(PRESETS)}; another machine "
+            "is shown by servotwin simulate SCENARIO --figure run.png, or alone by enabled = false in its [twin]"
+        )
     published = TwinJob(preset).scenario_to_run().replace(input_bias=BIAS)
     certified = st.Scenario.preset("certified").with_servo(published.servo)
     return published, certified.replace(input_bias=BIAS)

@@ -34,7 +34,7 @@ _Servo = Annotated[str, typer.Argument(help="A preset's name, or the TOML of a s
 
 def limit_cycle(
     servo: _Servo = "paper",
-    gap_deg: Annotated[float, typer.Option(help="Total gap, deg.")] = 10.0,
+    gap_deg: Annotated[float, typer.Option(help="Total gap at the motor, deg.")] = 10.0,
     tolerance_mm: Annotated[
         float | None, typer.Option(help="Half-width of the dead zone, mm; none by default.")
     ] = None,
@@ -98,7 +98,9 @@ def map_(
         str | None, typer.Option(help="Dead zone / (p b), with half gap b: LOW:HIGH:COUNT[:log] or VALUE,VALUE,...")
     ] = None,
     amplitude: Annotated[str | None, typer.Option(help="Reference step / (p b), in the same form.")] = None,
-    gap_deg: Annotated[str | None, typer.Option(help="Instead of --tolerance and --amplitude: total gap, deg.")] = None,
+    gap_deg: Annotated[
+        str | None, typer.Option(help="Instead of --tolerance and --amplitude: total gap at the motor, deg.")
+    ] = None,
     estimate_deg: Annotated[
         str | None, typer.Option(help="With --gap-deg: estimate of the gap, deg; by default the true gap.")
     ] = None,

@@ -17,7 +17,7 @@ from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.analysis.limit_cycles.shaft import Prediction
 from servotwin.cli.own_options import own_option
 from servotwin.errors import InvalidInput
-from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, position_unit
+from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, gap_in_words, position_unit
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant, resolve_plant
 from servotwin.plant.signals import turn_in_words
@@ -88,8 +88,9 @@ def print_limit_cycle(
         return
     console = Console()
     console.print(
-        f"{name}: total gap {gap_deg:g} deg, {_dead_zone(tolerance_shown, unit)}, after a step of "
-        f"{step_shown:g} {unit.name}"
+        f"{name}: total gap {gap_in_words(servo, math.radians(gap_deg))}, {_dead_zone(tolerance_shown, unit)}, after a "
+        f"step of {step_shown:g} {unit.name}",
+        highlight=False,
     )
     _print(console, computed, unit)
 
@@ -99,6 +100,7 @@ def as_dict(computed: Findings, unit: DisplayUnit = MILLIMETRES) -> dict[str, An
     return {
         "status": computed.result.status.value,
         "reason": computed.result.reason,
+        "settling_s": computed.result.settling,
         "orbit": _orbit(computed.result.orbit, unit),
         "describing_function": [
             {

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from servotwin.cosim import Loop
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.plant.display_units import position_unit
+from servotwin.plant.display_units import gap_in_words, position_unit
 from servotwin.simulation import Run
 
 _ENDS, _RESTS, _COUNTS = 0.1, 0.01, 2.0
@@ -81,7 +81,8 @@ def _of_estimates(loop: Loop) -> Iterator[str]:
     if accepted:
         off = max(abs(each.gap - true_gap(loop, each)) for each in accepted)
         inside = sum(each.interval[0] <= true_gap(loop, each) <= each.interval[1] for each in accepted)
-        line += f", off by at most {math.degrees(off):.3g} deg; the gap lies in {inside} of {len(accepted)} intervals"
+        words = gap_in_words(loop.scenario.servo, off, ".3g")
+        line += f", off by at most {words}; the gap lies in {inside} of {len(accepted)} intervals"
     yield line
     others = [each for each in loop.estimates if not each.ok]
     for status, count in Counter(each.status for each in others).items():

@@ -22,9 +22,11 @@ from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
 from servotwin.estimation.kinematic.growth import LEAST, GapGrowth, growth
 from servotwin.estimation.kinematic.lost_motion import LostMotion, estimate_lost_motion
+from servotwin.estimation.kinematic.recording import EncoderRecording
 from servotwin.estimation.kinematic.travel import StatedTravel, in_stated_unit
 from servotwin.estimation.kinematic.wind_up import TransmissionGap
 from servotwin.logs.recordings import RecordedLog, RecordingColumns, read_recording
+from servotwin.plant.display_units import DEGREES, MILLIMETRES
 from servotwin.plant.plants import Plant, resolve_plant
 
 _Answer = tuple[RecordedLog, TransmissionGap]
@@ -67,7 +69,15 @@ def show(
     machine = None if axis is None else resolve_plant(axis)
     given = dates_of(dates, len(logs))
     answers = []
-    asked = partial(_answered, columns=columns, machine=machine, stiff=stiff, dynamics=dynamics, travel=travel)
+    asked = partial(
+        _answered,
+        columns=columns,
+        machine=machine,
+        stiff=stiff,
+        dynamics=dynamics,
+        travel=travel,
+        read_by_people=not as_json,
+    )
     for path in logs:
         with console.status(path.name) as status:
             answers.append(asked(path, partial(_tell, status, path.name)))
@@ -98,15 +108,37 @@ def _answered(
     stiff: bool,
     dynamics: bool,
     travel: StatedTravel | None,
+    read_by_people: bool,
 ) -> _Answer:
-    """Read a log and estimate its gap."""
+    """Read a log and estimate its gap, in units for people or in the log's own."""
     log = read_recording(path, columns, partial(_tell_samples, tell))
+    if read_by_people:
+        log = replace(log, recording=_in_shown_units(log.recording))
     tell("models")
     recording, lost = log.recording, estimate_lost_motion(log.recording)
     if travel is not None:
         recording, lost = in_stated_unit(recording, lost, travel)
         log = replace(log, recording=recording)
     return log, gap_of_recording(recording, lost, machine, stiff=stiff, dynamics=dynamics, tell=tell)
+
+
+def _in_shown_units(recording: EncoderRecording) -> EncoderRecording:
+    """The recording with metres in mm, and both ends of a rotary axis in degrees."""
+    shown = {"m": MILLIMETRES, "rad": DEGREES} if recording.load_unit == "rad" else {"m": MILLIMETRES}
+    for end in ("motor", "load"):
+        unit = shown.get(getattr(recording, f"{end}_unit"))
+        if unit is None:
+            continue
+        count = getattr(recording, f"{end}_count")
+        recording = replace(
+            recording,
+            **{
+                end: unit.factor * getattr(recording, end),
+                f"{end}_unit": unit.name,
+                f"{end}_count": None if count is None else unit.factor * count,
+            },
+        )
+    return recording
 
 
 def dates_of(text: str | None, logs: int) -> list[float | None]:

@@ -250,9 +250,11 @@ class Table:
         """The key's dotted path inside its file."""
         return f"{self.name}.{key}" if self.name else key
 
-    def missing(self, key: str, table: bool = False) -> InvalidInput:
-        """The error for a key or a table that must be there; to be raised by the caller."""
-        what = f"table [{self.path(key)}]" if table else f"key '{self.path(key)}'"
+    def missing(self, key: str, *others: str, table: bool = False) -> InvalidInput:
+        """The error for a key (or one of others in its place) or a table that must be there; to be raised by the
+        caller."""
+        alike = "".join(f" or '{self.path(other)}'" for other in others)
+        what = f"table [{self.path(key)}]" if table else f"key '{self.path(key)}'{alike}"
         return InvalidInput(f"{self.source}: {what} is missing{self._misspelt(key)}")
 
     def invalid(self, key: str, allowed: str) -> InvalidInput:
@@ -279,7 +281,14 @@ class Table:
         return True
 
     def _misspelt(self, key: str) -> str:
-        close = difflib.get_close_matches(key, [k for k in self.values if k not in self._known], n=1)
+        # Units are as long as names: another quantity in the same unit is no misspelling.
+        word = key.partition("_")[0]
+        alike = [
+            other
+            for other in self.values
+            if other not in self._known and difflib.get_close_matches(word, [other.partition("_")[0]])
+        ]
+        close = difflib.get_close_matches(key, alike, n=1)
         return f" (found '{self.path(close[0])}' instead)" if close else ""
 
 

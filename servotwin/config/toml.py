@@ -70,7 +70,7 @@ def _read_items(table: Table, items: list[Item], folder: Path, base: Any, comple
         for item in here:
             _read_item(inner, item, folder, getattr(base, item.name, None), values)
             if complete and item.required and item.name not in values:
-                raise inner.missing(inner.names(item.names)[0], table=item.form is Form.TABLE)
+                raise inner.missing(*inner.names(item.names), table=item.form is Form.TABLE)
         if name:
             inner.done()
     return values

@@ -10,6 +10,7 @@ from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
+from servotwin.errors import InvalidInput
 
 
 def static_gain(law: AnyController) -> float:
@@ -28,6 +29,28 @@ def integrates(law: AnyController) -> bool:
     if isinstance(law, Cascade):
         return law.integral_time is not None
     return bool(law.holds) and law.integral_share != 0.0
+
+
+def check_zone_acts(law: AnyController, what: str) -> None:
+    """Refuse a dead zone that changes nothing.
+
+    Parameters
+    ----------
+    law : Controller, Cascade or LinearLaw
+    what : str
+        What has the dead zone, and opens the sentence.
+
+    Raises
+    ------
+    InvalidInput
+        It stops the integral only, and there is none.
+    """
+    if law.integral_only and not integrates(law):
+        holds = ", or name its integrators in holds" if isinstance(law, LinearLaw) else ""
+        raise InvalidInput(
+            f"{what} changes nothing: with controller integral_only = true it stops the integral only, and this "
+            f"controller has none; give integral_only = false, with which the loop opens there{holds}"
+        )
 
 
 def only_integrates(law: AnyController) -> bool:

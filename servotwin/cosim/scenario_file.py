@@ -81,15 +81,15 @@ REFERENCES: Mapping[str, Maker] = {
 
 
 def constant_gap(
-    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap.")],
+    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap, at the motor.")],
 ) -> SignalLike:
     """Constant gap."""
     return total
 
 
 def growing_gap(
-    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap.")],
-    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap.")],
+    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap, at the motor.")],
+    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap, at the motor.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
     begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
 ) -> SignalLike:

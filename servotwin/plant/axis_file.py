@@ -70,8 +70,10 @@ def _check_shaft(k_d: float, c_d: float, in_gap: str, keys: tuple[str, str, str]
     stiffness, damping, unit = keys
     if in_gap == FREE and math.isinf(k_d):
         raise InvalidInput(f'in_gap = "free": needs a finite {stiffness}; a rigid transmission is "held" in the gap')
-    if c_d > 0.0 and in_gap != FREE:
-        raise InvalidInput(f'{damping} = {c_d!r} {unit}: only with in_gap = "free"; leave it out, or give that')
+    if c_d > 0.0 and math.isinf(k_d):
+        raise InvalidInput(
+            f"{damping} = {c_d!r} {unit}: needs a finite {stiffness}, beside which it damps; leave it out, or give that"
+        )
 
 
 def linear_load(

@@ -50,6 +50,12 @@ def position_unit(plant: Plant) -> DisplayUnit:
     return DEGREES if isinstance(plant, Axis) and plant.load.motion == ROTARY else MILLIMETRES
 
 
+def gap_in_words(plant: Plant, gap: float, form: str = ".6g") -> str:
+    """A gap (rad), in degrees at the motor and as the travel of the load that it is."""
+    travel = position_unit(plant).small.text(plant.p * gap, ".3g")
+    return f"{math.degrees(gap):{form}} deg at the motor ({travel} at the load)"
+
+
 def command_unit(plant: Plant) -> str:
     """Unit of the command of a plant's actuator."""
     return plant.actuator.unit if isinstance(plant, Axis) else "V"

@@ -23,8 +23,9 @@ class Transmission:
         at the motor; divide one that was measured at the load by p.
     k_d, c_d : float
         Stiffness and damping between the driven end and the first mass, seen from the load: N/m and N s/m, of a rotary
-        axis N m/rad and N m s/rad. Infinite stiffness: the first mass is the driven end, and its load does not act back
-        on the motor.
+        axis N m/rad and N m s/rad. Where the gap holds the driven end, both act on the load at all times, and on the
+        motor in contact. Infinite stiffness: the first mass is the driven end, and its load does not act back on the
+        motor.
     in_gap : {"held", "free"}
         The driven end inside the gap: "held" where it is by its own friction (the paper's screw), or "free" to follow
         the load, with no force through the gap (the two-mass system with a dead zone).
@@ -32,7 +33,7 @@ class Transmission:
     Raises
     ------
     InvalidInput
-        A value out of its range, a rigid transmission that is free in the gap, or damping of a rigid or of a held one.
+        A value out of its range, a rigid transmission that is free in the gap, or damping of a rigid one.
     """
 
     p: float
@@ -55,9 +56,9 @@ class Transmission:
             raise InvalidInput(
                 'transmission in_gap = "free": needs a finite stiffness k_d; a rigid transmission is held in the gap'
             )
-        if self.c_d > 0.0 and self.backlash_kind is not BacklashKind.FREE:
+        if self.c_d > 0.0 and self.rigid:
             raise InvalidInput(
-                f'transmission damping (c_d) = {self.c_d!r}: only a transmission that is "free" in the gap has it'
+                f"transmission damping (c_d) = {self.c_d!r}: needs a finite k_d; a rigid transmission has none"
             )
 
     @property

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import NamedTuple, Protocol
 
 from servotwin.control.controller import Controller
-from servotwin.control.retuning import static_gain
+from servotwin.control.laws import kind_of
+from servotwin.control.retuning import check_zone_acts, static_gain
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import holds_position
 from servotwin.plant.plants import Plant, check_gap_in_loop, check_homogeneous
@@ -102,13 +103,27 @@ def check_verifiable(servo: Plant) -> None:
         )
 
 
+def check_tabled(servo: Plant, named: str) -> None:
+    """Refuse a table for a controller whose settings no table holds; the sentence opens with what is `named`.
+
+    Raises
+    ------
+    InvalidInput
+        The controller is no filtered PID.
+    """
+    if not isinstance(servo.controller, Controller):
+        raise InvalidInput(
+            f"{named}: tables hold settings of a filtered PID, and this controller is a {kind_of(servo.controller)} "
+            "one; leave the table out: the twin verifies each setting before it sends it"
+        )
+
+
 def _certified(servo: Plant, options: PolicyOptions) -> Policy:
     """Make the policy that verifies before every update or, with a table, looks settings up."""
     policy = certified_policy(servo, options)
-    if options.table is not None and not isinstance(servo.controller, Controller):
-        raise InvalidInput(f"table = {options.table!r}: tables hold settings of a filtered PID; leave the table out")
     if options.table is None:
         return policy
+    check_tabled(servo, f"table = {options.table!r}")
     try:
         return TablePolicy(policy, load(Path(options.table), policy))
     except InvalidInput as error:
@@ -120,8 +135,7 @@ def _margin(servo: Plant, options: PolicyOptions) -> MarginPolicy:
     _check_zone(servo, "margin")
     if not isinstance(servo.controller, Controller):
         raise InvalidInput(
-            "policy 'margin' reads its dead zone from a map, and maps are computed with the filtered PID: give another "
-            "policy"
+            "policy 'margin' designs for the filtered PID only, and this controller is another: give another policy"
         )
     if servo.pidf.voltage_limit is not None:
         raise InvalidInput(
@@ -147,7 +161,8 @@ def _paper(servo: Plant, options: PolicyOptions) -> PaperPolicy:
 
 
 def _check_zone(servo: Plant, policy: str) -> None:
-    """Refuse a dead zone whose command of zero moves the motor: a stepper goes to its angle zero."""
+    """Refuse a dead zone that changes nothing, or whose command of zero moves a stepper: it goes to its angle zero."""
+    check_zone_acts(servo.controller, f"policy {policy!r}: the dead zone that it sets")
     if holds_position(servo) and not servo.controller.integral_only:
         raise InvalidInput(
             f"policy {policy!r}: inside its dead zone the command is zero, and this axis's stepper would go to the "

@@ -179,7 +179,7 @@ class Run:
         panels = (
             Panel(f"position, {name}", {"reference": factor * self.reference, "position": factor * self.position}),
             Panel(f"error, {name}", errors),
-            Panel("total gap, deg", {"gap": np.degrees(self.gap)}),
+            Panel("gap at the motor, deg", {"gap": np.degrees(self.gap)}),
             Panel(f"{drive}, {command_unit(self.servo)}", {drive: self.voltage}),
         )
         return stacked_figure(repr(self).strip("<>"), self.time, panels)

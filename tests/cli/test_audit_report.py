@@ -265,6 +265,11 @@ def test_before_the_machine_is_known_nothing_has_a_unit(machine: dict[str, str])
     assert not re.search(r"\b(um|mdeg|mV|V|N m|m|rad)\b", text), text
 
 
+def test_a_zero_has_no_sign() -> None:
+    assert Units.of({"travel_unit": "m", "command_unit": "rad/s"}).of_command(-0.0) == "0 rad/s"
+    assert Units().of_command(-1e-6) == "0.0 mV"
+
+
 def test_one_window_alone_tells_no_wear() -> None:
     numbers = {"mean": [0.1, 1e-6, 0.0], "covariance": [0.0, 0.0, 0.0, 0.0, 1e-8, 0.0, 0.0, 0.0, 0.0]}
     for updates in (1, 2):

@@ -110,6 +110,14 @@ def test_a_policy_that_verifies_nothing_is_named(tmp_path: Path) -> None:
         certify(path, out=tmp_path / "x.table", grid=COARSE, console=quiet())
 
 
+def test_a_table_that_no_twin_takes_is_refused_before_anything_is_verified(tmp_path: Path) -> None:
+    path = tmp_path / "twin.toml"
+    path.write_text('[models.one]\nservo = "two-mass-drive"\n[servos]\n"ax" = "one"\n', encoding="utf-8")
+    with pytest.raises(InvalidInput, match=r"x\.table: model 'one': tables hold settings of a filtered PID, .*cascade"):
+        certify(path, out=tmp_path / "x.table", console=quiet())
+    assert [each.name for each in tmp_path.iterdir()] == ["twin.toml"]
+
+
 def test_an_interrupt_says_what_is_finished(tmp_path: Path, monkeypatch) -> None:
     def interrupted(*_given):
         yield 3, 8

@@ -7,6 +7,7 @@ import pytest
 from rich.console import Console
 
 from servotwin.cli import demo
+from servotwin.errors import InvalidInput
 
 
 @pytest.fixture(scope="module")
@@ -17,6 +18,14 @@ def shown(tmp_path_factory):
         patch.setattr(demo, "compare", lambda *given: compared.append(compare(*given)) or compared[-1])
         path = demo.demo(tmp_path_factory.mktemp("demo"), console=console)
     return path, console.file.getvalue(), compared[0]
+
+
+def test_another_machine_is_sent_to_the_command_that_shows_it(tmp_path):
+    with pytest.raises(
+        InvalidInput, match=r"--preset 'gantry': the demo is of the paper's servo: .*servotwin simulate"
+    ):
+        demo.demo(tmp_path / "out", "gantry")
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -261,6 +261,13 @@ def test_as_many_axes_as_vary_are_drawn(drawn, tmp_path, axes, size):
     assert image.imread(tmp_path / "map.png").std() > 0.05
 
 
+def test_colours_show_no_difference_where_there_is_none():
+    assert (figure.norm_of(np.array([2e-16, 8e-16]), 0.1).vmax) == 0.1  # all at rest
+    alike = figure.norm_of(np.array([0.11405, 0.11405001]))
+    assert alike(0.11405001) - alike(0.11405) < 1e-3
+    assert (figure.norm_of(np.zeros(3)).vmin, figure.norm_of(np.array([1.0, 5.0])).vmax) == (0.0, 5.0)
+
+
 @pytest.mark.parametrize(
     ("text", "values"),
     [("1,2.5", (1.0, 2.5)), ("7", (7.0,)), ("0:1:3", (0.0, 0.5, 1.0)), ("1:100:3:log", (1.0, 10.0, 100.0))],

@@ -104,7 +104,7 @@ def test_what_is_written_reads_back_bit_for_bit(units: OwnUnits | None) -> None:
         ({"error_rad": 1.0, "move_mm": 1.0}, "here its name is 'guard.move_deg'"),
         ({"error_rad": 1.0, "bias_v": 1.0}, "here its name is 'guard.bias_n_m'"),
         ({"error_deg": -1.0}, "guard.error_deg = -1.0 is not allowed; give a number, at least 0"),
-        ({}, "key 'guard.error_deg' is missing"),
+        ({}, "key 'guard.error_deg' or 'guard.error_rad' is missing"),
         ({"error_rad": 1.0, "eror_rad": 1.0}, "unknown key 'guard.eror_rad'"),
     ],
 )

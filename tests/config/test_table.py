@@ -88,6 +88,7 @@ def test_values_out_of_range(text: str, ask, shown: str, allowed: str) -> None: 
     [
         ("a = 1", lambda t: t.number("m"), "key 'm' is missing"),
         ("mas_kg = 1", lambda t: t.number("mass_kg"), "key 'mass_kg' is missing (found 'mas_kg' instead)"),
+        ("damping_n_m_s_per_rad = 1", lambda t: t.number("pitch_m_per_rad"), "key 'pitch_m_per_rad' is missing"),
         ("[p]\nmas = 1", lambda t: t.table("p").text("mass"), "key 'p.mass' is missing (found 'p.mas' instead)"),
         ("a = 1", lambda t: t.table("motor", required=True), "table [motor] is missing"),
         ("[moter]", lambda t: t.table("motor", required=True), "table [motor] is missing (found 'moter' instead)"),

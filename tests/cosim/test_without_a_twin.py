@@ -64,7 +64,7 @@ def test_a_twin_that_can_verify_nothing_is_refused(tmp_path: Path, twin: str) ->
 
 
 def test_a_twin_that_cannot_estimate_the_gap_is_refused(tmp_path: Path) -> None:
-    scenario = Scenario.load(file_of(tmp_path, "emps", '[twin]\npolicy = "paper"\n'))
+    scenario = Scenario.load(file_of(tmp_path, "emps", '[twin]\npolicy = "paper"\nk_dz = 0.0\n'))
     with pytest.raises(InvalidInput, match="the motor's encoder and the command do not show the gap"):
         cosimulate(scenario)
 

@@ -58,16 +58,23 @@ def test_small_steps_and_located_events_move_alike() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("encoders", [1, 2])
-def test_the_gap_of_a_loop_on_the_motor_is_found_from_one_encoder_and_from_two(seed: int, encoders: int) -> None:
-    """Of machines whose numbers are not those of the model; the load's encoder is beside the loop."""
+@pytest.mark.parametrize("damped", [0.0, 0.1])
+def test_the_gap_of_a_loop_on_the_motor_is_found_from_one_encoder_and_from_two(
+    seed: int, encoders: int, damped: float
+) -> None:
+    """Of machines whose numbers are not those of the model; the load's encoder is beside the loop.
+
+    `damped` is the damping ratio of the load on its screw, of which the machine has a quarter less.
+    """
     random = np.random.default_rng([30113060, seed])
     gap = math.exp(random.uniform(math.log(0.1), math.log(0.5)))
-    angle, command, place = machine(gap, random).run(SINE, PARTS)
-    seen, axis = slice(900, 1700), AXIS
+    damping = 2.0 * damped * math.sqrt(STIFFNESS * MASS)
+    angle, command, place = replace(machine(gap, random), damping=0.75 * damping).run(SINE, PARTS)
+    seen, axis = slice(900, 1700), AXIS.replace(transmission=Transmission(PITCH, STIFFNESS, damping))
     window = Window(theta_m=angle[seen], voltage=command[seen], sample_rate=RATE)
     if encoders == 2:
         resolution = 5e-8
-        axis = AXIS.replace(sensors=Sensors(COUNT, resolution))
+        axis = axis.replace(sensors=Sensors(COUNT, resolution))
         load = resolution * np.round(place[seen] / resolution)
         window = Window(position=load, theta_m=angle[seen], voltage=command[seen], sample_rate=RATE)
     estimate = estimate_gap(window, axis)

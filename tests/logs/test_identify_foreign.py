@@ -77,6 +77,22 @@ def test_identify_from_a_log_to_json(tmp_path, made):
     assert len(found["segments"]) > 10
 
 
+@pytest.mark.parametrize(
+    ("scale", "header", "words"),
+    [
+        (1e-3, "t [s],motor [rad],load [m]", "gap 0.00{} mm at the load, 0.0{} rad at the motor"),
+        (math.radians(1.0), "t [s],motor [rad],load [rad]", "gap 0.00{} deg at the load, {} deg at the motor"),
+    ],
+)
+def test_people_read_millimetres_and_degrees(tmp_path, made, scale, header, words):
+    path = csv(tmp_path / "log.csv", rows(replace(made, load=scale * made.load)), header)
+    shown = " ".join(CliRunner().invoke(app, ["identify", str(path), "--stiff"]).output.split())
+    assert re.search(words.replace("{}", r"[0-9.]+"), shown)
+    found = json.loads(CliRunner().invoke(app, ["identify", str(path), "--stiff", "--json"]).stdout)
+    assert found["gap_load"] == pytest.approx(scale * float(re.search(r"gap ([0-9.]+)", shown)[1]), rel=1e-3)
+    assert f"[{found['unit_load']}]" == header.split("load ")[1]
+
+
 def test_lost_motion_is_gap_only_where_nothing_winds_up(tmp_path, made):
     path = csv(tmp_path / "log.csv", rows(made), "t [s],motor [rad],load [mm]")
     unknown, stiff = (
@@ -168,7 +184,7 @@ def test_the_change_between_two_logs(tmp_path, made):
     second = csv(tmp_path / "new.csv", rows(worn))
     result = CliRunner().invoke(app, ["identify", str(first), str(second)])
     assert result.exit_code == 0, result.output
-    assert "change of the lost motion: +0.001" in " ".join(result.output.split())
+    assert "change of the lost motion: +0.057" in " ".join(result.output.split())
     assert "(95 %): more than chance explains" in " ".join(result.output.split())
 
 

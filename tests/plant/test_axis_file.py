@@ -53,7 +53,7 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
         ("mass_kg = [20.0]", "mass_kg = [1e-300]", r"cannot be computed; farthest from 1 is load.mass_kg = 1e-300"),
         ("stiffness_n_per_m = 50000000.0", "stiffness_n_per_m = 1e300", "transmission.stiffness_n_per_m = 1e[+]300"),
         ("sample_rate_hz = 2000.0", "sample_rate_hz = 1e-300", "controller.sample_rate_hz = 1e-300: check its unit"),
-        ("pitch_m_per_rad", "pitch_mm_per_rad", "transmission.pitch_m_per_rad' is missing"),
+        ("pitch_m_per_rad", "pitch_mm_per_rad", "pitch_m_per_rad' or 'transmission.lead_mm_per_rev' is missing"),
         ("mass_kg = [20.0]", "mass_kg = [20.0, 0.0]", r"load.mass_kg\[1\] = 0.0 is not allowed"),
         ("mass_kg = ", "inertia_kg_m2 = ", r"load.inertia_kg_m2 = \[20.0\]: this load is linear; give load.mass_kg"),
         ("pitch_m_per_rad = ", "lead_mm_per_rev = 5.0\npitch_m_per_rad = ", "give only one of them"),
@@ -86,7 +86,11 @@ def test_a_file_resolves_as_a_servo_or_an_axis(tmp_path: Path) -> None:
             "stiffness_n_m_per_rad = 5e7",
             r"unknown key 'transmission.stiffness_n_m_per_rad'.*allows .*stiffness_n_per_m",
         ),
-        ('in_gap = "free"', 'in_gap = "held"', r"damping_n_s_per_m = 6000.0 N s/m: only with in_gap = \"free\""),
+        (
+            "stiffness_n_per_m = 50000000.0\ndamping_n_s_per_m = 6000.0\nin_gap = \"free\"",
+            "damping_n_s_per_m = 6000.0",
+            r"damping_n_s_per_m = 6000.0 N s/m: needs a finite stiffness_n_per_m, beside which it damps",
+        ),
         (
             "mass_kg = [20.0]\nstiffness_n_per_m = [0.0]\ndamping_n_s_per_m = [100.0]",
             "mass_kg = [20.0, 3.0]\nstiffness_n_per_m = [0.0, 0.0]\ndamping_n_s_per_m = [100.0, 0.0]",

@@ -146,6 +146,14 @@ def test_margin_has_no_map_for_a_limited_voltage():
         policy_of(PAPER.replace(voltage_limit=24.0), TwinSettings(policy="margin"))
 
 
+@pytest.mark.parametrize("policy", ["paper", "hysteresis", "margin"])
+def test_a_dead_zone_that_changes_nothing_is_refused(policy):
+    proportional = PAPER.replace(Ki=0.0, integral_only=True)
+    with pytest.raises(InvalidInput, match=rf"policy '{policy}': the dead zone that it sets changes nothing: .*none; "):
+        policy_of(proportional, TwinSettings(policy=policy))
+    policy_of(proportional, TwinSettings(policy="paper", k_dz=0.0))
+
+
 @pytest.mark.slow
 def test_the_loop_begins_on_the_set_that_is_verified_for_the_whole_range(tmp_path):
     scenario = load(tmp_path, "[twin]\nhorizon_s = 7.0\nsilence_s = 90.0\n")

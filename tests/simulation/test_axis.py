@@ -252,7 +252,7 @@ def test_integral_action_swings_in_the_gap_and_rests_without() -> None:
     [
         (lambda: Transmission(0.0), "transmission p = 0.0: must be positive and finite"),
         (lambda: Transmission(1.0, in_gap="free"), "needs a finite stiffness"),
-        (lambda: Transmission(1.0, 1e3, 1.0), 'only a transmission that is "free"'),
+        (lambda: Transmission(1.0, c_d=1.0), "needs a finite k_d; a rigid transmission has none"),
         (lambda: Load((-1.0,)), r"load m\[0\] \(mass_kg\) = -1.0 kg: must be finite and positive"),
         (
             lambda: Load((1.0, 2.0), (0.0, 0.0), (0.0, 0.0)),

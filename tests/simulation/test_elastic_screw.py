@@ -6,11 +6,18 @@ import math
 import numpy as np
 import pytest
 from exploration import examples
+from held_screw import HeldScrew
 from hypothesis import given
 from hypothesis import strategies as st
 
+from servotwin.control.controller import Controller
+from servotwin.plant.actuator import TorqueDrive
+from servotwin.plant.axis import Axis
+from servotwin.plant.load import Load
+from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
+from servotwin.plant.transmission import Transmission
 from servotwin.simulation import Run, Simulation, simulate
 
 PAPER = Servo.preset("paper")
@@ -23,6 +30,25 @@ def run_of(servo: Servo, gap: float, **options) -> tuple[Run, dict[str, np.ndarr
     rows = np.eye(len(engine.loop.automaton.names))
     states = {name: engine.trajectory.sampled(rows[engine.loop.automaton.index(name)]) for name in ("current", "speed")}
     return simulation.run(), states
+
+
+@pytest.mark.parametrize("damping", [0.0, 60.0, 400.0])
+def test_a_screw_with_a_damper_moves_as_small_steps_say(damping: float) -> None:
+    """A worm: the damper acts on the load beside the spring, and on the motor in contact only."""
+    own = HeldScrew(1e-3, 1e-3, 2e-3, 0.01, 5e4, 3.0, 20.0, (8.0, 4.0, 0.4, 5e-3), 1e-9, 1e3, 0.1, damping)
+    axis = Axis(
+        TorqueDrive(J=own.J, lag=own.lag, friction=own.friction),
+        Transmission(own.p, own.k, damping),
+        Load((own.m,), c=(own.c,)),
+        Controller(*own.gains, sample_rate=own.rate),
+        Sensors(own.count, feedback="motor"),
+    )
+    run = simulate(axis, 3.0, reference=SquareWave(0.02, 2.0), gap=own.gap, sample_rate=own.rate)
+    assert {"contact", "hold", "release"} <= set(run.events.kind.tolist())
+    # Both differences are those of the steps, which are of first order.
+    coarse, fine = (np.abs(own.run(run.reference, parts)[2] - run.position).max() for parts in (30, 300))
+    assert fine < 2e-4 * np.abs(run.position).max()
+    assert fine < 0.2 * coarse
 
 
 def held_samples(run: Run, side: int) -> np.ndarray:

@@ -81,7 +81,12 @@ def test_a_run_and_a_window_plot_themselves(run):
     pyplot = pytest.importorskip("matplotlib.pyplot")
     pyplot.switch_backend("agg")
     figure = run.plot()
-    assert [ax.get_ylabel() for ax in figure.axes] == ["position, mm", "error, mm", "total gap, deg", "voltage, V"]
+    assert [ax.get_ylabel() for ax in figure.axes] == [
+        "position, mm",
+        "error, mm",
+        "gap at the motor, deg",
+        "voltage, V",
+    ]
     assert np.array_equal(figure.axes[0].lines[1].get_ydata(), 1e3 * run.position)
     assert len(st.Window.from_run(run, 0.5, 1.0).plot().axes) == 4
     pyplot.close("all")

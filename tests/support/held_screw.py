@@ -26,6 +26,8 @@ class HeldScrew:
         Kp, Ki, Kd, Tf of the loop, per m.
     count, rate, gap : float
         rad, Hz, rad.
+    damping : float
+        N s/m, beside the spring.
     """
 
     J: float
@@ -39,6 +41,7 @@ class HeldScrew:
     count: float
     rate: float
     gap: float
+    damping: float = 0.0
 
     def run(self, reference: Array, parts: int) -> tuple[Array, Array, Array]:
         """Measured angle (rad), command (N m) and load (m) at the samples of a reference (m), `parts` steps each."""
@@ -57,7 +60,8 @@ class HeldScrew:
             total += ki * error / self.rate
             filtered = fade * filtered + (1.0 - fade) * error
             for _ in range(parts):
-                force = self.k * (self.p * screw - place)
+                # The screw moves with the motor on its flank, and not at all in the gap.
+                force = self.k * (self.p * screw - place) + self.damping * (self.p * speed * abs(side) - velocity)
                 torque += step * (command - torque) / self.lag
                 free = torque - self.friction * speed
                 push = free - self.p * force

@@ -21,7 +21,9 @@ from servotwin.analysis.limit_cycles.poincare import GuardId, LostOrbit, Section
 from servotwin.analysis.limit_cycles.scaled import LOOKS, ScaledLoop, scaled_loop
 from servotwin.control.laws import AnyController, Law, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
+from servotwin.control.retuning import check_zone_acts
 from servotwin.errors import InvalidInput
+from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import Trajectory, ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
@@ -31,6 +33,8 @@ from servotwin.plant.plants import Plant
 _FIRST_PART, _PARTS = 32, 8
 # Motion below this part of the gap (or of the tolerance) is rest; above this part it runs away.
 _REST, _AWAY = 1e-9, 1e9
+# Share of the gap (or of the dead zone, or of the step) within which motor and position count as settled.
+_SETTLED = 0.01
 # Without integral action the motor crosses the gap ever more slowly, and never rests. It counts as settling when the
 # position moves by less than this part of p gap in the later half of all parts, and by less than a quarter of before.
 _CREEP = 1e-3
@@ -60,11 +64,15 @@ class CycleResult:
         Only with `CycleStatus.CYCLE`.
     reason : str
         Reason why there is no orbit; empty otherwise.
+    settling : float, optional
+        s, where the run came to rest: from then on motor and position stay within 1 % of the gap (without one of the
+        dead zone, or of the step) of their ends.
     """
 
     status: CycleStatus
     orbit: Orbit | None
     reason: str
+    settling: float | None = None
 
     def __repr__(self) -> str:
         """Status, and the orbit or the reason, in one line."""
@@ -111,12 +119,15 @@ def limit_cycle(
     if not (math.isfinite(step) and step != 0.0):
         raise InvalidInput(f"step = {step!r} m: must be finite and not 0, or the loop never leaves its rest")
     loop = scaled_loop(servo, gap, tolerance, controller, step)
-    law = law_of(servo.controller if controller is None else controller)
+    own = servo.controller if controller is None else controller
+    law = law_of(own)
+    if tolerance:
+        check_zone_acts(own, "tolerance: the dead zone")
     limit = law.voltage_limit
     if gap == 0.0 and not tolerance and limit is None and servo.command_limit is None:
         return _linear(servo, law)
     try:
-        return _searched(loop)
+        return _searched(loop, "gap" if gap else "dead zone" if tolerance else "step")
     except ZenoError as error:
         return CycleResult(CycleStatus.CHATTERS, None, str(error))
 
@@ -130,16 +141,20 @@ def _linear(servo: Plant, law: Law) -> CycleResult:
     return CycleResult(CycleStatus.DIVERGES, None, "without gap, dead zone and limit the loop is linear and not stable")
 
 
-def _searched(loop: ScaledLoop) -> CycleResult:
-    reason, elapsed, moved = "", 0.0, []
-    for run, swing, travel in _tails(loop):
+def _searched(loop: ScaledLoop, extent: str) -> CycleResult:
+    """Search the run's end; `extent` is what `loop.extent` is the size of, in a word."""
+    reason, elapsed, moved, travels = "", 0.0, [], []
+    for run, travel in _parts(loop):
         elapsed += run.time
-        moved.append(travel)
-        if not np.isfinite(swing):
+        if travel is None:
             reason = f"the motion grows beyond any bound within {elapsed:.4g} s"
             return CycleResult(CycleStatus.DIVERGES, None, reason)
-        if swing <= _REST * loop.extent:
-            return CycleResult(CycleStatus.SETTLES, None, f"motor and position rest after at most {elapsed:.4g} s")
+        travels.append(travel)
+        moved.append(float(np.ptp(travel[0])))
+        if np.ptp(travel[:, len(travel[0]) // 2 :], axis=1).max() <= _REST * loop.extent:
+            time = _settling(loop, travels)
+            reason = f"motor and position stay within 1 % of the {extent} from {time:.3g} s on"
+            return CycleResult(CycleStatus.SETTLES, None, reason, time)
         try:
             closed = _followed(loop, run)
         except LostOrbit as error:
@@ -156,13 +171,13 @@ def _searched(loop: ScaledLoop) -> CycleResult:
     return CycleResult(CycleStatus.IRREGULAR, None, f"no orbit is reached within {elapsed:.4g} s: {reason}")
 
 
-def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
-    """Parts of one run, each twice as long as the one before, with two half peak-to-peaks of its second half.
+def _parts(loop: ScaledLoop) -> Iterator[tuple[Trajectory, Array | None]]:
+    """Parts of one run, each twice as long as the one before, with half the travel of position and motor, (2, samples).
 
-    The first is the larger of the position's and the motor's travel, since the position rests while the motor crosses
-    the gap. The second is the position's.
+    The motor's is in the position's unit: the position rests while the motor crosses the gap. None: it runs away.
     """
     state, mode = loop.state, loop.mode
+    rows = loop.loop.rows
     for number in range(_PARTS):
         run = Trajectory(loop.loop.automaton, state, mode, loop.sample_step)
         samples = _FIRST_PART * 2**number * LOOKS
@@ -170,12 +185,18 @@ def _tails(loop: ScaledLoop) -> Iterator[tuple[Trajectory, float, float]]:
         for check in range(1, _FIRST_PART + 1):
             run.advance(samples // _FIRST_PART * check)
             if not float(np.max(np.abs(run.state))) <= _AWAY * float(np.max(np.abs(loop.state))):
-                yield run, np.inf, np.inf
+                yield run, None
                 return
-        position = 0.5 * run.sampled(loop.loop.rows["position"])
-        motor = 0.5 * loop.extent * run.sampled(loop.loop.rows["theta_m"], samples // 2)
-        yield run, float(max(np.ptp(position[samples // 2 :]), np.ptp(motor))), float(np.ptp(position))
+        yield run, 0.5 * np.array([run.sampled(rows["position"]), loop.extent * run.sampled(rows["theta_m"])])
         state, mode = run.state, run.mode
+
+
+def _settling(loop: ScaledLoop, travels: list[Array]) -> float:
+    """Time (s) of the first sample from which position and motor stay near where the last part ends."""
+    # The first sample of each part is the last one of the part before.
+    travel = np.concatenate([travels[0], *(each[:, 1:] for each in travels[1:])], axis=1)
+    away = np.abs(travel - travel[:, -1:]).max(axis=0) > 0.5 * _SETTLED * loop.extent
+    return float(loop.sample_step * (np.flatnonzero(away).max(initial=-1) + 1))
 
 
 def _followed(loop: ScaledLoop, run: Trajectory) -> ClosedOrbit:

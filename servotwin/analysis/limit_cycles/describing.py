@@ -21,9 +21,11 @@ from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
+from servotwin.plant.display_units import command_unit
 from servotwin.plant.law_loop import check_encoders
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
+from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant
 
 # Grid intervals within each band of frequencies in which a prediction is possible.
@@ -99,11 +101,9 @@ def _check(servo: Plant, law: Law, gap: float) -> None:
     if servo.motor_friction or servo.guide.friction or servo.guide.force:
         raise InvalidInput("the describing function is that of the gap alone; the axis has friction or a force too")
     if servo.command_limit is not None:
-        raise InvalidInput(f"actuator limit = {servo.command_limit:g}: the describing function knows no limit")
+        raise InvalidInput(f"{_limit('actuator', servo, servo.command_limit)}: the describing function knows no limit")
     if law.voltage_limit is not None:
-        raise InvalidInput(
-            f"controller voltage_limit = {law.voltage_limit:g} V: the describing function knows no limit"
-        )
+        raise InvalidInput(f"{_limit('controller', servo, law.voltage_limit)}: the describing function knows no limit")
     if law.sample_rate is not None:
         raise InvalidInput(
             f"controller sample_rate = {law.sample_rate:g} Hz: the describing function is that of the law"
@@ -111,6 +111,10 @@ def _check(servo: Plant, law: Law, gap: float) -> None:
         )
     if not (math.isfinite(gap) and gap > 0.0):
         raise InvalidInput(f"gap = {gap!r} rad: must be finite and greater than 0")
+
+
+def _limit(part: str, servo: Plant, value: float) -> str:
+    return f"{part} {own_units(servo).key('voltage_limit_v')} = {value:g} {command_unit(servo)}"
 
 
 def _play(angle: float) -> complex:

@@ -12,6 +12,7 @@ from servotwin.analysis.limit_cycles.scaled import characteristic_time
 from servotwin.analysis.maps.axes import Axes, RatioAxes, as_lists, axis_names
 from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, Law, law_of
+from servotwin.control.retuning import check_zone_acts
 from servotwin.errors import InvalidInput
 from servotwin.plant.plants import Plant
 from servotwin.plant.scales import scales
@@ -76,6 +77,8 @@ class MapSettings:
     def __post_init__(self) -> None:
         self.axes.check_gap(self.servo)
         _check_law(self.law)
+        if any(self.axes.tolerance if isinstance(self.axes, RatioAxes) else self.axes.k_dz):
+            check_zone_acts(self.servo.controller if self.controller is None else self.controller, "map: the dead zone")
         self.servo.check_loop(self.law)
         for name, least in (("members", 1), ("seed", 0)):
             value = getattr(self, name)

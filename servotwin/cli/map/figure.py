@@ -24,12 +24,14 @@ from servotwin.report import style
 from servotwin.runtime import files
 
 _LABELS = {
-    "gap": ("gap (deg)", math.degrees(1.0)),
-    "estimate": ("estimated gap (deg)", math.degrees(1.0)),
+    "gap": ("gap (deg at the motor)", math.degrees(1.0)),
+    "estimate": ("estimated gap (deg at the motor)", math.degrees(1.0)),
     "k_dz": ("$k_{DZ}$", 1.0),
 }
 _RATIO_LABELS = {"tolerance": ("tolerance / (p b)", 1.0), "amplitude": ("reference step / (p b)", 1.0)}
 _DOT: Any = {"color": style.PINK, "linestyle": "", "marker": ".", "markersize": 2.5}
+# Values within this factor are drawn alike.
+_ALIKE = 1.01
 # The horizontal axis is the one that a designer can choose: the dead zone.
 _ACROSS = ("tolerance", "k_dz", "estimate", "gap", "amplitude")
 
@@ -114,10 +116,10 @@ def _panels(result: StabilityMap, across: _PictureAxis, up: _PictureAxis) -> Fig
     _mark(axes[0, 0], across, up, slow)
     _shares(axes[0, 1], across, grid("settled"), bool(slow.any()))
     error, swing = grid("error") / unit, grid("swing") / unit
-    _colour(axes[1, 0], across, up, error, _norm(error))
-    _colour(axes[1, 1], across, up, swing, _norm(swing, result.settings.stillness / unit))
-    _colour(axes[2, 0], across, up, grid("settling"), _norm(grid("settling"), 0.5))
-    _colour(axes[2, 1], across, up, grid("effort"), _norm(grid("effort")))
+    _colour(axes[1, 0], across, up, error, norm_of(error))
+    _colour(axes[1, 1], across, up, swing, norm_of(swing, result.settings.stillness / unit))
+    _colour(axes[2, 0], across, up, grid("settling"), norm_of(grid("settling"), 0.5))
+    _colour(axes[2, 1], across, up, grid("effort"), norm_of(grid("effort")))
     titles = (
         "share of the runs that settle",
         f"over every {up.label.partition(' (')[0].partition(' /')[0]}",
@@ -142,12 +144,16 @@ def _effort(result: StabilityMap) -> str:
     return f"{'voltage' if unit == 'V' else 'command'}{where} ({unit} rms)"
 
 
-def _norm(values: Array, least: float = 0.0) -> Normalize:
+def norm_of(values: Array, least: float = 0.0) -> Normalize:
     """Logarithmic over three decades at most of the values that can be shown so, and from `least` on."""
     shown = values[np.isfinite(values) & (values > 0.0)]
     high = float(shown.max(initial=0.0))
-    low = max(float(shown.min(initial=high)), least, high * 1e-3)
-    return LogNorm(low, high, clip=True) if low < high else Normalize()
+    if high <= least or not high:  # no difference among these counts
+        return Normalize(0.0, least or 1.0)
+    low = max(float(shown.min()), least, high * 1e-3)
+    if high < _ALIKE * low:  # differences in the last digits are no colours
+        low, high = 0.5 * low, 2.0 * high
+    return LogNorm(low, high, clip=True)
 
 
 def _colour(axes: Axes, across: _PictureAxis, up: _PictureAxis, values: Array, norm: Normalize) -> None:

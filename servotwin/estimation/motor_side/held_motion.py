@@ -1,6 +1,7 @@
 """Motion of a motor and a load behind an elastic screw that the gap holds, under the motor's command.
 
-In contact the screw's spring acts back on the motor; in the gap, and while the motor rests, the screw carries the load.
+In contact the screw's spring and damper act back on the motor; in the gap, and while the motor rests, the screw
+carries the load.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from servotwin.plant.signals import Array
 from servotwin.plant.structure import chain
 
 SCREW, SPRINGS, DAMPING, MASS_RATIO = "screw stiffness", "load stiffness", "load damping", "mass ratio"
-FRICTION, FORCE = "load friction", "load force"
+FRICTION, FORCE, DAMPER = "load friction", "load force", "screw damping"
 _LEAST_PARTS = 8  # of a sample, as of `free_motion`
 
 
@@ -36,6 +37,7 @@ class HeldFactors(NamedTuple):
     mass_ratio: float = 1.0
     force: float = 1.0
     reaction: float = 1.0
+    damper: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,7 @@ class HeldShaft:
             Unknown(SCREW, self.screw, "factor"): True,
             Unknown(SPRINGS, known.stiffness, "factor"): any(load.k),
             Unknown(DAMPING, known.damping, "damping"): any(load.c),
+            Unknown(DAMPER, known.damping, "damping"): self.axis.transmission.c_d > 0.0,
             Unknown(FRICTION, known.damping, "damping"): load.friction > 0.0,
             Unknown(FORCE, known.stiffness, "factor"): load.force != 0.0,
             Unknown(MASS_RATIO, known.mass_ratio, "factor"): load.n > 1,
@@ -125,7 +128,8 @@ def _factors(known: Mapping[str, float], reaction: float) -> HeldFactors:
     def factor(name: str) -> float:
         return math.exp(known.get(name, 0.0))
 
-    return HeldFactors(factor(SCREW), factor(SPRINGS), factor(DAMPING), factor(MASS_RATIO), factor(FORCE), reaction)
+    load = factor(SPRINGS), factor(DAMPING), factor(MASS_RATIO), factor(FORCE)
+    return HeldFactors(factor(SCREW), *load, reaction, factor(DAMPER))
 
 
 @lru_cache(maxsize=16)
@@ -140,8 +144,8 @@ def _flows(axis: Axis, actuator: Actuator, factors: HeldFactors) -> Array:
     """Flows (3, M + 2, M + 2) in the gap, in contact and at rest, with command and 1 as the last states."""
     load, shaft, masses = axis.load, actuator.matrices(), axis.load.masses
     masses[-1] *= factors.mass_ratio
-    k_d = factors.screw * axis.transmission.k_d
-    links = chain(masses, factors.springs * load.stiffnesses, factors.damping * load.dampings, k_d)
+    k_d, c_d = factors.screw * axis.transmission.k_d, factors.damper * axis.transmission.c_d
+    links = chain(masses, factors.springs * load.stiffnesses, factors.damping * load.dampings, k_d, c_d)
     d = len(shaft.names)
     screw, unit = d + 2 * load.n, np.ones(d)
     unit[-2:] = axis.p
@@ -154,5 +158,8 @@ def _flows(axis: Axis, actuator: Actuator, factors: HeldFactors) -> Array:
     flows[CONTACT, :d, chained] -= np.outer(pushed, links.reaction)
     flows[CONTACT, :d, screw] -= pushed * links.reaction_position
     flows[CONTACT, screw, d - 2] = 1.0
+    # The screw's damper feels the motor's speed.
+    flows[CONTACT, :d, d - 2] -= pushed * links.reaction_velocity
+    flows[CONTACT, chained, d - 2] += links.B_velocity
     flows[REST, d - 2 : d] = 0.0
     return flows
