@@ -51,6 +51,9 @@ _RESPONSE_EXPIRY_S = 60.0
 _MOST_HELD_BACK = 1000
 """Answers to refused requests that are held back at once; further ones are left out, since nobody waits for so many."""
 
+_TOPIC_SHOWN = 100
+"""Characters of a topic that is no servo's in the log: anybody on the broker may choose 65,535."""
+
 
 class MqttAnswer(NamedTuple):
     """Answer to a request.
@@ -107,6 +110,10 @@ class MqttRequestHandler:
             self._refusals.log(Refusal.TOO_LARGE if too_large else Refusal.BAD_TOKEN, servo, True, why=str(error))
             # Anybody on the broker may write the name of an edge, which must not slow down that edge.
             return MqttAnswer(None if too_large else encode_unknown_peer(data), f"name {servo}")
+
+    def refuse_topic(self, topic: str) -> None:
+        """Count and log a message to a topic that is no servo's; there is nobody to answer."""
+        self._refusals.log(Refusal.NOT_UNDERSTOOD, "", False, why=f"topic {topic[:_TOPIC_SHOWN]!r} is no servo's")
 
     async def respond(self, request: ReceivedRequest) -> MqttAnswer:
         """Handle a request; the answer has no response where its token was revoked."""
@@ -211,9 +218,14 @@ class MqttServer:
             await asyncio.to_thread(connection.close)
 
     def _receive(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-        """Start handling a request, on the event loop; an ignored one stays unacknowledged and goes to another twin."""
+        """Start handling a request, on the event loop; one that comes during a stop goes to another twin."""
+        if self._connection is None:
+            return
         servo = servo_of(topic)
-        if servo is None or self._connection is None:
+        if servo is None:
+            # Of messages that are not acknowledged the broker allows a number, and after those sends none at all.
+            acknowledge()
+            self._handler.refuse_topic(topic)
             return
         task = asyncio.create_task(self._serve(self._connection, servo, payload, acknowledge))
         self._tasks.add(task)
