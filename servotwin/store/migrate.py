@@ -31,6 +31,8 @@ def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> N
         if _revision(connection) == to:
             return
         if connection.dialect.name == POSTGRESQL:
+            # Another process may migrate for minutes.
+            connection.execute(sa.text("SET LOCAL lock_timeout = 0"))
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
         # Read again under the lock: another process may have migrated meanwhile.
         current = _revision(connection)
