@@ -29,7 +29,7 @@ _SERVER_TIMES = {
     "keepalives_count": "3",
     "tcp_user_timeout": "25000",
 }
-"""libpq's limits, s and ms, unless the URL gives others: its own wait for minutes where the network swallows packets."""
+"""libpq's limits, s and ms, unless the URL gives others: its own wait minutes where a network swallows packets."""
 _PAUSE_S = 0.005
 """s between two attempts where SQLite itself does not wait."""
 _PAGE_BYTES = 8192

@@ -36,7 +36,7 @@ class StoreExecutor:
 
     @property
     def waited(self) -> float:
-        """Time for which the oldest call in progress has waited for its result, s; calls that may take long excluded."""
+        """Time for which the oldest call in progress has waited for its result, s; slow ones do not count."""
         return time.monotonic() - min(self._begun.values()) if self._begun else 0.0
 
     async def run(self, call: Callable[[], _Result], slow: bool = False) -> _Result:

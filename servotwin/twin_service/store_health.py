@@ -52,8 +52,7 @@ class StoreHealth:
 
     @property
     def trouble(self) -> str:
-        """Reason for which the last read or write failed, or gets no answer; empty: neither, or the last failed write is
-        long ago."""
+        """Reason for which the last read or write failed, or gets no answer; empty: none did, or long ago."""
         if self._damage():
             return ""
         failed = self._writes.failure if self._now() - self._writes.failed_at < _UNHEALTHY_S else ""

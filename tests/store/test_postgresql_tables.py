@@ -45,7 +45,9 @@ def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
     with closing(open_store(address)) as store, closing(open_store(address)) as other:
         with other.engines.writer.begin() as connection:
             connection.execute(sa.text("LOCK TABLE messages IN ACCESS EXCLUSIVE MODE"))
-            with pytest.raises(StoreUnavailable, match=r"not available now \(canceling statement due to lock timeout\)"):
+            with pytest.raises(
+                StoreUnavailable, match=r"not available now \(canceling statement due to lock timeout\)"
+            ):
                 store.put([window()])
         assert store.put([window()]) == [PutResult.NEW]
 
@@ -54,7 +56,10 @@ def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
 def test_a_server_that_does_not_answer_is_not_waited_for_without_end(
     postgres_server: postgres.Server, given: str
 ) -> None:
-    with closing(open_store(postgresql_addresses(postgres_server)() + given)) as store, store.engines.reader.connect() as c:
+    with (
+        closing(open_store(postgresql_addresses(postgres_server)() + given)) as store,
+        store.engines.reader.connect() as c,
+    ):
         used = c.connection.driver_connection.info.get_parameters()
         assert (used["connect_timeout"], used["tcp_user_timeout"]) == ("3" if given else "10", "25000")
 
