@@ -30,6 +30,8 @@ _SERVER_TIMES = {
     "tcp_user_timeout": "25000",
 }
 """libpq's limits, s and ms, unless the URL gives others: its own wait minutes where a network swallows packets."""
+_LOCKED = "database is locked"
+"""SQLite's words: they sound as if the operator had locked it."""
 _PAUSE_S = 0.005
 """s between two attempts where SQLite itself does not wait."""
 _PAGE_BYTES = 8192
@@ -165,6 +167,8 @@ def _is_of_the_statement(error: DBAPIError) -> bool:
 
 def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:
     reason = message.strip().splitlines()[0] if message.strip() else "no reason given"
+    if reason == _LOCKED:
+        reason = f"another program has kept it locked for {_BUSY_S:g} s"
     return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason}{_closed_files(engine)})")
 
 
