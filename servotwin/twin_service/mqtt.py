@@ -170,6 +170,8 @@ class MqttServer:
     ----------
     trouble : str
         Why the broker is not connected; empty: it is.
+    refused : str
+        Why the broker delivers no answers of this twin, since it connected; empty: it does.
     """
 
     def __init__(self, broker: Broker, handler: MqttRequestHandler, group: str) -> None:
@@ -178,6 +180,7 @@ class MqttServer:
         self._held_back = 0
         self._connection: Connection | None = None
         self.trouble = "it has not answered yet"
+        self.refused = ""
 
     @property
     def connected(self) -> bool:
@@ -185,8 +188,10 @@ class MqttServer:
         return not self.trouble
 
     def sentences(self) -> list[str]:
-        """A sentence that says why the broker is not connected; none: it is."""
-        return [f"the MQTT broker is not connected: {self.trouble}"] if self.trouble else []
+        """A sentence that says why the broker is not connected, or passes no answers on; none: it does."""
+        if self.trouble:
+            return [f"the MQTT broker is not connected: {self.trouble}"]
+        return [f"the MQTT broker passes no answers on to edges: {self.refused}"] if self.refused else []
 
     async def start(self) -> None:
         """Connect, and reconnect whenever the connection is lost."""
@@ -195,6 +200,10 @@ class MqttServer:
         # paho calls back in a thread of its own.
         def on_message(topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
             loop.call_soon_threadsafe(self._receive, topic, payload, acknowledge)
+
+        def on_not_delivered(_number: int, why: str) -> None:
+            if why:  # otherwise only the edge is away
+                loop.call_soon_threadsafe(self._on_refused, why)
 
         session = MqttSession(
             # Another name at each start: a broker that sees a name twice ends the older connection.
@@ -205,7 +214,7 @@ class MqttServer:
             will=TWIN_GONE,
         )
         self._connection = Connection(
-            self._broker, session, MqttCallbacks(on_message, self._on_connected, self._on_lost)
+            self._broker, session, MqttCallbacks(on_message, self._on_connected, self._on_lost, on_not_delivered)
         )
 
     async def stop(self) -> None:
@@ -264,10 +273,15 @@ class MqttServer:
         return True
 
     def _on_connected(self, _session_lost: bool) -> None:
-        self.trouble = ""
+        self.trouble = self.refused = ""
         log.info("broker connected", extra={"broker": self._broker.url, "group": self._group})
 
     def _on_lost(self, why: str) -> None:
         if why != self.trouble:  # each reason once: it is tried again every few seconds
             log.warning("broker lost", extra={"broker": self._broker.url, "why": why})
         self.trouble = why
+
+    def _on_refused(self, why: str) -> None:
+        if why != self.refused:  # once: it concerns every answer
+            log.warning("broker refuses answers", extra={"broker": self._broker.url, "why": why})
+        self.refused = why
