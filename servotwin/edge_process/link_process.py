@@ -16,7 +16,7 @@ import socket
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Event, Thread
@@ -39,14 +39,13 @@ from servotwin.edge_process.monitoring import (
     summarise,
     write_status,
 )
+from servotwin.edge_process.open_outbox import open_outbox
 from servotwin.edge_process.shared_samples import SampleReader
 from servotwin.edge_process.transports import exclusive_transport, live_link
 from servotwin.edge_process.twin_limits import limits_told, window_trouble
 from servotwin.errors import InvalidInput
 from servotwin.link.claim import ExclusiveTransport
-from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.session import Receiver, Sender, Session
-from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Acknowledge, ClaimStatus, InvalidMessage, Resend, decode, encode
 from servotwin.runtime.frames import FrameSocket
 from servotwin.runtime.locks import locked
@@ -77,7 +76,7 @@ class LinkProcess:
         last = read_status(config.path(config.files.status)) or {}
         if last.get("servo", config.agent.servo) != config.agent.servo:
             last = {}  # what another servo's outbox held is not lost
-        self._run, self.outbox = run, _outbox(config, last)
+        self._run, self.outbox = run, open_outbox(config, last, run)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
         self._token, self._token_replaced = token_of(config), False
@@ -321,18 +320,6 @@ class LinkProcess:
                 status["live"] = dict(self._live.counts)
             status["down"] = {"trouble": self._troubles.logged("from the twin"), **self._receiver.counts}
         return {**status, "link_process": os.getpid(), "written": time.time()}
-
-
-def _outbox(config: EdgeConfig, last_status: Mapping[str, Any]) -> SqliteOutbox:
-    """Open the outbox; the last status tells how many windows waited in it, and how many it had had."""
-    files = config.files
-    windows = last_status.get("windows")
-    known = windows if isinstance(windows, dict) else {}
-    numbers = (known.get(name) for name in LastStatus._fields)
-    last = LastStatus(*(number if isinstance(number, int) else 0 for number in numbers))
-    kept = AcknowledgedLimits(files.acknowledged_bytes, files.acknowledged_s)
-    path = config.path(files.outbox)
-    return SqliteOutbox(path, config.agent.servo, files.windows, files.bytes, kept, last)
 
 
 def _live_view(

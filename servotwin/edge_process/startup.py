@@ -94,6 +94,11 @@ def next_boot(path: Path, random: bytes) -> str:
     return f"b{count}-{random.hex()}"
 
 
+def is_later_start(boot: str) -> bool:
+    """True where `next_boot` had counted a start before the one of this name."""
+    return not boot.startswith("b1-")
+
+
 def _count(path: Path) -> int:
     try:
         text = path.read_text(encoding="ascii").strip()

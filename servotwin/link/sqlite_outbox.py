@@ -74,6 +74,8 @@ class SqliteOutbox:
         Files of other servos that were in this one's place.
     missing : int
         Windows that waited at the last status, and are not in the file: it is an older one, or without its log.
+    empty : bool
+        The file was missing, or held nothing at all.
     """
 
     def __init__(
@@ -91,7 +93,7 @@ class SqliteOutbox:
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
         self._contents = OutboxContents(AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0), clock))
         self._last: LastStatus | None = last
-        self._stored = self.missing = 0
+        self._stored, self.missing, self.empty = 0, 0, False
         self.salvages: list[Salvage] = []
         self.others: list[OtherOutbox] = []
         self._lock = RLock()
@@ -303,6 +305,7 @@ class SqliteOutbox:
         """Load the file's contents, and count the windows that it lacks."""
         self._contents.load(connection)
         if SERVO not in self._contents.notes:
+            self.empty = not (self.salvages or self.others or self._contents.counts or self._contents.index)
             self._contents.set_value(SERVO, self._servo.encode())
         if self._last is not None:
             lacks = self._last.stored - sum(number for (number,) in connection.execute(STORED))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import sqlalchemy as sa
 
-from servotwin.store.engine import transaction
+from servotwin.store.engine import POSTGRESQL, transaction
 from servotwin.store.schema import messages
 from servotwin.store.store import Store
 
@@ -81,6 +81,14 @@ def newest_receipt(store: Store) -> float:
     with transaction(store.engines.reader) as connection:
         last = _receipt(connection, _LAST)
     return 0.0 if last is None else last.received
+
+
+def server_clock(store: Store) -> float | None:
+    """Time of PostgreSQL's server, s since the epoch; None: the store is a file of this machine."""
+    if store.engines.reader.dialect.name != POSTGRESQL:
+        return None
+    with transaction(store.engines.reader) as connection:
+        return float(connection.execute(sa.select(sa.func.extract("epoch", sa.func.clock_timestamp()))).scalar_one())
 
 
 def _backwards(

@@ -22,6 +22,16 @@ SQLITE, POSTGRESQL = "sqlite", "postgresql"
 _ALLOWED = "give the name of a file, sqlite:///FILE or postgresql://USER@HOST/DATABASE"
 _BUSY_S = 10.0
 """s that a connection waits for another one's transaction."""
+_SERVER_TIMES = {
+    "connect_timeout": "10",
+    "keepalives_idle": "10",
+    "keepalives_interval": "5",
+    "keepalives_count": "3",
+    "tcp_user_timeout": "25000",
+}
+"""libpq's limits, s and ms, unless the URL gives others: its own wait minutes where a network swallows packets."""
+_LOCKED = "database is locked"
+"""SQLite's words: they sound as if the operator had locked it."""
 _PAUSE_S = 0.005
 """s between two attempts where SQLite itself does not wait."""
 _PAGE_BYTES = 8192
@@ -157,6 +167,8 @@ def _is_of_the_statement(error: DBAPIError) -> bool:
 
 def _unavailable(engine: sa.Engine, message: str) -> StoreUnavailable:
     reason = message.strip().splitlines()[0] if message.strip() else "no reason given"
+    if reason == _LOCKED:
+        reason = f"another program has kept it locked for {_BUSY_S:g} s"
     return StoreUnavailable(f"store {public_address(engine.url)}: not available now ({reason}{_closed_files(engine)})")
 
 
@@ -171,12 +183,23 @@ def _closed_files(engine: sa.Engine) -> str:
 
 
 def _postgresql(address: sa.URL) -> sa.Engine:
+    times = {name: value for name, value in _SERVER_TIMES.items() if name not in address.query}
     try:
-        return sa.create_engine(address, hide_parameters=True, pool_size=_READERS, max_overflow=_READERS)
+        engine = sa.create_engine(
+            address, hide_parameters=True, pool_size=_READERS, max_overflow=_READERS, connect_args=times
+        )
     except ModuleNotFoundError:
         raise InvalidInput(
             f"store {public_address(address)}: PostgreSQL needs the package psycopg; install servotwin[postgres]"
         ) from None
+
+    @event.listens_for(engine, "connect")
+    def limit_locks(connection: Any, _record: Any) -> None:
+        # PostgreSQL itself waits for a lock for ever: VACUUM FULL, or a session that somebody forgot, would go unsaid.
+        connection.execute(f"SET lock_timeout = {round(1000.0 * _BUSY_S)}")
+        connection.commit()
+
+    return engine
 
 
 def _sqlite(address: sa.URL, connections: int, *, reading: bool) -> sa.Engine:

@@ -198,7 +198,13 @@ class AwaitedCommits:
     def __init__(self, commits: GroupCommit, clock: Callable[[], float] = time.monotonic) -> None:
         self._commits, self._clock = commits, clock
         self._done: deque[tuple[asyncio.Future[Any], Future[Any]]] = deque()
+        self._begun = dict[object, float]()
         self.failed_at, self.failure = -math.inf, ""
+
+    @property
+    def waited(self) -> float:
+        """Time for which the oldest write in progress has waited for its commit, s."""
+        return self._clock() - min(self._begun.values()) if self._begun else 0.0
 
     async def put(self, item: Incoming) -> PutResult:
         """Store a message; returns when it is on the disk. Raises as `GroupCommit.put` and its future do."""
@@ -209,11 +215,15 @@ class AwaitedCommits:
         return await self._result(self._commits.commit, result)
 
     async def _result(self, write: Callable[[_Record], Future[_Result]], record: _Record) -> _Result:
+        mark = object()
+        self._begun[mark] = self._clock()
         try:
             result = await self._wrap(write(record))
         except StoreUnavailable as error:
             self.failed_at, self.failure = self._clock(), str(error)
             raise
+        finally:
+            del self._begun[mark]
         self.failed_at, self.failure = -math.inf, ""
         return result
 

@@ -130,10 +130,18 @@ def missing_windows(store: Store, servo: str, boot: str, newest: int = 256) -> l
     """Ranges of sequences, both included, that are missing among the newest windows of a boot."""
     with transaction(store.engines.reader) as connection:
         rows = connection.execute(_NEWEST, {"_servo": servo, "_newest": newest}).all()
-    sequences = sorted({row.sequence for row in rows if row.boot == boot})
-    if sequences and len(rows) < newest:
-        sequences.insert(0, -1)  # a boot counts from 0
-    pairs = pairwise(sequences)
+        sequences = {row.sequence for row in rows if row.boot == boot}
+        if sequences and len(rows) < newest:
+            sequences.add(-1)  # a boot counts from 0
+        if holes := _holes(sequences):
+            # Windows that were sent again are the newest by their arrival, and those around them came long before.
+            between = {"_servo": servo, "_boot": boot, "_first": holes[0][0], "_last": holes[-1][1]}
+            holes = _holes(sequences.union(connection.execute(_BETWEEN, between).scalars()))
+    return holes
+
+
+def _holes(sequences: set[int]) -> list[tuple[int, int]]:
+    pairs = pairwise(sorted(sequences))
     return [(one + 1, other - 1) for one, other in pairs if other > one + 1]
 
 
@@ -172,4 +180,10 @@ _NEWEST = (
     .where(WINDOWS, messages.c.servo == sa.bindparam("_servo"))
     .order_by(messages.c.id.desc())
     .limit(sa.bindparam("_newest"))
+)
+_BETWEEN = sa.select(messages.c.sequence).where(
+    WINDOWS,
+    messages.c.servo == sa.bindparam("_servo"),
+    messages.c.boot == sa.bindparam("_boot"),
+    messages.c.sequence.between(sa.bindparam("_first"), sa.bindparam("_last")),
 )

@@ -28,15 +28,21 @@ def migrate(engine: sa.Engine, to: str = REVISION, scripts: Path = SCRIPTS) -> N
         It cannot be read or written.
     """
     with transaction(engine) as connection:
-        if _revision(connection) == to:
-            return
         if connection.dialect.name == POSTGRESQL:
+            # Another process may migrate for minutes.
+            connection.execute(sa.text("SET LOCAL lock_timeout = 0"))
             connection.execute(sa.select(sa.func.pg_advisory_xact_lock(_LOCK)))
-        # Read again under the lock: another process may have migrated meanwhile.
+        # Read under the lock: another process may have migrated meanwhile.
         current = _revision(connection)
         if current != to:
             _check(connection, current, to)
             _upgrade(connection, to, scripts)
+
+
+def is_newest(engine: sa.Engine) -> bool:
+    """True where a database needs no migration; it is only read. Raises StoreUnavailable."""
+    with transaction(engine) as connection:
+        return _revision(connection) == REVISION
 
 
 def _revision(connection: sa.Connection) -> str | None:

@@ -22,7 +22,7 @@ from servotwin.store.engine import (
     transaction,
 )
 from servotwin.store.incoming import insert_once
-from servotwin.store.migrate import migrate
+from servotwin.store.migrate import is_newest, migrate
 from servotwin.store.records import (
     Backlog,
     Incoming,
@@ -313,7 +313,9 @@ def open_store(url: str, password: str | None = None) -> Store:
     """
     engines = engines_of(parse_address(url, password))
     try:
-        migrate(engines.writer)
+        # Read first: a command that only reads does not wait for whoever is writing.
+        if not is_newest(engines.reader):
+            migrate(engines.writer)
     except StoreUnavailable as error:
         engines.dispose()
         raise InvalidInput(str(error)) from None

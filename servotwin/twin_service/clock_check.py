@@ -1,4 +1,4 @@
-"""A clock that is behind the store's newest message: it is wrong now, or was when that message came."""
+"""A clock that is behind the store's newest message, or differs from that of PostgreSQL's server."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from contextlib import suppress
 from datetime import UTC, datetime
 from functools import partial
 
-from servotwin.store.clock_gaps import newest_receipt
+from servotwin.store.clock_gaps import newest_receipt, server_clock
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import Store
 from servotwin.twin_service.store_executor import StoreExecutor
@@ -31,24 +31,32 @@ class ClockCheck:
 
     def __init__(self, store: Store, executor: StoreExecutor, wall: Callable[[], float]) -> None:
         self._store, self._executor, self._wall = store, executor, wall
-        self._fault = ""
+        self._faults: list[str] = []
 
     def sentences(self) -> list[str]:
-        """Return a sentence where the clock was behind the store at the start."""
-        return [self._fault] if self._fault else []
+        """Return a sentence on each fault of the clock at the start."""
+        return list(self._faults)
 
     async def tell(self, announce: Callable[[str, str], None]) -> None:
-        """Compare, and log and announce the sentence."""
+        """Compare, and log and announce what is found."""
         with suppress(StoreUnavailable):
+            server, now = await self._executor.run(lambda: (server_clock(self._store), self._wall()))
+            if server is not None and abs(server - now) > _APART_S:
+                # Twins whose clocks differ take each other's leases for ended, and work on the same messages.
+                fault = self._add(now, f"that of the database's server {_date(server)}: set the one that is wrong,")
+                log.warning("clock differs from the database server's", extra={"why": fault})
+                announce("clock differs from the database server's", fault)
             newest, now = await self._executor.run(partial(newest_receipt, self._store)), self._wall()
-            if newest <= now + _APART_S:
-                return
-            self._fault = (
-                f"the clock said {_date(now)} at the start, and the store's newest message came on {_date(newest)}: "
-                "set the clock if it is wrong, and restart the twin"
-            )
-            log.warning("clock behind the store", extra={"why": self._fault})
-            announce("clock behind the store", self._fault)
+            if newest > now + _APART_S:
+                came = f"the store's newest message came on {_date(newest)}: set the clock if it is wrong,"
+                fault = self._add(now, came)
+                log.warning("clock behind the store", extra={"why": fault})
+                announce("clock behind the store", fault)
+
+    def _add(self, now: float, against: str) -> str:
+        fault = f"the clock said {_date(now)} at the start, and {against} and restart the twin"
+        self._faults.append(fault)
+        return fault
 
 
 def _date(seconds: float) -> str:

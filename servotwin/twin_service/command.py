@@ -115,6 +115,8 @@ def open_existing_store(config: ServiceConfig) -> Store:
     file = sqlite_file(parse_address(config.store))
     if file is not None and not file.is_file():
         raise InvalidInput(f"store {file}: there is no such file; the twin makes it when it first runs")
+    if file is not None and not file.stat().st_size and not file.with_name(f"{file.name}-wal").exists():
+        raise InvalidInput(f"store {file}: is empty: cut short, or never written; restore a backup, or move it away")
     return _open_configured_store(config)
 
 

@@ -39,8 +39,8 @@ from servotwin.twin_service.store_executor import StoreExecutor
 
 MAX_ROWS = 1000
 _Result = TypeVar("_Result")
-_BACKLOG_S = 0.5
-"""s for which a backlog that was read is served again."""
+_BACKLOG_S, _PATIENCE_S = 0.5, 5.0
+"""s for which a backlog that was read is served again; s that a request for health waits for the store."""
 Health = Callable[[Backlog | None], dict[str, Any]]
 """Returns the health of each part of the service, "ok" for all of them, and "degraded"; None: the store is away."""
 
@@ -72,7 +72,7 @@ class OperatorApi:
     ) -> None:
         self._operators, self._store, self._executor, self._readers = operators, store, executor, readers
         self._health, self._metrics, self._wall = health, metrics, wall
-        self._backlog_lock = asyncio.Lock()
+        self._reading: asyncio.Future[Backlog] | None = None
         self._backlog: tuple[float, Backlog | None] = -math.inf, None
         metrics.add_gauge("servotwin_waiting", "Messages and verifications not yet processed.", self._counts, "kind")
         metrics.add_gauge("servotwin_waiting_seconds", "Age of the oldest message not yet processed.", self._age)
@@ -192,13 +192,28 @@ class OperatorApi:
         return math.nan if backlog is None else backlog.lag
 
     async def _read_backlog(self) -> Backlog:
-        """Backlog, read from the store at most every 0.5 s: requests for it need no token and have no rate limit."""
-        async with self._backlog_lock:
-            at, backlog = self._backlog
-            if backlog is None or self._wall() - at >= _BACKLOG_S:
-                backlog = await self._executor.run(lambda: self._store.backlog(self._wall()))
-                self._backlog = self._wall(), backlog
+        """Backlog, read from the store at most every 0.5 s: requests for it need no token and have no rate limit.
+
+        Raises
+        ------
+        StoreUnavailable
+            It cannot be read, or not in time: whoever asks for health needs an answer.
+        """
+        at, backlog = self._backlog
+        if backlog is not None and 0.0 <= self._wall() - at < _BACKLOG_S:
             return backlog
+        if self._reading is None or self._reading.done():
+            self._reading = asyncio.ensure_future(self._executor.run(lambda: self._store.backlog(self._wall())))
+            self._reading.add_done_callback(self._note_backlog)
+        # Not cancelled when the time is over: it goes on to the next request's answer.
+        await asyncio.wait({self._reading}, timeout=_PATIENCE_S)
+        if not self._reading.done():
+            raise StoreUnavailable("the store does not answer")
+        return self._reading.result()
+
+    def _note_backlog(self, reading: asyncio.Future[Backlog]) -> None:
+        if not reading.cancelled() and reading.exception() is None:
+            self._backlog = self._wall(), reading.result()
 
     async def _query(self, call: Callable[[], Any]) -> Any:
         return await store_query(self._readers, call)

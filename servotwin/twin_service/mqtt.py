@@ -51,6 +51,9 @@ _RESPONSE_EXPIRY_S = 60.0
 _MOST_HELD_BACK = 1000
 """Answers to refused requests that are held back at once; further ones are left out, since nobody waits for so many."""
 
+_TOPIC_SHOWN = 100
+"""Characters of a topic that is no servo's in the log: anybody on the broker may choose 65,535."""
+
 
 class MqttAnswer(NamedTuple):
     """Answer to a request.
@@ -108,6 +111,10 @@ class MqttRequestHandler:
             # Anybody on the broker may write the name of an edge, which must not slow down that edge.
             return MqttAnswer(None if too_large else encode_unknown_peer(data), f"name {servo}")
 
+    def refuse_topic(self, topic: str) -> None:
+        """Count and log a message to a topic that is no servo's; there is nobody to answer."""
+        self._refusals.log(Refusal.NOT_UNDERSTOOD, "", False, why=f"topic {topic[:_TOPIC_SHOWN]!r} is no servo's")
+
     async def respond(self, request: ReceivedRequest) -> MqttAnswer:
         """Handle a request; the answer has no response where its token was revoked."""
         refused = ""
@@ -163,6 +170,8 @@ class MqttServer:
     ----------
     trouble : str
         Why the broker is not connected; empty: it is.
+    refused : str
+        Why the broker delivers no answers of this twin, since it connected; empty: it does.
     """
 
     def __init__(self, broker: Broker, handler: MqttRequestHandler, group: str) -> None:
@@ -171,6 +180,7 @@ class MqttServer:
         self._held_back = 0
         self._connection: Connection | None = None
         self.trouble = "it has not answered yet"
+        self.refused = ""
 
     @property
     def connected(self) -> bool:
@@ -178,8 +188,10 @@ class MqttServer:
         return not self.trouble
 
     def sentences(self) -> list[str]:
-        """A sentence that says why the broker is not connected; none: it is."""
-        return [f"the MQTT broker is not connected: {self.trouble}"] if self.trouble else []
+        """A sentence that says why the broker is not connected, or passes no answers on; none: it does."""
+        if self.trouble:
+            return [f"the MQTT broker is not connected: {self.trouble}"]
+        return [f"the MQTT broker passes no answers on to edges: {self.refused}"] if self.refused else []
 
     async def start(self) -> None:
         """Connect, and reconnect whenever the connection is lost."""
@@ -188,6 +200,10 @@ class MqttServer:
         # paho calls back in a thread of its own.
         def on_message(topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
             loop.call_soon_threadsafe(self._receive, topic, payload, acknowledge)
+
+        def on_not_delivered(_number: int, why: str) -> None:
+            if why:  # otherwise only the edge is away
+                loop.call_soon_threadsafe(self._on_refused, why)
 
         session = MqttSession(
             # Another name at each start: a broker that sees a name twice ends the older connection.
@@ -198,7 +214,7 @@ class MqttServer:
             will=TWIN_GONE,
         )
         self._connection = Connection(
-            self._broker, session, MqttCallbacks(on_message, self._on_connected, self._on_lost)
+            self._broker, session, MqttCallbacks(on_message, self._on_connected, self._on_lost, on_not_delivered)
         )
 
     async def stop(self) -> None:
@@ -211,9 +227,14 @@ class MqttServer:
             await asyncio.to_thread(connection.close)
 
     def _receive(self, topic: str, payload: bytes, acknowledge: Callable[[], None]) -> None:
-        """Start handling a request, on the event loop; an ignored one stays unacknowledged and goes to another twin."""
+        """Start handling a request, on the event loop; one that comes during a stop goes to another twin."""
+        if self._connection is None:
+            return
         servo = servo_of(topic)
-        if servo is None or self._connection is None:
+        if servo is None:
+            # Of messages that are not acknowledged the broker allows a number, and after those sends none at all.
+            acknowledge()
+            self._handler.refuse_topic(topic)
             return
         task = asyncio.create_task(self._serve(self._connection, servo, payload, acknowledge))
         self._tasks.add(task)
@@ -252,10 +273,15 @@ class MqttServer:
         return True
 
     def _on_connected(self, _session_lost: bool) -> None:
-        self.trouble = ""
+        self.trouble = self.refused = ""
         log.info("broker connected", extra={"broker": self._broker.url, "group": self._group})
 
     def _on_lost(self, why: str) -> None:
         if why != self.trouble:  # each reason once: it is tried again every few seconds
             log.warning("broker lost", extra={"broker": self._broker.url, "why": why})
         self.trouble = why
+
+    def _on_refused(self, why: str) -> None:
+        if why != self.refused:  # once: it concerns every answer
+            log.warning("broker refuses answers", extra={"broker": self._broker.url, "why": why})
+        self.refused = why

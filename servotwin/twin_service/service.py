@@ -338,7 +338,9 @@ class TwinService:
             await asyncio.sleep(_RETENTION_S)
             before, stored = stored, self.metrics.stored.values["window", PutResult.NEW.value]
             with suppress(StoreUnavailable):
-                done = await self.executor.run(partial(self._delete_old, age, _LEAST_DELETED + 2 * (stored - before)))
+                done = await self.executor.run(
+                    partial(self._delete_old, age, _LEAST_DELETED + 2 * (stored - before)), slow=True
+                )
                 if done.emptied:
                     log.info("old window bodies deleted", extra=done._asdict())
 

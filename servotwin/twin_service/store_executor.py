@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
@@ -30,15 +31,26 @@ class StoreExecutor:
 
     def __init__(self, threads: int = _THREADS, name: str = "store") -> None:
         self._threads = ThreadPoolExecutor(threads, name)
+        self._begun = dict[object, float]()
         self.fault = ""
 
-    async def run(self, call: Callable[[], _Result]) -> _Result:
-        """Run a call in a thread; raises what it raises, above all StoreUnavailable."""
+    @property
+    def waited(self) -> float:
+        """Time for which the oldest call in progress has waited for its result, s; slow ones do not count."""
+        return time.monotonic() - min(self._begun.values()) if self._begun else 0.0
+
+    async def run(self, call: Callable[[], _Result], slow: bool = False) -> _Result:
+        """Run a call in a thread; raises what it raises, above all StoreUnavailable. `slow`: it may take minutes."""
+        mark = object()
+        if not slow:
+            self._begun[mark] = time.monotonic()
         try:
             result = await asyncio.get_running_loop().run_in_executor(self._threads, call)
         except StoreUnavailable as error:
             self.fault = str(error)
             raise
+        finally:
+            self._begun.pop(mark, None)
         self.fault = ""
         return result
 

@@ -14,6 +14,9 @@ log = logging.getLogger(__name__)
 
 _UNHEALTHY_S = 60.0
 """s for which the store counts as unhealthy after a failed write, unless a later one succeeds."""
+_STALLED_S = 12.0
+"""s after which a store that does not answer is not available: it fails by itself where it waits 10 s for a lock, and
+edges do not wait longer."""
 _LOOK_S, _LASTS_S, _OVER_S = 1.0, 5.0, 10.0
 """s between two looks; after which trouble is no moment's, and posted; without trouble after which it is over: on a
 full disk reads succeed between writes that fail."""
@@ -49,11 +52,17 @@ class StoreHealth:
 
     @property
     def trouble(self) -> str:
-        """Reason for which the last read or write failed; empty: none did, or the last failed write is long ago."""
+        """Reason for which the last read or write failed, or gets no answer; empty: none did, or long ago."""
         if self._damage():
             return ""
         failed = self._writes.failure if self._now() - self._writes.failed_at < _UNHEALTHY_S else ""
-        return self._leases() or failed or self._executor.fault
+        return self._leases() or failed or self._executor.fault or self._stalled()
+
+    def _stalled(self) -> str:
+        """A server that hangs, or a disk that does, gives no error."""
+        if max(self._executor.waited, self._writes.waited) < _STALLED_S:
+            return ""
+        return f"the store has not answered for {_STALLED_S:g} s: its server, its disk or the network between hangs"
 
     def look(self, announce: Callable[[str, str], None]) -> None:
         """Log trouble, each reason once, since a log fills a full disk too; announce it once it lasts."""

@@ -94,7 +94,7 @@ class StoreWatch:
     async def start(self) -> None:
         """Check the pages for a short time, and if messages are missing that the store once had."""
         with suppress(StoreUnavailable):
-            self._found(await self._executor.run(partial(check_pages, self._store, _START_S)))
+            self._found(await self._executor.run(partial(check_pages, self._store, _START_S), slow=True))
             if not self.fault:
                 await self._executor.run(self._compare_mark)
 
@@ -104,7 +104,7 @@ class StoreWatch:
         while not self.fault:
             begun = self._monotonic()
             with suppress(StoreUnavailable):
-                after = await self._executor.run(partial(self._check_some, after))
+                after = await self._executor.run(partial(self._check_some, after), slow=True)
             await asyncio.sleep(max(1.0, (self._monotonic() - begun) * (1.0 / _SHARE - 1.0)))
 
     async def run_mark(self) -> None:

@@ -93,7 +93,10 @@ def _announce(folder: Folder, url: str, console: Console) -> None:
 
 def _initial_speed(folder: Folder) -> float:
     """Choose a speed a little below the last one, which this machine may not reach under its present load."""
-    last = [read_speed(folder.servo(servo) / _SPEED_FILE) or 0.0 for servo in SERVOS]
+    try:
+        last = [read_speed(folder.servo(servo) / _SPEED_FILE) or 0.0 for servo in SERVOS]
+    except InvalidInput:  # it is written anew before the machines start
+        return SLOWEST
     return max(SLOWEST, _CAUTION * min(last))
 
 

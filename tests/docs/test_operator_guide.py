@@ -181,6 +181,7 @@ def test_every_field_of_an_edge_s_status_is_explained() -> None:
     assert fields - set(NAME.findall(text)) == set()
     faults = counted("edge_process", "self.faults", "self._faults")
     faults |= {sqlite_outbox.ANOTHER, sqlite_outbox.BROKEN, sqlite_outbox.UNWRITABLE, outlet.UNFILTERED}
+    faults |= {sqlite_outbox.INCOMPLETE}
     assert faults - set(NAME.findall(text)) == set()
 
 

@@ -24,10 +24,10 @@ WINDOWS, OF_LOG = 24, 8
 
 
 @contextmanager
-def link(folder: Path) -> Iterator[LinkProcess]:
+def link(folder: Path, run: str = "b1-aa") -> Iterator[LinkProcess]:
     """A link process that does not run; it writes its status at the beginning and at the end."""
     ours, theirs = socket.socketpair()
-    process = LinkProcess(load(folder / "edge.toml"), theirs, "b1-aa")
+    process = LinkProcess(load(folder / "edge.toml"), theirs, run)
     try:
         process._check()
         yield process
@@ -78,6 +78,31 @@ def test_windows_of_a_file_that_was_not_copied_are_counted_once(
     log = capfd.readouterr().err
     assert log.count('"event":"outbox incomplete"') == (left < WINDOWS)
     assert log.count('"event":"windows dropped"') == (left < WINDOWS)
+
+
+@pytest.mark.parametrize("left", [0, 100])
+def test_an_outbox_and_a_status_that_are_both_lost_are_said_once(
+    folder: Path, left: int, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for path in folder.glob("outbox.sqlite-*"):
+        path.unlink()
+    for name in ("outbox.sqlite", "status.json"):
+        path = folder / name
+        path.write_bytes(path.read_bytes()[:left])
+    for run in ("b2-bb", "b3-cc"):
+        with link(folder, run):
+            faults = (read_status(folder / "status.json") or {})["disk"]["faults"]
+            assert sum(faults.values()) == (run == "b2-bb")
+    log = capfd.readouterr().err
+    assert log.count('"event":"outbox incomplete"') + log.count('"event":"outbox broken"') == 1
+
+
+def test_a_new_edge_has_lost_no_outbox(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    for path in (*folder.glob("outbox.sqlite*"), folder / "status.json"):
+        path.unlink()
+    with link(folder):
+        assert (read_status(folder / "status.json") or {})["disk"]["faults"] == {}
+    assert "outbox" not in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.95])

@@ -122,6 +122,15 @@ def test_holes_in_the_sequences_of_a_boot_are_found(store: Store) -> None:
     assert missing_windows(store, "a", "boot") == []
 
 
+def test_windows_that_were_sent_again_leave_no_hole_around_those_that_were_not(store: Store) -> None:
+    # As after a backup was restored: the edge sends again what was lost, and later windows were stored before.
+    store.put([window(sequence=n) for n in (3, 4, 5, 0, 1, 2, 6)])
+    for newest in (3, 4, 5, 256):
+        assert missing_windows(store, "a", "boot", newest) == []
+    store.put([window(sequence=n) for n in (8, 9)])
+    assert missing_windows(store, "a", "boot", 6) == [(7, 7)]
+
+
 def test_a_message_is_posted_to_an_edge_besides_results(store: Store) -> None:
     store.put([window()])
     store.post({"a": b"asking", "unknown": b"lost"}, 100.0)

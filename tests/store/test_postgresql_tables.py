@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 
 import postgres
 import pytest
@@ -9,9 +10,10 @@ import sqlalchemy as sa
 from store_cases import claim, outcome, postgresql_addresses, window
 
 from servotwin.errors import InvalidInput
+from servotwin.store import engine
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.integrity import check_pages
-from servotwin.store.records import EvidenceRecord
+from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.store import Store, open_store
 
 pytest_plugins = ("store_fixtures",)
@@ -33,6 +35,33 @@ def run(store: Store, *statements: str) -> None:
     with store.engines.writer.begin() as connection:
         for statement in statements:
             connection.execute(sa.text(statement))
+
+
+def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
+    postgres_server: postgres.Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(engine, "_BUSY_S", 0.2)
+    address = postgresql_addresses(postgres_server)()
+    with closing(open_store(address)) as store, closing(open_store(address)) as other:
+        with other.engines.writer.begin() as connection:
+            connection.execute(sa.text("LOCK TABLE messages IN ACCESS EXCLUSIVE MODE"))
+            with pytest.raises(
+                StoreUnavailable, match=r"not available now \(canceling statement due to lock timeout\)"
+            ):
+                store.put([window()])
+        assert store.put([window()]) == [PutResult.NEW]
+
+
+@pytest.mark.parametrize("given", ["", "&connect_timeout=3"])
+def test_a_server_that_does_not_answer_is_not_waited_for_without_end(
+    postgres_server: postgres.Server, given: str
+) -> None:
+    with (
+        closing(open_store(postgresql_addresses(postgres_server)() + given)) as store,
+        store.engines.reader.connect() as c,
+    ):
+        used = c.connection.driver_connection.info.get_parameters()
+        assert (used["connect_timeout"], used["tcp_user_timeout"]) == ("3" if given else "10", "25000")
 
 
 def test_a_sound_store_is_read_whole(filled: Store) -> None:

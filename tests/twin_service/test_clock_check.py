@@ -6,16 +6,20 @@ import time
 from pathlib import Path
 
 import pytest
+from postgres import Server
 from service_system import bearer, place, served, twin_file, window
+from store_cases import postgresql_addresses
 
 from servotwin.messages import encode
 from servotwin.twin_service import ingest, service
+
+pytest_plugins = ("store_fixtures",)
 
 DAY = 86400.0
 
 
 def started(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, sequence: int
+    folder: Path, monkeypatch: pytest.MonkeyPatch, days: float, sequence: int, service_keys: str = ""
 ) -> tuple[int, list[str], list[tuple[str, str]]]:
     """Start a twin whose clock is off by some days, and send a window; status, what is degraded, and alarms."""
     told: list[tuple[str, str]] = []
@@ -25,7 +29,7 @@ def started(
     monkeypatch.setattr(service.TwinService, "_announce", lambda _, *alarm: told.append(alarm[:2]))
 
     async def body() -> tuple[int, list[str]]:
-        async with served(twin_file(folder)) as (_, client):
+        async with served(twin_file(folder, service_keys)) as (_, client):
             await asyncio.sleep(0.2)
             sent = window(sequence)
             answer = await client.put(place(sent), content=encode(sent), headers=bearer())
@@ -53,3 +57,20 @@ def test_a_twin_whose_clock_is_behind_its_store_says_so_with_both_times(
     assert started(tmp_path, monkeypatch, 60.0, 2) == (201, [], [])
     assert len(started(tmp_path, monkeypatch, 0.0, 3)[1]) == 1
     assert started(tmp_path, monkeypatch, 0.0, 3) == (200, [], [])
+
+
+@pytest.mark.parametrize("days", [0.0, 1 / 24, -1 / 24, 60.0])
+def test_a_twin_whose_clock_differs_from_postgresqls_says_so_whichever_is_ahead(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, postgres_server: Server, days: float
+) -> None:
+    address = postgresql_addresses(postgres_server)()
+    status, degraded, told = started(tmp_path, monkeypatch, days, 0, f'store = "{address}"')
+    assert status == 201, "edges go on"
+    if not days:
+        assert (degraded, told) == ([], [])
+        return
+    [sentence] = degraded
+    assert told == [("clock differs from the database server's", sentence)]
+    then = time.strftime("%Y-%m-%d %H:", time.gmtime(time.time() + days * DAY))
+    assert f"the clock said {then}" in sentence
+    assert "that of the database's server " in sentence

@@ -9,6 +9,7 @@ import pytest
 from mosquitto import Login, Tls, broker
 from mqttparts import edge, kept, parcel, twin
 from selfsigned import self_made
+from waiting import until
 
 from servotwin.config.table import parse_toml
 from servotwin.edge_process.config import password_of
@@ -64,6 +65,25 @@ def test_the_rules_that_the_guide_shows_are_enough_and_keep_others_out(tmp_path:
             with pytest.raises(Unreachable, match=r"the broker refuses what this user sends \(Not authorized\)"):
                 other.deliver(parcel(0, "axis-2"))
     assert (kept(store), kept(store, "axis-2")) == ([0], [])
+
+
+@pytest.mark.slow
+def test_a_twin_whose_user_may_not_answer_says_so(
+    tmp_path: Path, store: Store, caplog: pytest.LogCaptureFixture
+) -> None:
+    rules = shown("pattern write").replace("topic write servotwin/+/down\n", "")
+    assert rules != shown("pattern write")
+    logins = Login("twins", "twin's password"), Login("axis-1", "edge's password")
+    with broker(tmp_path / "broker", logins, rules=rules) as server:
+        twins, edges = (Broker(server.url, *login) for login in logins)
+        with twin(twins, store), edge(edges, timeout_s=1.0) as here:
+            for _ in range(2):
+                with pytest.raises(Unreachable, match="no answer of a twin"):
+                    here.deliver(parcel(0))
+            until(lambda: "broker refuses answers" in caplog.messages)
+    assert kept(store) == [0]
+    [line] = [each for each in caplog.records if each.message == "broker refuses answers"]
+    assert vars(line)["why"] == "the broker refuses what this user sends (Not authorized)"
 
 
 @pytest.mark.slow

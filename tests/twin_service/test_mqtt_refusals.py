@@ -99,6 +99,20 @@ def test_a_flood_holds_up_neither_the_broker_nor_an_honest_edge(released: asynci
     asyncio.run(body())
 
 
+def test_messages_to_topics_of_no_servo_leave_the_broker_room_for_those_of_edges(released: asyncio.Event) -> None:
+    async def body() -> None:
+        metrics, acknowledged = Metrics(), list[str]()
+        there, noted = server(metrics)
+        for name in ("bad name", "", "x" * 65, "x" * 60000):
+            there._receive(wire.request_topic(name), b"x", lambda: acknowledged.append("stranger"))
+        await settle()
+        assert (len(acknowledged), noted.published) == (4, []), "the broker stops after 1000 without acknowledgement"
+        assert +metrics.rejected.values == {("not_understood",): 4}
+        await there.stop()
+
+    asyncio.run(body())
+
+
 def test_an_edge_that_repeats_what_is_refused_is_slowed_down_by_itself(released: asyncio.Event) -> None:
     async def body() -> None:
         there, noted = server(Metrics())

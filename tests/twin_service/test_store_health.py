@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import threading
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +10,8 @@ import pytest
 from service_system import MSGPACK, bearer, hello, served, twin_file
 
 from servotwin.store.engine import StoreUnavailable
-from servotwin.twin_service import store_health, store_watch
+from servotwin.store.records import Backlog
+from servotwin.twin_service import http_operator, store_health, store_watch
 from servotwin.twin_service.store_health import StoreHealth
 
 FULL = "the database cannot be used: database or disk is full"
@@ -21,8 +23,8 @@ class Watched:
 
     def __init__(self) -> None:
         self.now, self.leases, self.damage = 1000.0, "", ""
-        self.reads, self.told = SimpleNamespace(fault=""), list[tuple[str, str]]()
-        self.writes = SimpleNamespace(failure="", failed_at=-1e9)
+        self.reads, self.told = SimpleNamespace(fault="", waited=0.0), list[tuple[str, str]]()
+        self.writes = SimpleNamespace(failure="", failed_at=-1e9, waited=0.0)
         self.health = StoreHealth(self.reads, self.writes, lambda: self.leases, lambda: self.damage, lambda: self.now)
 
     def looked(self, seconds: int) -> None:
@@ -78,6 +80,52 @@ def test_a_moments_trouble_is_not_posted_and_reads_that_succeed_in_between_are_n
         watched.looked(4)
     assert lines(caplog) == [(KIND, FULL)]
     assert watched.told == [(KIND, FULL + MEANWHILE)]
+
+
+@pytest.mark.parametrize("part", ["reads", "writes"])
+def test_a_store_that_hangs_is_told_although_it_gives_no_error(caplog: pytest.LogCaptureFixture, part: str) -> None:
+    caplog.set_level(logging.INFO)
+    watched = Watched()
+    calls = getattr(watched, part)
+    for second in range(11):  # as long as it may wait for a lock
+        calls.waited = float(second)
+        watched.looked(1)
+    assert not watched.health.trouble
+    for second in range(12, 40):
+        calls.waited = float(second)
+        watched.looked(1)
+    ((_, why),) = lines(caplog)
+    assert "hangs" in why
+    assert watched.told == [(KIND, why + MEANWHILE)]
+    calls.waited = 0.0
+    watched.looked(20)
+    assert lines(caplog)[1:] == [("store available again", "")]
+
+
+def test_health_and_metrics_answer_while_the_store_does_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_operator, "_PATIENCE_S", 0.05)
+    monkeypatch.setattr(store_health, "_STALLED_S", 0.1)
+    released = threading.Event()
+
+    async def body() -> None:
+        async with served(twin_file(tmp_path)) as (system, client), asyncio.timeout(60.0):
+            backlog = system.store.backlog
+
+            def hanging(now: float) -> Backlog:
+                assert released.wait(60.0)
+                return backlog(now)
+
+            monkeypatch.setattr(system.store, "backlog", hanging)
+            try:
+                for _ in range(9):  # more than there are threads for the store
+                    assert not (await client.get("/healthz")).json()["store"]
+                assert "servotwin_store_ok 0" in (await client.get("/metrics")).text.splitlines()
+            finally:
+                released.set()
+            while not (await client.get("/healthz")).json()["store"]:
+                await asyncio.sleep(0.02)
+
+    asyncio.run(body())
 
 
 def test_a_damaged_store_is_told_by_its_damage_alone() -> None:

@@ -11,9 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as some
 from rich.console import Console
 
-from servotwin.drives.simulated.machine_state import MachineState, read_speed, read_state, write_speed, write_state
+from servotwin.drives.simulated.machine_state import MachineState, read_state, write_speed, write_state
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.drives.simulated.state_recorder import StateRecorder
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import PiecewiseCubic, SCurve
 from servotwin.up import display
@@ -175,10 +176,44 @@ def test_an_invalid_state_file_is_refused(tmp_path: Path, text: str) -> None:
         read_state(tmp_path / "state.json")
 
 
-@pytest.mark.parametrize("text", ["", "fast", "0", "-3", "nan", "inf", "1e9", "5 6"])
-def test_an_invalid_speed_file_changes_nothing(tmp_path: Path, text: str) -> None:
-    (tmp_path / "speed").write_text(text)
-    assert read_speed(tmp_path / "speed") is None
+RUBBISH = ["", "fast", "0", "-3", "nan", "inf", "1e9", "5 6", "\xff"]
+
+
+@pytest.mark.parametrize("text", RUBBISH)
+def test_a_machine_is_not_started_with_rubbish_in_its_speed_file(tmp_path: Path, text: str) -> None:
+    (tmp_path / "speed").write_text(text, encoding="latin-1")
+    with pytest.raises(InvalidInput, match=r"machine\.toml: speed_file = .*speed: holds .*; give one number above 0"):
+        machine(tmp_path)
+
+
+@pytest.mark.parametrize("text", RUBBISH)
+def test_rubbish_in_the_speed_file_of_a_running_machine_is_said_once_and_changes_nothing(
+    tmp_path: Path, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = machine(tmp_path)
+    pace = Pace(1000.0, settings.speed, 0.25, 0.0)
+    recorder = StateRecorder(settings, pace, 0.0)
+    (tmp_path / "speed").write_text(text, encoding="latin-1")
+    for second in range(5):
+        recorder.update(second, float(second))
+    assert pace.reached(5.0) == Pace(1000.0, settings.speed, 0.25, 0.0).reached(5.0)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(f"; the speed stays {settings.speed:g}")
+    write_speed(tmp_path / "speed", 2.0 * settings.speed)
+    recorder.update(6, 6.0)
+    assert pace.reached(8.0) - pace.reached(7.0) == pytest.approx(2000.0 * settings.speed, abs=2.0)
+    assert not capsys.readouterr().err
+
+
+def test_a_speed_file_that_is_empty_for_a_moment_is_not_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = machine(tmp_path)
+    recorder = StateRecorder(settings, Pace(1000.0, settings.speed, 0.25, 0.0), 0.0)
+    for second, text in enumerate(["", "5", "", "6"]):
+        (tmp_path / "speed").write_text(text)
+        recorder.update(second, float(second))
+    assert not capsys.readouterr().err
 
 
 @given(some.floats(0.1, 100.0), some.floats(0.1, 100.0), some.floats(0.0, 50.0))

@@ -65,12 +65,26 @@ def write_state(path: Path, state: MachineState) -> None:
 
 
 def read_speed(path: Path) -> float | None:
-    """Read the speed file; None where it holds no allowed speed, so that the present one stays."""
+    """Read the speed file; None: there is none.
+
+    Raises
+    ------
+    InvalidInput
+        It cannot be read, or holds no allowed speed.
+    """
     try:
-        speed = float(path.read_bytes()[:_MAX_BYTES])
-    except (OSError, ValueError):
+        text = path.read_bytes()[:_MAX_BYTES]
+        speed = float(text)
+    except FileNotFoundError:
         return None
-    return speed if 0.0 < speed <= MAX_SPEED else None
+    except OSError as error:
+        raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
+    except ValueError:
+        speed = math.nan
+    if not 0.0 < speed <= MAX_SPEED:
+        shown = text.decode(errors="replace").strip()
+        raise InvalidInput(f"{path}: holds {shown!r}; give one number above 0 and at most {MAX_SPEED:g}, in s per s")
+    return speed
 
 
 def write_speed(path: Path, speed: float) -> None:

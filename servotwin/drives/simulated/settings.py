@@ -114,7 +114,10 @@ class MachineSettings:
     ] = None
     speed_file: Annotated[
         Path | None,
-        key(help="File with a number that replaces speed, at the start and whenever the file changes."),
+        key(
+            help="File with a number that replaces speed, at the start and whenever the file changes. One that holds "
+            "none is refused at the start; later it is said, and the speed stays."
+        ),
     ] = None
     begin: float = 0.0
 
@@ -146,11 +149,13 @@ class MachineSettings:
         table, folder = read_toml(path), Path(path).parent
         machine: MachineSettings = read(table, cls, folder)
         table.done()
+        with named(table) if machine.speed_file is None else of_key(table, "speed_file"):
+            speed = None if machine.speed_file is None else read_speed(machine.speed_file)
         with named(table) if machine.state_file is None else of_key(table, "state_file"):
-            return machine.resumed()
+            return replace(machine, speed=speed or machine.speed).resumed()
 
     def resumed(self) -> MachineSettings:
-        """Continue from the state file, at the speed of the speed file.
+        """Continue from the state file.
 
         Raises
         ------
@@ -158,8 +163,7 @@ class MachineSettings:
             The state file holds no state of a machine.
         """
         state = None if self.state_file is None else read_state(self.state_file)
-        speed = None if self.speed_file is None else read_speed(self.speed_file)
-        return replace(self, begin=0.0 if state is None else state.time_s, speed=speed or self.speed)
+        return replace(self, begin=0.0 if state is None else state.time_s)
 
     @property
     def present(self) -> Scenario:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 import time
 from contextlib import suppress
 
 from servotwin.drives.simulated.machine_state import MachineState, read_speed, write_state
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.settings import MachineSettings
+from servotwin.errors import InvalidInput
 
 PERIOD_S = 0.5
 """Interval between updates, s by the clock."""
@@ -30,6 +32,7 @@ class StateRecorder:
         self._settings, self._pace = settings, pace
         self._speed = settings.speed
         self._due = now
+        self._fault = self._said = ""
 
     def update(self, sample: int, now: float) -> None:
         """Write the state and read the speed if `PERIOD_S` has passed since the last time."""
@@ -56,7 +59,19 @@ class StateRecorder:
 
     def _change_speed(self, now: float) -> None:
         path = self._settings.speed_file
-        speed = None if path is None else read_speed(path)
+        try:
+            speed = None if path is None else read_speed(path)
+        except InvalidInput as error:
+            self._say(str(error))
+            return
+        self._fault = self._said = ""
         if speed is not None and speed != self._speed:
             self._speed = speed
             self._pace.change(speed, now)
+
+    def _say(self, fault: str) -> None:
+        """Say a fault once, found for the second time: a file that is being written is empty for a moment."""
+        if fault == self._fault != self._said:
+            self._said = fault
+            print(f"{fault}; the speed stays {self._speed:g}", file=sys.stderr, flush=True)
+        self._fault = fault
