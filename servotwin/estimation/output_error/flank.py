@@ -19,7 +19,6 @@ from servotwin.estimation.core.whitening import Autoregression
 from servotwin.estimation.estimate import NORMAL_95
 from servotwin.estimation.output_error.fit import Fit, FitProblem, Search, descend, noise_in, on_each_flank
 from servotwin.estimation.output_error.flank_models import Flank, FlankModel, OwnModel, by_flank
-from servotwin.estimation.output_error.held_chain import HeldChainModel
 from servotwin.estimation.output_error.jitter import time_jitter
 from servotwin.estimation.output_error.mismatches import (
     APART,
@@ -29,7 +28,6 @@ from servotwin.estimation.output_error.mismatches import (
     unusual_numbers,
 )
 from servotwin.estimation.output_error.models import HALF, OFFSET, RATIO, ShaftModel, other_friction
-from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.rounding import rounded
 from servotwin.estimation.output_error.settings import OutputErrorSettings
@@ -94,13 +92,13 @@ class OneFlank:
     def of(cls, found: Search, settings: OutputErrorSettings) -> OneFlank | None:
         """Read the flank from the fit of a window that one flank explains; None where it is not told for certain."""
         model, problem = found.problem.model, found.problem
+        # One mass on a rigid screw creeps to its target alike with another ratio and with another delay.
         if not isinstance(model, OwnModel) or not isinstance(problem, Problem):
             return None
         if isinstance(model, ShaftModel) and not model.axis.load.free:
             return None
-        if not isinstance(model, PlayModel):
-            known = max(_LEAST_FRICTION, settings.friction) / NORMAL_95
-            found = _in(replace(problem, model=replace(model, friction=known)), found)
+        known = max(_LEAST_FRICTION, settings.friction) / NORMAL_95
+        found = _in(replace(problem, model=replace(model, friction=known)), found)
         flanks = [fit for fits in on_each_flank(found) for fit in fits]
         single = min(flanks, key=lambda fit: fit.cost)
         side, variance = _side(found.problem, single), single.variance()
@@ -219,7 +217,7 @@ class OneFlank:
         model = self._model
         if isinstance(model, ShaftModel):
             return 1.0 / self.axis.transmission.k_d + float(np.sum(1.0 / self.axis.load.stiffnesses[1:]))
-        return model.moving.flexibility() if isinstance(model, HeldChainModel) else 0.0
+        return model.moving.flexibility()
 
     def _lead(self, found: Search, std: float) -> float:
         """Way of the motor off the flank at least, m or rad at the load, less what may wind up the shaft beyond."""

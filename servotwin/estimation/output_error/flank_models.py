@@ -8,7 +8,6 @@ from typing import NamedTuple, TypeAlias
 
 from servotwin.estimation.output_error.held_chain import HeldChainModel
 from servotwin.estimation.output_error.models import HALF, OFFSET, RATIO, Motion, ShaftModel
-from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.plant.signals import Array
 
 
@@ -62,29 +61,12 @@ class FlankOfChain(HeldChainModel):
         return super().simulate(drive, measured, interval, self.flank.with_offset(values), rate)
 
 
-@dataclass(frozen=True)
-class FlankOfPlay(PlayModel):
-    """One mass on a rigid screw, by one of its flanks."""
-
-    flank: Flank = _UPPER
-
-    def simulate(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Motion:
-        """As that of `PlayModel`."""
-        return super().simulate(drive, measured, interval, self.flank.with_offset(values), rate)
-
-    def position(self, drive: Array, measured: Array, interval: float, values: Array, rate: float) -> Array:
-        """As that of `PlayModel`."""
-        return super().position(drive, measured, interval, self.flank.with_offset(values), rate)
-
-
-OwnModel: TypeAlias = ShaftModel | HeldChainModel | PlayModel
-FlankModel: TypeAlias = FlankOfShaft | FlankOfChain | FlankOfPlay
+OwnModel: TypeAlias = ShaftModel | HeldChainModel
+FlankModel: TypeAlias = FlankOfShaft | FlankOfChain
 
 
 def by_flank(model: OwnModel, flank: Flank) -> FlankModel:
     """The model with a flank in place of its offset."""
     if isinstance(model, ShaftModel):
         return FlankOfShaft(model.axis, model.priors, model.learnt, model.friction, flank)
-    if isinstance(model, HeldChainModel):
-        return FlankOfChain(model.axis, model.priors, model.friction, flank)
-    return FlankOfPlay(model.axis, model.priors, flank)
+    return FlankOfChain(model.axis, model.priors, model.friction, flank)

@@ -25,6 +25,8 @@ from servotwin.plant.signals import Array
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
+# Counts: a load that follows its motor to and fro without a gap differs by more from one that does so one way only.
+_PLAIN = 4.0
 RIVAL = 30.0  # the same of another gap that explains the window as well
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
@@ -128,13 +130,15 @@ def _known_half(
 
 def _single(found: Search, known: _KnownHalf) -> tuple[Fit, bool]:
     """The best fit with one flank, and whether it explains the window nearly as well as two."""
-    best = found.best
-    singles = [one_flank(found)]
-    if known.half <= NORMAL_95 * known.total:
+    best, zero = found.best, known.half <= NORMAL_95 * known.total
+    # A minimum that does not show the gap has one flank, wherever the other one is.
+    singles = [one_flank(found), *(fit for fit in found.others if math.isinf(fit.std(HALF, found.free)))]
+    if zero:
         singles += one_flank_without_a_gap(found)
     single = min(singles, key=lambda fit: fit.cost)
     rise = (single.cost - best.cost) / best.variance()
-    return single, rise < BELIEVED or any(_alike(found, fit) for fit in singles)
+    least = _PLAIN if zero else _ALIKE
+    return single, rise < BELIEVED or any(_alike(found, fit, least) for fit in singles)
 
 
 def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
@@ -207,12 +211,12 @@ def _hidden_friction(found: Search, fit: Fit) -> float:
     return model.hidden_friction(fit.values) if isinstance(model, ShaftModel | HeldChainModel) else 0.0
 
 
-def _alike(found: Search, single: Fit) -> bool:
-    """True where rounding may hide the difference between the best fit and one with a single flank.
+def _alike(found: Search, single: Fit, least: float) -> bool:
+    """True where the best fit and one with a single flank differ by less than `least` counts in every sample.
 
     The noise is learnt at the best fit, and speaks for it: what rounding hides is no evidence of a second flank.
     """
-    return float(np.max(np.abs(single.raw - found.best.raw))) < _ALIKE * found.problem.count
+    return float(np.max(np.abs(single.raw - found.best.raw))) < least * found.problem.count
 
 
 def largest_std(found: Search, half: float, settings: OutputErrorSettings) -> float:
