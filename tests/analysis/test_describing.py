@@ -118,7 +118,7 @@ def test_a_loop_filter_is_part_of_the_loop():
     ("changes", "gap", "message"),
     [
         ({"k_d": 1e7}, GAP, "k_d"),
-        ({"voltage_limit": 5.0}, GAP, "voltage_limit = 5 V"),
+        ({"voltage_limit": 5.0}, GAP, "voltage_limit_v = 5 V"),
         ({"sample_rate": 100.0}, GAP, "sample_rate = 100 Hz"),
         ({}, 0.0, "gap = 0.0 rad"),
     ],

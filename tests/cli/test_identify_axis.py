@@ -160,14 +160,19 @@ def test_a_log_of_a_motor_that_shows_nothing_is_refused(motor_logs: Path, name: 
 
 def test_windows_of_one_flank_each_say_that_two_steps_show_both(tmp_path: Path) -> None:
     """The table goes straight to its place behind a worm that holds the gap: each step leaves it on one flank."""
-    gap = math.radians(7.5)
-    run = st.simulate(WORM_TABLE, 8.0, reference=st.SquareWave(0.035, 4.0), gap=gap, sample_rate=2000.0)
-    path = tmp_path / "log.npz"
-    write_log(SignalTable(run.columns, {"servo": WORM_TABLE.dumps()}), path)
-    once = " ".join(CliRunner().invoke(app, ["identify", str(path)]).output.split())
-    assert "4 windows, 0 OK" in once
+    gap, path = math.radians(7.5), tmp_path / "log.npz"
+
+    def told(seconds: float, *options: str) -> str:
+        run = st.simulate(WORM_TABLE, seconds, reference=st.SquareWave(0.035, 4.0), gap=gap, sample_rate=2000.0)
+        write_log(SignalTable(run.columns, {"servo": WORM_TABLE.dumps()}), path)
+        return " ".join(CliRunner().invoke(app, ["identify", str(path), *options]).output.split())
+
+    once = told(4.0)
+    assert "2 windows, 0 OK" in once
     assert "a window with two steps, to and fro, shows both flanks: give its length with --window" in once
-    both = " ".join(CliRunner().invoke(app, ["identify", str(path), "--window", "3.9"]).output.split())
+    # The third step confirms what the two before show together.
+    assert "4 windows, 2 OK" in told(8.0)
+    both = told(8.0, "--window", "3.9")
     assert "2 windows, 2 OK" in both
     assert "--window" not in both
 

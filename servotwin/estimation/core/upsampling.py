@@ -1,9 +1,8 @@
-"""Recognise a channel that is recorded more often than it was measured: held, or interpolated by straight lines."""
+"""Recognise an angle that is recorded more often than it was measured: held, or interpolated by straight lines."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,21 +21,16 @@ _STRAIGHT = 0.45  # of all samples: those between each second one
 _DIGITS = 32 * 1e-13  # of the largest value: smaller steps are rounding of numbers
 
 
-def upsampled(channels: Mapping[str, Array], rate: float) -> tuple[str, ...]:
-    """Sentences for those channels, recorded at a rate (Hz), that are held or interpolated from a slower one."""
-    sentences = (_sentence(name, samples, rate) for name, samples in channels.items())
-    return tuple(sentence for sentence in sentences if sentence)
-
-
-def _sentence(name: str, samples: Array, rate: float) -> str:
-    held = held_factor(samples)
-    factor = held or line_factor(samples)
+def upsampled(theta_m: Array, rate: float) -> tuple[str, ...]:
+    """Sentence for a motor's angle (N,), recorded at a rate (Hz), that is held or interpolated from a slower one."""
+    held = held_factor(theta_m)
+    factor = held or line_factor(theta_m)
     if not factor:
-        return ""
+        return ()
     how, slow = "held" if held else "interpolated", f"{rate / factor:.6g} Hz"
     return (
-        f"{name} is {how} from a rate about {factor} times slower than the window's: record it at {rate:.6g} Hz, or "
-        f"give the window at {slow}, with the samples at which {name} was measured"
+        f"theta_m is {how} from a rate about {factor} times slower than the window's: record it at {rate:.6g} Hz, or "
+        f"give the window at {slow}, with the samples at which theta_m was measured",
     )
 
 

@@ -110,7 +110,7 @@ def estimate(
     blank = no_estimate(window.mid_time, model_version=axis.version, method=METHOD)
     if float(np.ptp(theta_m)) == 0.0:
         return replace(blank, reasons=("theta_m is constant: nothing moved, or the sensor is dead",))
-    if slow := upsampled({"theta_m": theta_m}, window.sample_rate):
+    if slow := upsampled(theta_m, window.sample_rate):
         return replace(blank, status=GapStatus.MODEL_MISMATCH, reasons=slow)
     unit = 2.0 / axis.p
     found = fit(window, axis, prior, settings)

@@ -200,8 +200,8 @@ def _broken(window: Window, axis: Axis) -> tuple[str, ...]:
     if follows(axis):
         dead = tuple(sentence for sentence in found if "constant" in sentence)
         # The counter of a stepper's steps changes with its command.
-        measured = ("position",) if isinstance(axis.actuator, Stepper) else ("theta_m", "position")
-        found = dead or upsampled({name: window.channels[name] for name in measured}, window.sample_rate)
+        counts = isinstance(axis.actuator, Stepper)
+        found = dead or (() if counts else upsampled(window.channels["theta_m"], window.sample_rate))
     return found or other_units(window, axis.encoder_resolution, axis.sensors.position_resolution)
 
 

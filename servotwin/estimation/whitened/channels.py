@@ -53,8 +53,9 @@ def faults(window: Window, motion: str = LINEAR) -> tuple[str, ...]:
     units = {"theta_m": degrees, "position": (1e3, "mm") if motion == LINEAR else degrees}
     channels = {name: (window.channels[name], *unit) for name, unit in units.items()}
     sentences = [_fault(name, samples, factor, unit) for name, (samples, factor, unit) in channels.items()]
-    slow = upsampled({name: window.channels[name] for name in channels}, window.sample_rate)
-    found = slow or tuple(sentence for sentence in sentences if sentence)
+    # A position that is held is late, as others are; an angle moves the screw by leaps.
+    found = tuple(sentence for sentence in sentences if sentence)
+    found = upsampled(window.theta_m, window.sample_rate) or found
     return found or _slip(window.theta_m, window.position, *units["position"])
 
 
