@@ -25,7 +25,7 @@ from servotwin.plant.signals import Array
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
-# Counts: a load that follows its motor to and fro without a gap differs by more from one that does so one way only.
+# Counts: a screw that follows its motor to and fro without a gap differs by more from one that does so one way only.
 _PLAIN = 4.0
 RIVAL = 30.0  # the same of another gap that explains the window as well
 _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
@@ -137,7 +137,7 @@ def _single(found: Search, known: _KnownHalf) -> tuple[Fit, bool]:
         singles += one_flank_without_a_gap(found)
     single = min(singles, key=lambda fit: fit.cost)
     rise = (single.cost - best.cost) / best.variance()
-    least = _PLAIN if zero else _ALIKE
+    least = _PLAIN if zero and isinstance(found.problem.model, HeldChainModel) else _ALIKE
     return single, rise < BELIEVED or any(_alike(found, fit, least) for fit in singles)
 
 
