@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,6 +16,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from servotwin.cli.log_dates import DATED, LogDate, date_of, dates_of, iso
 from servotwin.errors import InvalidInput
 from servotwin.estimation.driven_load.answer import gap_of_recording
 from servotwin.estimation.estimate import NORMAL_95, NOTHING_KNOWN, Interval
@@ -30,8 +30,6 @@ from servotwin.plant.display_units import DEGREES, MILLIMETRES
 from servotwin.plant.plants import Plant, resolve_plant
 
 _Answer = tuple[RecordedLog, TransmissionGap]
-_DATED = 3e8  # s since 1970: smaller times are no dates
-_DAY = re.compile(r"\d{4}-\d\d-\d\d$")
 _PLACES = 5  # parts of the travel, and of the time, in the table of local gaps
 
 
@@ -86,7 +84,7 @@ def show(
         said = Text.from_markup(headline(found, log.recording.load_unit, log.recording.motor_unit)).plain
         write_page(page, log, found, said)
     _check_units(answers)
-    stamps = [_date(log, day) for (log, _), day in zip(answers, given, strict=True)]
+    stamps = [date_of(log, day) for (log, _), day in zip(answers, given, strict=True)]
     wear = _wear(answers, stamps)
     if as_json:
         _print_json(answers, stamps, wear)
@@ -141,35 +139,6 @@ def _in_shown_units(recording: EncoderRecording) -> EncoderRecording:
     return recording
 
 
-def dates_of(text: str | None, logs: int) -> list[float | None]:
-    """Dates with commas between them as seconds since 1970, one for each log; None: of the log or its file.
-
-    Raises
-    ------
-    InvalidInput
-        No date, or another number of them than of logs.
-    """
-    if text is None:
-        return [None] * logs
-    days = text.split(",")
-    try:
-        if not all(_DAY.match(day.strip()) for day in days):
-            raise ValueError
-        found = [float(np.datetime64(day.strip(), "s").astype(np.int64)) for day in days]
-    except ValueError:
-        raise InvalidInput(f"--dates {text!r}: give dates such as 2026-03-01, with commas between them") from None
-    if len(found) != logs:
-        raise InvalidInput(f"--dates {text!r}: has {len(found)} dates for {logs} logs; give one for each")
-    return list(found)
-
-
-class _Stamp(NamedTuple):
-    """Date of a log, s since 1970, and where it is from: "given", "stamped" in the log, or that of its "file"."""
-
-    time: float
-    origin: str
-
-
 class _Wear(NamedTuple):
     """Growth of a quantity over so many logs, from one date to another."""
 
@@ -178,19 +147,6 @@ class _Wear(NamedTuple):
     logs: int
     begin: float
     end: float
-
-
-def _date(log: RecordedLog, given: float | None) -> _Stamp:
-    if given is not None:
-        return _Stamp(given, "given")
-    first = float(log.recording.time[0])
-    if first > _DATED:
-        return _Stamp(first, "stamped")
-    return _Stamp(Path(log.recording.source.removeprefix("log ")).stat().st_mtime, "file")
-
-
-def _iso(date: float) -> str:
-    return str(np.datetime64(round(date), "s"))
 
 
 def _check_units(answers: Sequence[_Answer]) -> None:
@@ -203,7 +159,7 @@ def _check_units(answers: Sequence[_Answer]) -> None:
             )
 
 
-def _wear(answers: Sequence[_Answer], stamps: Sequence[_Stamp]) -> _Wear | str:
+def _wear(answers: Sequence[_Answer], stamps: Sequence[LogDate]) -> _Wear | str:
     """Growth over the logs whose gap, or lost motion, is known; or the reason against, empty for one log or two."""
     if len(answers) < LEAST:
         return ""
@@ -238,7 +194,7 @@ def _said(wear: _Wear | str, unit: str) -> str:
         return f"no growth per year: {wear}"
     low, high = wear.growth.interval
     return (
-        f"wear from {_iso(wear.begin)[:10]} to {_iso(wear.end)[:10]}: {wear.quantity} {wear.growth.per_year:+.4g} "
+        f"wear from {iso(wear.begin)[:10]} to {iso(wear.end)[:10]}: {wear.quantity} {wear.growth.per_year:+.4g} "
         f"{unit} per year (95 %: {low:+.4g} .. {high:+.4g}), in {wear.logs} logs"
     )
 
@@ -251,9 +207,9 @@ def _tell(status: Any, name: str, what: str) -> None:
     status.update(f"{name}: {what}")
 
 
-def _print_json(answers: Sequence[_Answer], stamps: Sequence[_Stamp], wear: _Wear | str) -> None:
+def _print_json(answers: Sequence[_Answer], stamps: Sequence[LogDate], wear: _Wear | str) -> None:
     rows = [
-        as_dict(log, found) | {"date": _iso(stamp.time), "date_from": stamp.origin}
+        as_dict(log, found) | {"date": iso(stamp.time), "date_from": stamp.origin}
         for (log, found), stamp in zip(answers, stamps, strict=True)
     ]
     if isinstance(wear, _Wear):
@@ -387,7 +343,7 @@ def model_rows(found: TransmissionGap) -> list[list[str]]:
 def _local(found: LostMotion, unit: str, begin: float) -> Iterator[Table]:
     """Median lost motion of parts of the travel and of the time; dates count from the first sample, `begin` (s)."""
     gaps = np.array([each.gap for each in found.local]) * abs(found.ratio)
-    first = begin if begin > _DATED else 0.0
+    first = begin if begin > DATED else 0.0
     positions, times = np.array([(each.position, each.time - first) for each in found.local]).T
     for head, keys in ((f"position, {unit}", positions), ("time, s", times)):
         table = Table(head, f"median lost motion, {unit}", "reversals", box=None, pad_edge=False)
