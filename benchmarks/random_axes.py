@@ -1,9 +1,11 @@
-"""Random axes whose shafts are free in the gap, and the estimates of their twins: no preset, but what a stranger has.
+"""Random axes, and the estimates of their twins: no preset, but what a stranger has.
 
 ``python -m benchmarks.batch axes-random --seed 5 --count 40 FILE``: torque drives, DC motors and velocity drives, one
 to three masses, with and without friction, encoders of any fineness, a controller by `tune`, 7.5 to 30 samples in a
 period of the motor against its load; stiffness 5 %, damping 30 %, motor 10 %, friction 40 % off the model. Axes for
-which no controller is found are drawn anew. The blocks are the actuators.
+which no controller is found are drawn anew. Shafts are free in the gap, and the blocks are the actuators; ``--blocks``
+with "held" or "held cascade" draws elastic screws that the gap holds, behind torque drives, half of them under a
+constant force.
 
 ``windows-random`` estimates from windows of their second to fourth step without a twin, below 6000 samples: faster.
 """
@@ -21,13 +23,14 @@ from rich.table import Table
 from benchmarks.axis_presets import judged
 from benchmarks.batch import Batch
 from servotwin.commissioning.edge_settings import Recording
+from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
 from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
 from servotwin.design import tune
 from servotwin.errors import InvalidInput
-from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.window import Window
 from servotwin.plant.actuator import Actuator, DcMotor, TorqueDrive, VelocityDrive
@@ -41,7 +44,9 @@ from servotwin.twin.settings import TwinSettings
 
 NAME, WINDOWS = "axes-random", "windows-random"
 BLOCKS = ("torque", "dc motor", "velocity")
-"""Actuators."""
+"""Actuators of free shafts."""
+HELD_BLOCKS = ("held", "held cascade")
+"""Controllers of held screws: one by `tune`, and a cascade with 4 to 16 times the position gain in its velocity loop."""
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1, "motor_friction": 0.4, "load_friction": 0.4}
 _STEPS, _KINDS = 8, ("PD", "PIDF", "P", "PI")
 _LATER, _MOST_SAMPLES = (1, 2, 3), 6000  # steps whose windows are estimated without a twin
@@ -68,7 +73,7 @@ class AxisTask(NamedTuple):
 
 def random_axis(block: str, seed: int, place: int) -> RandomAxis:
     """Draw an axis for which there is a controller."""
-    random = np.random.default_rng([seed, BLOCKS.index(block), place])
+    random = np.random.default_rng([seed, (*BLOCKS, *HELD_BLOCKS).index(block), place])
     while True:
         try:
             return _drawn(block, random)
@@ -87,20 +92,31 @@ def _drawn(block: str, random: np.random.Generator) -> RandomAxis:
     rubs = [torque * log(-2.5, -1) if random.random() < 0.45 else 0.0 for _ in range(2)]
     motor = _motor(block, inertia, crossover, rubs[0] if block != "velocity" else 0.0, log)
     masses, stiffness = int(random.choice([1, 1, 1, 2, 3])), mass * shaft**2
+    held = block in HELD_BLOCKS
+    weight = torque / pitch * random.uniform(-0.3, 0.3) if held and random.random() < 0.5 else 0.0
     load = Load(
         (mass / masses,) * masses,
         (0.0, *(stiffness * random.uniform(0.5, 2.0) for _ in range(masses - 1))),
         (mass * crossover * random.uniform(0.5, 3.0) * 2.0 * damped, *[2.0 * damped * mass * shaft] * (masses - 1)),
         friction=rubs[1] / pitch,
+        force=weight,
     )
-    screw = Transmission(pitch, stiffness, 2.0 * damped * mass * shaft if random.random() < 0.8 else 0.0, "free")
+    damping = 2.0 * damped * mass * shaft if random.random() < 0.8 else 0.0
+    screw = Transmission(pitch, stiffness, damping, "held" if held else "free")
     sensors = Sensors(log(-4.5, -2.5), amplitude * log(-5.5, -3.5))
     axis = Axis(motor, screw, load, Controller(1.0, 0.0, 0.0, 1.0 / crossover), sensors)
     kind, margin = str(random.choice(_KINDS)), math.radians(random.uniform(45.0, 65.0))
-    law = tune(axis, crossover, margin, kind=kind).controller
     yields = 0.0 if block == "velocity" else mass * pitch**2 / inertia
     rate = shaft / (2.0 * math.pi) * math.sqrt(1.0 + yields) * log(math.log10(7.5), math.log10(30.0))
-    axis = axis.replace(controller=law.replace(sample_rate=rate, Tf=max(law.Tf, 0.05 / crossover)))
+    if block == "held cascade":
+        axis = axis.replace(
+            controller=_cascade(axis.p, inertia + mass * pitch**2, crossover, log).replace(sample_rate=rate)
+        )
+        if not axis.margins().stable:
+            raise InvalidInput("the cascade is unstable")
+    else:
+        law = tune(axis, crossover, margin, kind=kind).controller
+        axis = axis.replace(controller=law.replace(sample_rate=rate, Tf=max(law.Tf, 0.05 / crossover)))
     errors = {name: 1.0 + width * random.uniform(-1.0, 1.0) for name, width in _ERRORS.items()}
     half_period = round(max(24.0 * math.pi / crossover * random.uniform(0.5, 1.2), 1000.0 / rate) * rate) / rate
     gap = min(log(-1.7, -0.3), 0.25 * amplitude / pitch)
@@ -115,6 +131,12 @@ def _motor(block: str, inertia: float, crossover: float, friction: float, log: A
     resistance = log(-1, 1)
     gain = math.sqrt(resistance * inertia * crossover * log(-1, 1.5))
     return DcMotor(inertia, resistance, gain, gain, friction=0.1 * inertia * crossover, coulomb=friction)
+
+
+def _cascade(pitch: float, inertia: float, crossover: float, log: Any) -> Cascade:
+    """A cascade of a crossover (rad/s), for all that turns (kg m^2 at the motor)."""
+    speed = crossover * log(math.log10(4.0), math.log10(16.0))
+    return Cascade(crossover, pitch, inertia * speed, log(0.4, 1.2) / speed, 0.1 / speed)
 
 
 def measured(task: AxisTask) -> dict[str, Any]:
@@ -167,7 +189,8 @@ def _judged(drawn: RandomAxis, estimates: Sequence[GapEstimate]) -> dict[str, An
     sensors = drawn.model.sensors
     count = max(sensors.encoder_resolution, sensors.position_resolution / drawn.model.p)
     accepted = [judged(each, (drawn.gap,) * 3, count) for each in estimates if each.ok]
-    return {"windows": len(estimates), "estimates": accepted}
+    bounds = [each.gap / drawn.gap for each in estimates if each.status is GapStatus.LOWER_BOUND]
+    return {"windows": len(estimates), "estimates": accepted, "bounds": bounds}
 
 
 def axis_tasks(blocks: Sequence[str], count: int, seed: int) -> Iterator[tuple[str, AxisTask]]:
@@ -180,19 +203,23 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
     """A line for each actuator, and the axes with false estimates."""
     table = Table(title="random axes: estimates of a gap that stands still", title_justify="left", box=None)
     table.add_column("actuator")
-    for heading in ("axes", "refused", "windows", "accepted", "inside", "near", "false"):
+    for heading in ("axes", "refused", "windows", "accepted", "inside", "near", "false", "bounds", "above"):
         table.add_column(heading, justify="right")
-    for block in BLOCKS:
+    for block in (*BLOCKS, *HELD_BLOCKS):
         axes = [numbers for key, numbers in found.items() if key.split("/")[1] == block]
         ran = [each for each in axes if "refused" not in each]
         estimates = [estimate for each in ran for estimate in each["estimates"]]
         counts = [len(axes), len(axes) - len(ran), sum(each["windows"] for each in ran), len(estimates)]
         counts += [int(sum(each[name] for each in estimates)) for name in ("inside", "near")]
-        table.add_row(block, *map(str, counts), str(sum(map(_is_false, estimates))))
+        bounds = [bound for each in ran for bound in each["bounds"]]
+        counts += [sum(map(_is_false, estimates)), len(bounds), sum(bound > 1.0 for bound in bounds)]
+        table.add_row(block, *map(str, counts))
     console.print(table)
     for key, numbers in found.items():
-        if wrong := sum(map(_is_false, numbers.get("estimates", ()))):
-            console.print(f"{key}: {wrong} false", highlight=False)
+        wrong = sum(map(_is_false, numbers.get("estimates", ())))
+        above = sum(bound > 1.0 for bound in numbers.get("bounds", ()))
+        if wrong or above:
+            console.print(f"{key}: {wrong} false, {above} bounds above the gap", highlight=False)
 
 
 def _is_false(estimate: Mapping[str, float]) -> bool:
@@ -200,7 +227,7 @@ def _is_false(estimate: Mapping[str, float]) -> bool:
 
 
 BATCHES = {
-    NAME: Batch(axis_tasks, measured, _show, BLOCKS),
-    WINDOWS: Batch(axis_tasks, measured_windows, _show, BLOCKS),
+    NAME: Batch(axis_tasks, measured, _show, (*BLOCKS, *HELD_BLOCKS)),
+    WINDOWS: Batch(axis_tasks, measured_windows, _show, (*BLOCKS, *HELD_BLOCKS)),
 }
 """For `benchmarks.batch`."""
