@@ -46,7 +46,8 @@ NAME, WINDOWS = "axes-random", "windows-random"
 BLOCKS = ("torque", "dc motor", "velocity")
 """Actuators of free shafts."""
 HELD_BLOCKS = ("held", "held cascade")
-"""Controllers of held screws: one by `tune`, and a cascade with 4 to 16 times the position gain in its velocity loop."""
+"""Controllers of held screws: one by `tune`, and a cascade whose velocity loop is 4 to 16 times as fast as its position
+loop."""
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1, "motor_friction": 0.4, "load_friction": 0.4}
 _STEPS, _KINDS = 8, ("PD", "PIDF", "P", "PI")
 _LATER, _MOST_SAMPLES = (1, 2, 3), 6000  # steps whose windows are estimated without a twin

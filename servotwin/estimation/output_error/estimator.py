@@ -14,7 +14,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.decimation import decimation
-from servotwin.estimation.core.motor_angle import MotorAngle, without_noise
+from servotwin.estimation.core.motor_angle import MotorAngle, noise_of, without_noise
 from servotwin.estimation.core.upsampling import upsampled
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
@@ -53,6 +53,7 @@ _SAMPLES_LATE = 3.0
 _GAPS = np.linspace(0.0, 0.3, 16)  # of the motor's travel; with wider ones a gap looks like another ratio
 _COASTS = 0.1  # of the position's motion: what play leaves of a load that coasts in the gap, and no wrong ratio does
 _MUCH_LESS = 0.5  # of the errors with what was learnt: another shaft that leaves no more than this is the machine's
+_UNSURE = 3.0  # standard deviations of the motor's angle by which it may be beside what its encoder shows
 _CUT = 8.0  # times the shaft's own frequency: cut-off of the low-pass on a motor's encoder that shows its counts
 
 
@@ -313,7 +314,7 @@ def _problem(
     if own > 0.0:
         late = max(late, _LATE / own)
         if at_motor > 0.0:
-            theta_m = _smooth(theta_m, _CUT * own / (2.0 * math.pi), window.sample_rate)
+            theta_m = _smooth(theta_m, at_motor, _CUT * own / (2.0 * math.pi), window.sample_rate)
     priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
     model, travel = _model(axis, priors, learnt), lever(axis)
     count, drive, position = math.hypot(travel * at_motor, at_load), travel * theta_m, window.position
@@ -338,11 +339,17 @@ def _model(axis: Axis, priors: Priors, learnt: Array | None) -> MotionModel:
     return PlayModel(axis, priors) if follows(axis) else HeldChainModel(axis, priors)
 
 
-def _smooth(theta_m: Array, cutoff: float, rate: float) -> Array:
-    """(N,) angle without its counts; as it is where the cut-off (Hz) is too high for the sample rate (Hz)."""
+def _smooth(theta_m: Array, count: float, cutoff: float, rate: float) -> Array:
+    """(N,) angle without its counts (rad); as it is where the cut-off (Hz) is too high for the sample rate (Hz).
+
+    It stays within what the encoder showed: a motor may start and stop more sharply than its load, and where it crosses
+    the gap the load would see what the low-pass took away.
+    """
     if cutoff >= 0.4 * rate:
         return theta_m
-    return ZeroPhase(cutoff, 3, rate, "odd", min(round(rate / cutoff), theta_m.size - 1)).respond(theta_m)
+    smooth = ZeroPhase(cutoff, 3, rate, "odd", min(round(rate / cutoff), theta_m.size - 1)).respond(theta_m)
+    unsure = max(0.5 * count, _UNSURE * noise_of(theta_m))
+    return np.clip(smooth, theta_m - unsure, theta_m + unsure)
 
 
 def _stated(blank: GapEstimate, found: Search, verdict: JudgedFit, unit: float) -> GapEstimate:

@@ -36,10 +36,28 @@ def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple
     Samples that show the same count have the same error: noise averages out over them, rounding does not. The second
     and third are inf where these residuals do not show it.
     """
-    fit, problem = found.best, found.problem
-    places = np.flatnonzero(found.free)
-    at, data = int(np.flatnonzero(places == which)[0]), fit.raw.size
-    rows = fit.rows[np.ix_(places, keep)]
+    fit, data = found.best, found.best.raw.size
+    weights, std = _weights(found, keep, which)
+    if math.isinf(std):
+        return 0.0, math.inf, math.inf
+    white, seen = np.zeros(data), keep < data
+    white[keep[seen]] = weights[seen]
+    rounding = found.problem.count * _EVENLY * float(np.linalg.norm(per_count(found, white[None])))
+    return float(weights @ fit.residual[keep]), std, rounding
+
+
+def moved_by(found: Search, change: Array, which: int = HALF) -> float:
+    """Change of an unknown, linearised, where the model's position were another by a change (m,) in m or rad; 0 where
+    nothing shows it."""
+    weights, std = _weights(found, np.arange(found.best.residual.size), which)
+    return 0.0 if math.isinf(std) else float(weights[: change.size] @ found.noise.whiten(change[None])[0])
+
+
+def _weights(found: Search, keep: NDArray[np.intp], which: int) -> tuple[Array, float]:
+    """(k,) weights with which some of the residuals (k,) move an unknown, and its std; zeros and inf where they do not
+    show it."""
+    fit, places = found.best, np.flatnonzero(found.free)
+    at, rows = int(np.flatnonzero(places == which)[0]), fit.rows[np.ix_(places, keep)]
     size = np.linalg.norm(rows, axis=1)
     size[size == 0.0] = 1.0
     scaled = rows / size[:, None]
@@ -47,15 +65,9 @@ def influence(found: Search, keep: NDArray[np.intp], which: int = HALF) -> tuple
     shown = values > _NOTHING * values[-1]
     # Of two unknowns that move these residuals alike neither is shown.
     if float(np.sum(vectors[at, ~shown] ** 2)) > _ALIKE:
-        return 0.0, math.inf, math.inf
+        return np.zeros(keep.size), math.inf
     inverse = (vectors[at, shown] / values[shown]) @ vectors[:, shown].T
-    weights = -(inverse @ scaled) / size[at]
-    white = np.zeros(data)
-    seen = keep < data
-    white[keep[seen]] = weights[seen]
-    rounding = problem.count * _EVENLY * float(np.linalg.norm(per_count(found, white[None])))
-    std = math.sqrt(inverse[at] * fit.variance()) / size[at]
-    return float(weights @ fit.residual[keep]), std, rounding
+    return -(inverse @ scaled) / size[at], math.sqrt(inverse[at] * fit.variance()) / size[at]
 
 
 def rounded(found: Search, which: int = HALF) -> float:

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from servotwin.estimation.estimate import NORMAL_95, GapStatus, UnknownRatio
+from servotwin.estimation.output_error.between_samples import error_between_samples, moved_between_samples
 from servotwin.estimation.output_error.bound import smallest_half
 from servotwin.estimation.output_error.fit import Fit, Search, one_flank
 from servotwin.estimation.output_error.held_chain import FRICTION, HeldChainModel
@@ -21,7 +22,6 @@ from servotwin.estimation.output_error.search import one_flank_without_a_gap
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.output_error.soft_contact import moved_by_contact
 from servotwin.estimation.output_error.unexplained import unexplained
-from servotwin.plant.signals import Array
 
 BELIEVED = 60.0  # rise of the cost without the second flank, over the noise's variance
 _ALIKE = 0.5  # of a count: motions that differ by less in every sample may round to the same counts
@@ -32,9 +32,8 @@ _TRAVEL = 1e-3  # of the motor's travel: a spread that is small whatever the gap
 _BOUND, _BOUND_COUNTS = 0.9, 10.0  # of the gaps that are excluded; smallest bound that says anything
 _RATCHET = 4.0  # of the noise left in the motor's angle: its extremes push the load, so that the gap seems wider
 _ROUNDED = 1.0  # of a count: standard deviation of an error that does not average out
-# The motor's motion between two samples is a cubic: error in the middle over the fourth difference, and that difference
-# which rounding makes at most (counts); the error that counts, of half the gap, and the samples that may have it.
-_CUBIC, _FOURTH, _HIDDEN, _FEW = 3.0 / 128.0, 8.0, 0.25, 10
+# The motor's place between two samples: the error that counts, of half the gap, and the samples that may have it.
+_HIDDEN, _FEW = 0.25, 10
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,7 @@ def _single(found: Search, known: _KnownHalf) -> tuple[Fit, bool]:
 def _bounded(found: Search, single: Fit, words: str) -> JudgedFit:
     """Decide on a window that shows one flank, for a reason in words."""
     count = found.problem.count
-    hidden = _hidden_friction(found, single) + float(np.max(_between_samples(found)))
+    hidden = _hidden_friction(found, single) + float(np.max(error_between_samples(found, _FEW)))
     bound = _BOUND * 2.0 * (smallest_half(found, single) - hidden) - count
     enough = bound > _BOUND_COUNTS * count
     status = GapStatus.LOWER_BOUND if enough else GapStatus.UNIDENTIFIABLE
@@ -177,8 +176,8 @@ def _doubts(
         _of_slow_motion(left, half, allowed, unit),
         _of_jitter(times, allowed, unit),
     )
-    contact = 0.0 if any(doubts) else moved_by_contact(found)
-    explained = math.hypot(total, friction.std, DOUBT * left, DOUBT * times.half, DOUBT * contact)
+    contact, sharp = (0.0, 0.0) if any(doubts) else (moved_by_contact(found), moved_between_samples(found))
+    explained = math.hypot(total, friction.std, DOUBT * left, DOUBT * times.half, DOUBT * contact, DOUBT * sharp)
     return tuple(filter(None, doubts)), explained
 
 
@@ -272,22 +271,13 @@ def _of_jitter(times: TimeJitter, allowed: float, unit: float) -> str:
 
 def _hidden(found: Search, half: float) -> str:
     """Sentence for a motor that moves by a share of the gap between two samples, and the samples do not show how."""
-    error = float(np.sort(_between_samples(found))[-_FEW])
+    error = float(np.sort(error_between_samples(found, _FEW))[-_FEW])
     if error <= _HIDDEN * half:
         return ""
     return (
         f"the motor turns so sharply between two samples that they leave its place open by "
         f"{100.0 * error / half:.0f} % of half the gap: a higher sample rate is needed"
     )
-
-
-def _between_samples(found: Search) -> Array:
-    """Errors (m or rad at the load) of the motor's place between samples; of a load without dynamics they do not count:
-    0."""
-    problem = found.problem
-    if problem.model.speed == 0.0:
-        return np.zeros(_FEW)
-    return np.asarray(_CUBIC * np.maximum(np.abs(np.diff(problem.drive, 4)) - _FOURTH * problem.count, 0.0))
 
 
 def _unknown_ratio(
