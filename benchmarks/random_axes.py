@@ -4,8 +4,7 @@
 to three masses, with and without friction, encoders of any fineness, a controller by `tune`, 7.5 to 30 samples in a
 period of the motor against its load; stiffness 5 %, damping 30 %, motor 10 %, friction 40 % off the model. Axes for
 which no controller is found are drawn anew. Shafts are free in the gap, and the blocks are the actuators; ``--blocks``
-with "held" or "held cascade" draws elastic screws that the gap holds, behind torque drives, half of them under a
-constant force.
+with `HELD_BLOCKS` draws screws that the gap holds, half of them under a constant force.
 
 ``windows-random`` estimates from windows of their second to fourth step without a twin, below 6000 samples: faster.
 """
@@ -45,9 +44,9 @@ from servotwin.twin.settings import TwinSettings
 NAME, WINDOWS = "axes-random", "windows-random"
 BLOCKS = ("torque", "dc motor", "velocity")
 """Actuators of free shafts."""
-HELD_BLOCKS = ("held", "held cascade")
-"""Controllers of held screws: one by `tune`, and a cascade whose velocity loop is 4 to 16 times as fast as its position
-loop."""
+HELD_BLOCKS = ("held", "held cascade", "held velocity", "rigid")
+"""Elastic screws behind DC motors, under controllers by `tune` and under cascades whose velocity loops are 4 to 16
+times as fast as their position loops; behind velocity drives; rigid screws behind DC motors."""
 _ERRORS = {"k": 0.05, "c": 0.3, "k_T": 0.1, "k_B": 0.1, "motor_friction": 0.4, "load_friction": 0.4}
 _STEPS, _KINDS = 8, ("PD", "PIDF", "P", "PI")
 _LATER, _MOST_SAMPLES = (1, 2, 3), 6000  # steps whose windows are estimated without a twin
@@ -91,7 +90,8 @@ def _drawn(block: str, random: np.random.Generator) -> RandomAxis:
     amplitude, damped = pitch * log(0.3, 1.2), log(-2.3, -0.9)
     torque = (inertia + mass * pitch**2) * crossover**2 * amplitude / pitch
     rubs = [torque * log(-2.5, -1) if random.random() < 0.45 else 0.0 for _ in range(2)]
-    motor = _motor(block, inertia, crossover, rubs[0] if block != "velocity" else 0.0, log)
+    speed = block.endswith("velocity")
+    motor = _motor("velocity" if speed else block, inertia, crossover, 0.0 if speed else rubs[0], log)
     masses, stiffness = int(random.choice([1, 1, 1, 2, 3])), mass * shaft**2
     held = block in HELD_BLOCKS
     weight = torque / pitch * random.uniform(-0.3, 0.3) if held and random.random() < 0.5 else 0.0
@@ -103,11 +103,13 @@ def _drawn(block: str, random: np.random.Generator) -> RandomAxis:
         force=weight,
     )
     damping = 2.0 * damped * mass * shaft if random.random() < 0.8 else 0.0
+    if block == "rigid":
+        stiffness, damping = math.inf, 0.0
     screw = Transmission(pitch, stiffness, damping, "held" if held else "free")
     sensors = Sensors(log(-4.5, -2.5), amplitude * log(-5.5, -3.5))
     axis = Axis(motor, screw, load, Controller(1.0, 0.0, 0.0, 1.0 / crossover), sensors)
     kind, margin = str(random.choice(_KINDS)), math.radians(random.uniform(45.0, 65.0))
-    yields = 0.0 if block == "velocity" else mass * pitch**2 / inertia
+    yields = 0.0 if speed else mass * pitch**2 / inertia
     rate = shaft / (2.0 * math.pi) * math.sqrt(1.0 + yields) * log(math.log10(7.5), math.log10(30.0))
     if block == "held cascade":
         axis = axis.replace(

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
 
 from servotwin.estimation.output_error.fit import Fit, Search, descend
 from servotwin.estimation.output_error.models import HALF, OFFSET
+from servotwin.estimation.output_error.search import rms
 from servotwin.plant.signals import Array
 
 _EXCLUDED = 30.0  # rise of the cost, over the noise's variance
+_HARDLY = 0.1  # of a count: rms beyond that of the best fit
 _SHARES = (0.0, 0.15, 0.3, 0.45, 0.6, 0.7, 0.8, 0.9)  # of a gap that explains the window
 _HALVINGS = 2  # of the last step between two shares
 _STEPS = 8
@@ -49,8 +52,12 @@ def smallest_half(found: Search, single: Fit) -> float:
 
 
 def _explains(found: Search, half: float, like: list[Fit], limit: float) -> bool:
-    """True where a fit with a given half gap costs no more than a limit."""
-    return any(fit.cost <= limit for fit in _fits_at(found, half, like))
+    """True where a fit with a given half gap costs no more than a limit, or leaves hardly more than the best fit.
+
+    The noise was learnt at the best fit, and speaks for it: below a share of a count it is no evidence.
+    """
+    least = math.hypot(rms(found.best.raw), _HARDLY * found.problem.count)
+    return any(fit.cost <= limit or rms(fit.raw) <= least for fit in _fits_at(found, half, like))
 
 
 def _fits_at(found: Search, half: float, like: list[Fit]) -> Iterator[Fit]:

@@ -18,12 +18,13 @@ from servotwin.estimation.core.motor_angle import MotorAngle, noise_of, without_
 from servotwin.estimation.core.upsampling import upsampled
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
+from servotwin.estimation.output_error.between_samples import parts_needed
 from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.flank import OneFlank
 from servotwin.estimation.output_error.flank_pair import with_contact
 from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
-from servotwin.estimation.output_error.models import MotionModel, Priors, ShaftModel
+from servotwin.estimation.output_error.models import FRICTION_PARTS, MotionModel, Priors, ShaftModel
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
@@ -322,7 +323,10 @@ def _problem(
         reduce = decimation(model.decimation(interval, theta_m.size // SHORTEST))
         drive, position = reduce.rows(np.vstack([drive, position]))
         interval *= reduce.factor
-    return Problem(model, drive, position, interval, count)
+    if model.speed == 0.0:
+        return Problem(model, drive, position, interval, count)
+    parts = parts_needed(drive, position, count, FRICTION_PARTS if axis.load.friction > 0.0 else 1)
+    return Problem(model, drive, position, interval, count, parts)
 
 
 def _own_rate(axis: Axis) -> float:

@@ -226,7 +226,7 @@ class OneFlank:
         assert isinstance(problem.model, FlankModel)
         motion = problem.motion(values, self._rate)
         flank = float(values[OFFSET]) + math.exp(float(values[RATIO])) * (
-            problem.late_drive(values) - problem.model.flank.at
+            problem.late_drive(values)[:: problem.parts] - problem.model.flank.at
         )
         load = self.axis.load
         wound_up = _WOUND_UP * self._softness * max(load.friction, load.static or 0.0)

@@ -20,7 +20,7 @@ from servotwin.plant.structure import chain
 # Largest rate of the flow times a part of a sample: a flank touched and left within a part is not seen; and for the
 # Taylor series to converge.
 _FINE, _CONVERGES = 0.4, 1.2
-_PARTS = 3  # of a sample with friction, whose sign changes between parts only
+FRICTION_PARTS = 3  # of a sample with friction, whose sign changes between parts only
 _OWN = (1.0,) * 6  # factors of the model's own numbers
 _KNOWN = 0.5  # of a damping's usual spread: below it windows told of it
 
@@ -340,7 +340,7 @@ def _least_parts(axis: Axis, interval: float) -> int:
 
 def fine_parts(rate: float, friction: bool, interval: float) -> int:
     """Parts of a sample (s) in which a flow of a largest rate (1/s) turns little, and friction may change its sign."""
-    return max(_PARTS if friction else 1, math.ceil(rate * interval / _FINE))
+    return max(FRICTION_PARTS if friction else 1, math.ceil(rate * interval / _FINE))
 
 
 def fastest(flows: Array) -> float:

@@ -11,6 +11,7 @@ import numpy as np
 from servotwin.estimation.core.motor_angle import noise_of
 from servotwin.estimation.output_error.models import DELAY, HALF, OFFSET, Flags, Motion, MotionModel, usual_sizes
 from servotwin.estimation.output_error.play_model import PlayModel
+from servotwin.estimation.output_error.refined import refined
 from servotwin.hybrid.compiled import bare
 from servotwin.plant.signals import Array
 
@@ -40,6 +41,8 @@ class Problem:
         s.
     count : float
         One count of either channel, seen at the load.
+    parts : int
+        Of each interval, at which the model is told the motor's place.
     """
 
     model: MotionModel
@@ -47,6 +50,7 @@ class Problem:
     position: Array
     interval: float
     count: float
+    parts: int = 1
 
     @property
     def duration(self) -> float:
@@ -91,13 +95,18 @@ class Problem:
 
         The motor's angle is delayed in place of the position: the load's motion begins with the first sample.
         """
-        return self.model.simulate(self.late_drive(values), self.position, self.interval, values, rate)
+        position, velocity, driven, sides = self.under(self.late_drive(values), values, rate)
+        step = self.parts
+        return Motion(position[::step], velocity[::step], driven[::step], sides[::step])
+
+    def under(self, drive: Array, values: Array, rate: float = 0.0) -> Motion:
+        """Motion under another drive, at all parts of the intervals, ((N - 1) parts + 1,)."""
+        return self.model.simulate(drive, self._measured, self.interval / self.parts, values, rate)
 
     def misfit(self, values: Array, rate: float = 0.0) -> Array:
         """(m,) position of the model, predicted by the observer if there is one, less the measured one."""
-        return self._less_measured(
-            self.model.position(self.late_drive(values), self.position, self.interval, values, rate)
-        )
+        drive, interval = self.late_drive(values), self.interval / self.parts
+        return self.less_measured(self.model.position(drive, self._measured, interval, values, rate))
 
     def misfits(self, points: list[Array], rate: float = 0.0) -> list[Array]:
         """`misfit` (m,) at several points."""
@@ -107,25 +116,39 @@ class Problem:
         """`misfit` (m,) of a model without dynamics whose gap has `sizes` (N,), shares of the one in the unknowns."""
         assert isinstance(self.model, PlayModel)
         drive = self.late_drive(values)
-        return self._less_measured(self.model.position_in_growing_gap(drive, self.interval, values, sizes))
+        return self.less_measured(self.model.position_in_growing_gap(drive, self.interval, values, sizes))
 
     def late_drive(self, values: Array) -> Array:
-        """Motor (N,) as late as the unknowns (u,) say; most derivatives move another unknown than the delay."""
-        samples, known = float(values[DELAY]) / self.interval, self._late
-        if samples not in known:
+        """Motor ((N - 1) parts + 1,) as late as the unknowns (u,) say; most derivatives move another unknown than the
+        delay."""
+        late, known = float(values[DELAY]) / self.interval * self.parts, self._late
+        if late not in known:
             if len(known) == _REMEMBERED:
                 known.pop(next(iter(known)))
-            known[samples] = delayed(self.drive, samples)
-        return known[samples]
+            known[late] = delayed(self._refined, late)
+        return known[late]
+
+    @cached_property
+    def _refined(self) -> Array:
+        """Motor at all parts of the intervals, ((N - 1) parts + 1,)."""
+        return self.drive if self.parts == 1 else refined(self.drive, self.parts)
+
+    @cached_property
+    def _measured(self) -> Array:
+        """Position there, straight between samples, for the slow observer."""
+        if self.parts == 1:
+            return self.position
+        at = np.arange((self.position.size - 1) * self.parts + 1) / self.parts
+        return np.interp(at, np.arange(self.position.size), self.position)
 
     @cached_property
     def _late(self) -> dict[float, Array]:
-        """The motor (N,) as late by numbers of samples, the last few."""
+        """The motor ((N - 1) parts + 1,) as late by numbers of parts, the last few."""
         return {}
 
-    def _less_measured(self, position: Array) -> Array:
-        """A model's position (N,) less the measured one, (m,)."""
-        misfit = np.asarray((position - self.position)[self.margin : self.drive.size - self.margin])
+    def less_measured(self, position: Array) -> Array:
+        """A model's position ((N - 1) parts + 1,) less the measured one, (m,)."""
+        misfit = np.asarray((position[:: self.parts] - self.position)[self.margin : self.drive.size - self.margin])
         misfit[self.unsure] = 0.0
         return misfit
 

@@ -13,8 +13,8 @@ from dataclasses import replace
 import numpy as np
 
 from servotwin.estimation.output_error.fit import Fit, Search
-from servotwin.estimation.output_error.models import DELAY, HALF, ShaftModel
-from servotwin.estimation.output_error.problem import Problem, delayed
+from servotwin.estimation.output_error.models import HALF, ShaftModel
+from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.rounding import influence
 from servotwin.plant.signals import Array
 
@@ -53,13 +53,13 @@ def _softer(found: Search, problem: Problem) -> Array:
     A shaft of stiffness k that is stretched by x would pull with k (x - l tanh(x / l)) in place of k x, as if its motor
     were behind by l tanh(x / l).
     """
-    model, values, rate = problem.model, found.best.values, problem.model.slowing[-1] * problem.model.speed
-    drive = delayed(problem.drive, float(values[DELAY]) / problem.interval)
-    motion = model.simulate(drive, problem.position, problem.interval, values, rate)
+    values, rate = found.best.values, problem.model.slowing[-1] * problem.model.speed
+    drive = problem.late_drive(values)
+    motion = problem.under(drive, values, rate)
     stretch = np.where(motion.sides != 0, motion.driven - motion.position, 0.0)
     length = _LENGTH * float(np.max(np.abs(stretch)))
     if length == 0.0:
         return np.zeros(found.best.raw.size)
     later = drive - _DIFFERENCE * length * np.tanh(stretch / length)
-    moved = (model.position(later, problem.position, problem.interval, values, rate) - motion.position) / _DIFFERENCE
-    return moved[problem.margin : drive.size - problem.margin]
+    moved = problem.less_measured(problem.under(later, values, rate).position) - problem.less_measured(motion.position)
+    return moved / _DIFFERENCE

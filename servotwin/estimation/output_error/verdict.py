@@ -167,7 +167,7 @@ def _doubts(
     """
     half, std, total = known
     friction = _friction_doubt(found, half, width)
-    left, times = unexplained(found), time_jitter(found)
+    left, times, sharp = unexplained(found), time_jitter(found), moved_between_samples(found)
     doubts = (
         _wide(std, allowed, unit),
         _rival(found, half, total, unit),
@@ -175,8 +175,9 @@ def _doubts(
         _of_friction(found, friction, allowed, unit),
         _of_slow_motion(left, half, allowed, unit),
         _of_jitter(times, allowed, unit),
+        _of_sharp_motion(sharp, allowed, unit),
     )
-    contact, sharp = (0.0, 0.0) if any(doubts) else (moved_by_contact(found), moved_between_samples(found))
+    contact = 0.0 if any(doubts) else moved_by_contact(found)
     explained = math.hypot(total, friction.std, DOUBT * left, DOUBT * times.half, DOUBT * contact, DOUBT * sharp)
     return tuple(filter(None, doubts)), explained
 
@@ -267,6 +268,16 @@ def _of_jitter(times: TimeJitter, allowed: float, unit: float) -> str:
         f"{1e3 * times.time:.2g} ms"
     )
     return f"{cause}: that moves the gap by {_deg(unit * times.half)}, and {_deg(unit * allowed)} are allowed"
+
+
+def _of_sharp_motion(moved: float, allowed: float, unit: float) -> str:
+    """Sentence for places between samples that move a half gap (m or rad at the load) too much."""
+    if moved <= allowed:
+        return ""
+    return (
+        f"the motor turns so sharply that its places between two samples may move the gap by {_deg(unit * moved)}, and "
+        f"{_deg(unit * allowed)} are allowed: a higher sample rate is needed"
+    )
 
 
 def _hidden(found: Search, half: float) -> str:
