@@ -67,7 +67,7 @@ class _Member(NamedTuple):
             **{key: each for key, each in self.values.items() if key not in ("link", "edge", "novelty")},
             "name": self.name,
             "recording": {"sample_rate_hz": rate},
-            "twin": {"policy": "paper", "k_dz": 0.0, **stated},
+            "twin": {"enabled": False, "policy": "paper", "k_dz": 0.0, **stated},
         }
         return {
             "role": ROLE,
