@@ -21,23 +21,34 @@ def edge(file: Annotated[Path, typer.Argument(help="The servo's edge.toml.")]) -
 
 
 def up(
+    scenarios: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            help="Scenario files whose machines run, in real time; by default three servos that wear, as a "
+            "demonstration, or those of the folder.",
+        ),
+    ] = None,
+    machines: Annotated[int, typer.Option(help="Machines of each scenario, named NAME-1, NAME-2, ...")] = 1,
     folder: Annotated[Path, typer.Option(help="Folder for all stored data; created at the first start.")] = Path(
         "servotwin-up"
     ),
     speed: Annotated[
         float | None,
-        typer.Option(help="Speed in multiples of real time; by default as fast as 60 % of two cores allow."),
+        typer.Option(
+            help="Speed in multiples of real time; by default 1 for scenarios, and otherwise as fast as 60 % of two "
+            "cores allow."
+        ),
     ] = None,
     seconds: Annotated[float | None, typer.Option("--for", help="End after this many seconds.")] = None,
 ) -> None:
-    """Run a twin and three simulated servos that wear, all on this machine; Ctrl-C ends it."""
+    """Run a twin, edges and simulated machines that wear, all as processes on this machine; Ctrl-C ends it."""
     from servotwin.runtime.extras import check_extra
     from servotwin.up.command import up as run
 
     for module in ("uvicorn", "httptools", "sqlalchemy", "alembic"):  # the twin is a process of its own
         check_extra(module, "servotwin up")
 
-    run(folder, speed, seconds)
+    run(folder, scenarios or (), machines, speed, seconds)
 
 
 class TwinAction(StrEnum):

@@ -29,6 +29,7 @@ from servotwin.plant.plants import PLANT_KEY, Plant
 from servotwin.plant.signals import SignalLike, as_gap, as_pieces
 from servotwin.runtime.notebook import html_table
 from servotwin.simulation.inputs import whole_ratio
+from servotwin.twin.model import TwinModel
 from servotwin.twin.settings import TwinSettings
 
 BOOT = "boot-1"
@@ -136,7 +137,8 @@ class Scenario:
         ------
         InvalidInput
             The file is missing, empty or not TOML, a key is unknown or missing, a value is not allowed, the controller
-            is unstable on the servo even without a gap, nothing is verified for the stated range.
+            is unstable on the servo even without a gap, nothing is verified for the stated range, the twin's
+            method, policy or triage cannot work with the servo.
         """
         return cls.from_table(read_toml(path), Path(path).parent)
 
@@ -156,6 +158,8 @@ class Scenario:
             scenario.servo.check_loop(scenario.law)
             try:
                 scenario.commissioning.check_agent(scenario.name, BOOT)
+                if scenario.twin.enabled:
+                    TwinModel.of(scenario.model, scenario.twin)
             except InvalidInput as error:
                 hint = "; without a twin it can be simulated: enabled = false in [twin], and no policy"
                 raise InvalidInput(f"{error}{hint}") from None

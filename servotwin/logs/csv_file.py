@@ -24,6 +24,8 @@ _METADATA = "metadata"  # name of a CSV file's last column; its first row holds 
 _COMMENTS = ("#", "%", "//")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}(,\d{3})+(\.\d*)?$")
 _COMMA = re.compile(r"(^|[^\d.,])[+-]?(\d+|\d{1,3}(\.\d{3})+),\d+($|[^\d.,])")
+_LONGEST_CELL = 2**31 - 1
+"""Characters: the metadata of a log, with its scenario, are one cell; Python's own limit is 131072."""
 _BYTE_ORDER_MARKS = {b"\xff\xfe": "utf-16", b"\xfe\xff": "utf-16", b"\xef\xbb\xbf": "utf-8-sig"}
 
 
@@ -198,6 +200,7 @@ def _separator(lines: Sequence[str]) -> str | None:
 
 def _cells(line: str, separator: str | None) -> list[str]:
     if separator is not None and '"' in line:
+        csv.field_size_limit(_LONGEST_CELL)
         return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True))]
     return [cell.strip() for cell in line.split(separator)]
 

@@ -242,5 +242,6 @@ def check_encoders(plant: PlantNumbers, law: Law) -> None:
     """
     if isinstance(law, LinearLaw) and plant.at_motor and law.reads("y_load"):
         raise InvalidInput(
-            'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be "load"'
+            'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be '
+            '"load", or on = "motor" in [controller] of a cascade'
         )

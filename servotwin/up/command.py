@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 
@@ -19,7 +20,8 @@ from servotwin.up import display
 from servotwin.up.display import Snapshot, clock
 from servotwin.up.folder import Folder, opened
 from servotwin.up.outages import Outages
-from servotwin.up.plan import SERVOS
+from servotwin.up.plan import Plan
+from servotwin.up.scenario_plan import ScenarioPlan
 from servotwin.up.site import Site, StartInterrupted
 from servotwin.up.speed import CORES, FASTEST, SLOWEST, MachineTime, SpeedMeter, next_speed, processor_times
 from servotwin.up.status import ServoReader, TwinPoller, TwinStatus
@@ -32,15 +34,27 @@ _CAUTION = 0.7
 """Share of the last speed at which a start begins."""
 
 
-def up(path: Path, speed: float | None = None, seconds: float | None = None, console: Console | None = None) -> None:
+def up(
+    path: Path,
+    scenarios: Sequence[Path] = (),
+    machines: int = 1,
+    speed: float | None = None,
+    seconds: float | None = None,
+    console: Console | None = None,
+) -> None:
     """Run twin, edges and machines until a signal comes, or for a while.
 
     Parameters
     ----------
     path : Path
         The folder; made if it is missing.
+    scenarios : sequence of Path
+        Files of the scenarios whose machines run; none: those of the folder, in a new one the demonstration.
+    machines : int
+        Machines of each scenario.
     speed : float, optional
-        Machine time per time; None: as fast as the processor's share allows.
+        Machine time per time; None: real time for scenarios, and the demonstration as fast as the processor's share
+        allows.
     seconds : float, optional
         Time after which it ends, s; None: when a signal comes.
     console : Console, optional
@@ -48,13 +62,16 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
     Raises
     ------
     InvalidInput
-        The folder holds something else or is in use, a speed or time is not allowed, a process does not start or keeps
-        ending.
+        A scenario is not allowed, the folder holds something else or is in use, a speed or time is not allowed, a
+        process does not start or keeps ending.
     """
     _check_positive("--speed", speed, FASTEST)
     _check_positive("--for", seconds, 1e9)
     console = console or Console()
-    with opened(path, lambda made: _announce_making(made, console)) as folder, _counted_signals() as signals:
+    if machines != 1 and not scenarios:
+        raise InvalidInput(f"--machines {machines}: is the number of machines of each scenario; name a scenario's file")
+    plan = ScenarioPlan.read(scenarios, machines) if scenarios else None
+    with opened(path, plan, partial(_announce_making, console)) as folder, _counted_signals() as signals:
         _greet(folder, console)
         site = Site(folder, Outages(), signals, lambda url: _announce(folder, url, console))
         monitor = _Monitor(folder, site, speed, console)
@@ -71,13 +88,14 @@ def up(path: Path, speed: float | None = None, seconds: float | None = None, con
         monitor.print_summary()
 
 
-def _announce_making(path: Path, console: Console) -> None:
-    line = f"making {path}: a twin and three servos (the very first time, code is compiled for minutes) ..."
+def _announce_making(console: Console, path: Path, plan: Plan) -> None:
+    names = ", ".join(servo.name for servo in plan.servos)
+    line = f"making {path}: a twin for {names} (the very first time, code is compiled for minutes) ..."
     console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
 def _greet(folder: Folder, console: Console) -> None:
-    for servo in SERVOS:
+    for servo in folder.servos:
         state = folder.machine(servo)
         if state is not None:
             described = f"{servo.name} at {clock(state.time_s)} of machine time with a gap of {state.gap_deg:.3f} deg"
@@ -94,7 +112,7 @@ def _announce(folder: Folder, url: str, console: Console) -> None:
 def _initial_speed(folder: Folder) -> float:
     """Choose a speed a little below the last one, which this machine may not reach under its present load."""
     try:
-        last = [read_speed(folder.servo(servo) / _SPEED_FILE) or 0.0 for servo in SERVOS]
+        last = [read_speed(folder.servo(servo) / _SPEED_FILE) or 0.0 for servo in folder.servos]
     except InvalidInput:  # it is written anew before the machines start
         return SLOWEST
     return max(SLOWEST, _CAUTION * min(last))
@@ -128,8 +146,9 @@ class _Monitor:
 
     def __init__(self, folder: Folder, site: Site, speed: float | None, console: Console) -> None:
         self._folder, self._site, self._console = folder, site, console
-        self._fixed, self._speed = speed is not None, speed or _initial_speed(folder)
-        self._readers = {servo.name: ServoReader(servo, folder.servo(servo)) for servo in SERVOS}
+        fixed = folder.speed if speed is None else speed
+        self._fixed, self._speed = fixed is not None, fixed or _initial_speed(folder)
+        self._readers = {servo.name: ServoReader(servo, folder.servo(servo)) for servo in folder.servos}
         self._poller: TwinPoller | None = None
         self._meter = SpeedMeter()
         self._event, self._event_until = "", 0.0
@@ -141,7 +160,7 @@ class _Monitor:
     def run(self, signals: _SignalCounter, seconds: float | None) -> None:
         """Run until a signal comes or `seconds` have passed."""
         self._begun = time.monotonic()
-        names = [servo.name for servo in SERVOS]
+        names = [servo.name for servo in self._folder.servos]
         self._poller = TwinPoller(self._site.url, self._folder.operator(), names)
         self._poller.start()
         with self._live() as live:
@@ -205,7 +224,7 @@ class _Monitor:
                 self._print(event)
 
     def _adapt(self, now: float) -> None:
-        states = {servo.name: self._readers[servo.name].machine() for servo in SERVOS}
+        states = {servo.name: self._readers[servo.name].machine() for servo in self._folder.servos}
         times = {name: MachineTime(state.time_s, state.written) for name, state in states.items() if state is not None}
         self._meter.measure(processor_times(self._site.groups, {os.getpid()}), times, now)
         twin = None if self._poller is None else self._poller.twin
@@ -216,13 +235,13 @@ class _Monitor:
 
     def _write_speed(self) -> None:
         with suppress(OSError):
-            for servo in SERVOS:
+            for servo in self._folder.servos:
                 write_speed(self._folder.servo(servo) / _SPEED_FILE, self._speed)
 
     def _snapshot(self, now: float, twin: TwinStatus | None) -> Snapshot:
         left = 0.0 if self._site.forwarder is None else self._site.forwarder.left
         servos = []
-        for servo in SERVOS:
+        for servo in self._folder.servos:
             estimate = None if self._poller is None else self._poller.estimates.get(servo.name)
             restarts = self._site.machines[servo.name].restarts + self._site.edges[servo.name].restarts
             servos.append(self._readers[servo.name].read(estimate, left if servo.outages else 0.0, restarts))

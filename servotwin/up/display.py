@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from math import degrees, isfinite
 from typing import Any, NamedTuple
 
@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from servotwin.up.plan import POLICIES
+from servotwin.plant.display_units import DEGREES, MILLIMETRES
 from servotwin.up.speed import CORES, LIMIT, SLOWEST
 from servotwin.up.status import OK, ServoStatus, TwinStatus
 
@@ -53,15 +53,30 @@ _Cell = Callable[[ServoStatus], str]
 
 
 def table(snapshot: Snapshot) -> RenderableType:
-    """Live table with the lines below it."""
+    """Live table with the lines below it: a column for each servo or, where they are many, a short row."""
+    grid = _rows_of_servos(snapshot) if len(snapshot.servos) > _MOST_COLUMNS else _columns_of_servos(snapshot)
+    return Group(grid, Text.from_markup("\n".join(["", *_below(snapshot)]), overflow="fold"))
+
+
+def _columns_of_servos(snapshot: Snapshot) -> Table:
     grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=True)
     grid.add_column("", style="dim", no_wrap=True)
     for servo in snapshot.servos:
         grid.add_column(servo.plan.name, no_wrap=True, min_width=18)
     troubled = any(servo.restarts for servo in snapshot.servos)
-    for name, cell in [*_ROWS, *([_RESTARTS] if troubled else [])]:
+    rows = [*_ROWS, *_setting_rows(snapshot.servos), *_LINK_ROWS, *([_RESTARTS] if troubled else [])]
+    for name, cell in rows:
         grid.add_row(name, *(Text.from_markup(cell(servo)) for servo in snapshot.servos))
-    return Group(grid, Text.from_markup("\n".join(["", *_below(snapshot)]), overflow="fold"))
+    return grid
+
+
+def _rows_of_servos(snapshot: Snapshot) -> Table:
+    grid = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=True)
+    for name in ("", *_SHORT):
+        grid.add_column(name, no_wrap=True)
+    for servo in snapshot.servos:
+        grid.add_row(servo.plan.name, *(Text.from_markup(cell(servo)) for cell in _SHORT.values()))
+    return grid
 
 
 def _below(snapshot: Snapshot) -> list[str]:
@@ -95,8 +110,9 @@ def _short(servo: ServoStatus) -> str:
 def _speed(snapshot: Snapshot) -> str:
     if snapshot.cores is None and snapshot.reached == 0.0:
         return f"starting at {snapshot.speed:g} x real time"
-    slow = snapshot.reached < 0.95 * SLOWEST <= 0.95 * snapshot.speed
-    note = f" [red](this machine does not reach {SLOWEST:g})[/]" if slow else ""
+    least = min(SLOWEST, snapshot.speed)
+    slow = snapshot.reached < 0.95 * least
+    note = f" [red](this machine does not reach {least:g})[/]" if slow else ""
     return f"[bold]{snapshot.reached:.1f}[/] x real time{note}"
 
 
@@ -124,12 +140,6 @@ def _waits(twin: TwinStatus | None) -> str:
 def _windows(servo: ServoStatus) -> dict[str, Any]:
     windows = servo.edge.get("windows", {})
     return windows if isinstance(windows, dict) else {}
-
-
-def _number(servo: ServoStatus, key: str, scale: float, digits: int) -> str:
-    """A number of the edge's status, scaled."""
-    value = servo.edge.get(key)
-    return _NONE if value is None else f"{value * scale:.{digits}f}"
 
 
 def _gap(servo: ServoStatus) -> str:
@@ -168,9 +178,36 @@ def _version(servo: ServoStatus) -> str:
     return f"{servo.edge['version']}" + (" [yellow]fallback set[/]" if servo.edge.get("fallback") else "")
 
 
-def _gains(servo: ServoStatus) -> str:
-    numbers = [_number(servo, key, 1e-3, digits) for key, digits in _GAINS.items()]
-    return _NONE if _NONE in numbers else " ".join(numbers)
+def _setting_rows(servos: Sequence[ServoStatus]) -> list[tuple[str, _Cell]]:
+    """Rows with the settings in force, a row for each unit: machines may count in different ones."""
+    shown = [(servo, _setting(servo)) for servo in servos]
+    names = dict.fromkeys(name for _, setting in shown for name in setting)
+
+    def row(name: str) -> _Cell:
+        return lambda servo: next(setting.get(name, _NONE) for each, setting in shown if each is servo)
+
+    return [(name, row(name)) for order in _SETTINGS for name in names if name.startswith(order)]
+
+
+def _setting(servo: ServoStatus) -> dict[str, str]:
+    """Dead zone, gains and feedforward in the units of the machine, by the name of their row."""
+    units, edge = servo.units, {name: each for name, each in servo.edge.items() if isinstance(each, float)}
+    position = MILLIMETRES if units.position == "m" else DEGREES
+    rows = dict[str, str]()
+    if (tolerance := edge.get(units.key("tolerance_m"))) is not None:
+        rows[f"dead zone, {position.name}"] = f"{tolerance * position.factor:.4f}"
+    pid = [edge[name] for name in map(units.key, _PID) if name in edge]
+    if len(pid) == len(_PID):
+        scale, per = (1e-3, "mm") if units.position == "m" else (1.0, "rad")
+        rows[f"Kp Ki Kd, {units.command}/{per}"] = " ".join(f"{scale * gain:.3g}" for gain in pid)
+    cascade = {name: edge.get(units.key(key), 0.0) for name, key in _CASCADE.items()}
+    if not cascade["Kp"]:  # the drive closes the velocity loop
+        cascade = {name: gain for name, gain in cascade.items() if name == "Kv"}
+    if any(cascade.values()):
+        rows[" ".join(cascade)] = " ".join(f"{gain:.3g}" for gain in cascade.values())
+    if (feedforward := edge.get(units.key("feedforward_v"))) is not None:
+        rows[f"feedforward, m{units.command}"] = f"{1e3 * feedforward:.1f}"
+    return rows
 
 
 def _acknowledged(servo: ServoStatus) -> str:
@@ -193,26 +230,36 @@ def _link(servo: ServoStatus) -> str:
     return "[yellow]reconnecting[/]" if trouble else "[green]up[/]" if servo.edge else _NONE
 
 
-_GAINS = {"kp_v_per_m": 2, "ki_v_per_m_s": 1, "kd_v_s_per_m": 2}
+_PID = ("kp_v_per_m", "ki_v_per_m_s", "kd_v_s_per_m")
+_CASCADE = {"Kv": "position_gain_per_s", "Kp": "velocity_gain_v_s_per_rad", "Ti": "integral_time_s"}
+_SETTINGS = ("dead zone", "K", "feedforward")
+"""Beginnings of the names of rows, in their order."""
 _ROWS: Sequence[tuple[str, _Cell]] = (
     ("", lambda servo: f"[dim]{servo.plan.trait}[/]"),
     ("edge's role", lambda servo: servo.plan.role),
-    ("twin's policy", lambda servo: POLICIES[servo.plan.model]),
+    ("twin's policy", lambda servo: servo.plan.policy),
     ("machine time", lambda servo: _NONE if servo.machine is None else clock(servo.machine.time_s)),
     ("true gap, deg", _gap),
     ("estimate ± 95 %, deg", _estimate),
     ("error, deg", _error),
     ("wear ± 95 %, deg/h", _wear),
     ("version", _version),
-    ("dead zone, mm", lambda servo: _number(servo, "tolerance_m", 1e3, 4)),
-    ("Kp Ki Kd, V/mm", _gains),
-    ("feedforward, mV", lambda servo: _number(servo, "feedforward_v", 1e3, 1)),
+)
+_LINK_ROWS: Sequence[tuple[str, _Cell]] = (
     ("windows cut", lambda servo: str(servo.cut) if servo.edge else _NONE),
     ("acknowledged", _acknowledged),
     ("waiting", _waiting),
     ("dropped", _dropped),
     ("link", _link),
 )
+_SHORT: Mapping[str, _Cell] = {
+    "gap ± 95 %, deg": _estimate,
+    "error, deg": _error,
+    "version": _version,
+    "waiting": _waiting,
+    "link": _link,
+}
+_MOST_COLUMNS = 4
 _RESTARTS: tuple[str, _Cell] = ("restarts", lambda servo: f"[red]{servo.restarts}[/]" if servo.restarts else "0")
 
 

@@ -6,7 +6,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,27 +18,24 @@ from servotwin.edge_process.config_file import edge_toml, load
 from servotwin.errors import InvalidInput
 from servotwin.runtime.files import write_text
 from servotwin.runtime.locks import locked
-from servotwin.runtime.retry import Retry
 from servotwin.twin_service.auth import Verifiers, write_tokens
-from servotwin.up import enrolment
-from servotwin.up.plan import PRE_TRIGGER_S, RATE, SERVOS, WINDOW_S, ServoPlan, machine_toml, twin_toml
-from servotwin.up.speed import FASTEST
+from servotwin.up.demonstration import Demonstration
+from servotwin.up.enrolment import TOKEN, enroll_operator
+from servotwin.up.plan import DRIVE, EDGE, LOCK, MACHINE, OPERATOR, TWIN, Plan, ServoPlan
 
-MARKER, LOCK, TWIN, OPERATOR = "servotwin-up.json", "lock", "twin.toml", "operator.token"
-EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
+MARKER = "servotwin-up.json"
 LONGEST = 100
 """Bytes of a socket's path that every system accepts: Linux allows 107, macOS 103."""
 _ENDING_S = 25.0
 """s that processes of an earlier start, which was killed, may take to end."""
-_PLACEHOLDER = "http://127.0.0.1:1"
-"""URL of the twin in the edges' files until its port is known."""
-_RETRY = Retry(0.5, 2.0, 2.0)
 
 
-class _Marker(msgspec.Struct, frozen=True, tag="servotwin-up/1", tag_field="schema"):
-    """Marks a folder as made by `servotwin up`; names of its servos."""
+class _Marker(msgspec.Struct, frozen=True, tag="servotwin-up/2", tag_field="schema"):
+    """Marks a folder as made by `servotwin up`; its servos, their speed, and the digest of what it was made from."""
 
-    servos: list[str]
+    servos: tuple[ServoPlan, ...]
+    speed: float | None
+    digest: str
 
 
 @dataclass(frozen=True)
@@ -49,6 +46,9 @@ class Folder:
     ----------
     path : Path
         Absolute.
+    servos : tuple of ServoPlan
+    speed : float or None
+        Machine time per time; None: as fast as the processor's share allows.
     lock : int
         Descriptor of the lock, which every process that works in the folder keeps open.
     new : bool
@@ -56,6 +56,8 @@ class Folder:
     """
 
     path: Path
+    servos: tuple[ServoPlan, ...]
+    speed: float | None
     lock: int
     new: bool
 
@@ -85,14 +87,18 @@ class Folder:
 
 
 @contextmanager
-def opened(path: Path, making: Callable[[Path], None] | None = None) -> Iterator[Folder]:
+def opened(
+    path: Path, plan: Plan | None = None, making: Callable[[Path, Plan], None] | None = None
+) -> Iterator[Folder]:
     """Open the folder, made at the first start, and lock it for this process.
 
     Parameters
     ----------
     path : Path
+    plan : Plan, optional
+        What it is made from, or was made from. None: whatever is in it; a new one has the demonstration.
     making : callable, optional
-        Called with the folder before it is made, which takes minutes where code has to be compiled first.
+        Called with folder and plan before it is made, which takes minutes where code has to be compiled first.
 
     Raises
     ------
@@ -100,74 +106,67 @@ def opened(path: Path, making: Callable[[Path], None] | None = None) -> Iterator
         It holds something else, is in use, or cannot be written.
     """
     path = path.absolute()
-    _check_length(path)
     try:
         new = not path.exists() or not any(path.iterdir())
         if new:
+            first = plan or Demonstration()
+            _check_length(path, first.servos)
             if making is not None:
-                making(path)
-            _make(path)
-        _check(path)
+                making(path, first)
+            _make(path, first)
+        marker = _marker(path, plan)
+        _check_length(path, marker.servos)
         with _locked(path) as lock:
-            yield Folder(path, lock, new)
+            yield Folder(path, marker.servos, marker.speed, lock, new)
     except OSError as error:
         raise InvalidInput(f"{error.filename or path}: {(error.strerror or str(error)).lower()}") from None
 
 
-def _check_length(path: Path) -> None:
-    longest = max(len(os.fsencode(path / servo.name / DRIVE)) for servo in SERVOS)
+def _check_length(path: Path, servos: Iterable[ServoPlan]) -> None:
+    longest = max(len(os.fsencode(path / servo.name / DRIVE)) for servo in servos)
     if longest > LONGEST:
         fault = f"its path is {longest - LONGEST} bytes too long for the sockets in it"
         raise InvalidInput(f"folder {path}: {fault}; choose a shorter one with --folder")
 
 
-def _check(path: Path) -> None:
+def _marker(path: Path, plan: Plan | None) -> _Marker:
+    """Read the marker, and check that the folder is whole and was made from the plan."""
     try:
-        servos = msgspec.json.decode((path / MARKER).read_bytes(), type=_Marker).servos
+        marker = msgspec.json.decode((path / MARKER).read_bytes(), type=_Marker)
     except (OSError, msgspec.MsgspecError):
         allowed = "choose another with --folder, or one that is empty or not there yet"
-        raise InvalidInput(f"folder {path}: was not made by servotwin up; {allowed}") from None
-    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in servos for file in (EDGE, MACHINE, enrolment.TOKEN))]
+        raise InvalidInput(f"folder {path}: was not made by this version of servotwin up; {allowed}") from None
+    names = [servo.name for servo in marker.servos]
+    needed = [TWIN, OPERATOR, *(f"{name}/{file}" for name in names for file in (EDGE, MACHINE, TOKEN))]
     missing = [name for name in needed if not (path / name).is_file()]
-    if servos != [servo.name for servo in SERVOS] or missing:
-        fault = f"{missing[0]} is missing" if missing else f"its servos are {', '.join(servos)}"
+    fault = f"{missing[0]} is missing" if missing else ""
+    if plan is not None and plan.digest != marker.digest:
+        fault = f"was made from other scenarios or axes (its servos are {', '.join(names)})"
+    if fault:
         raise InvalidInput(f"folder {path}: {fault}; remove the folder to begin anew, or choose another with --folder")
+    return marker
 
 
-def _make(path: Path) -> None:
+def _make(path: Path, plan: Plan) -> None:
     """Make everything in a temporary folder beside it, then rename that one."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = Path(tempfile.mkdtemp(prefix=f".{path.name}-", dir=path.parent))
     try:
-        _fill(temporary)
+        _fill(temporary, plan)
         with suppress(FileExistsError):  # another start was quicker
             temporary.replace(path)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _fill(path: Path) -> None:
+def _fill(path: Path, plan: Plan) -> None:
     write_tokens(path / "tokens.toml", Verifiers())
-    write_text(path / TWIN, twin_toml(SERVOS, FASTEST))
-    enrolment.enroll_operator(path / TWIN, "up", path / OPERATOR)
-    for servo in SERVOS:
-        folder, drive = path / servo.name, {"kind": "simulated", "address": f"unix:{DRIVE}"}
-        request = enrolment.Enrolment(
-            servo=servo.name,
-            folder=folder,
-            role=servo.role,
-            sample_rate=RATE,
-            drive=drive,
-            url=_PLACEHOLDER,
-            noise=enrolment.StatedNoise(1e3 * servo.noise_mm),
-        )
-        enrolment.enroll(path / TWIN, request)
-        config = load(folder / EDGE)
-        agent = replace(config.agent, retry=_RETRY, window_s=WINDOW_S, pre_trigger_s=PRE_TRIGGER_S)
-        link = None if config.twin is None else replace(config.twin, live=True)
-        write_text(folder / EDGE, edge_toml(replace(config, agent=agent, twin=link)))
-        write_text(folder / MACHINE, machine_toml(servo))
-    write_text(path / MARKER, msgspec.json.encode(_Marker([servo.name for servo in SERVOS])).decode() + "\n")
+    plan.write_twin(path)
+    enroll_operator(path / TWIN, "up", path / OPERATOR)
+    for servo in plan.servos:
+        plan.write_servo(servo, path)
+    marker = _Marker(plan.servos, plan.speed, plan.digest)
+    write_text(path / MARKER, msgspec.json.encode(marker).decode() + "\n")
 
 
 @contextmanager

@@ -1,40 +1,34 @@
-"""Plan of `servotwin up`: three servos that wear at different rates, and the files of their first start."""
+"""Plan of a folder of `servotwin up`: its servos, and the files of their first start."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from pathlib import Path
+from typing import Protocol
 
-RATE = 1000.0
-"""Hz. It resolves gaps to a thousandth of a degree; the cost grows with the number of ticks."""
-WINDOW_S, PRE_TRIGGER_S = 4.0, 0.3
-"""s. A slow loop reverses late: windows of 2 s show only one side of gaps from 26 deg on, windows of 3 s both sides of
-40 deg."""
-NEW_GAP, WORN_GAP = 0.0, 40.0
-"""deg"""
-HOUR = 3600.0
-POLICIES = {"certified": "certified", "dead-zone": "hysteresis"}
-"""Policy of each model."""
+import msgspec
+
+from servotwin.runtime.retry import Retry
+
+TWIN, OPERATOR, LOCK = "twin.toml", "operator.token", "lock"
+EDGE, MACHINE, DRIVE = "edge.toml", "machine.toml", "drive.sock"
+PLACEHOLDER = "http://127.0.0.1:1"
+"""URL of the twin in the edges' files until its port is known."""
+RETRY = Retry(0.5, 2.0, 2.0)
 
 
-class ServoPlan(NamedTuple):
+class ServoPlan(msgspec.Struct, frozen=True):
     """One servo and its machine.
 
     Attributes
     ----------
     name : str
     trait : str
-        Its special feature, for the display.
+        What distinguishes it, for the display.
     role : str
-        "control": the edge runs the law at every sample, which costs most processor time: only one servo does.
-        "supervise": the machine has its own controller, and its samples come in blocks.
-    model : str
-        One of `POLICIES`.
-    wears_h, age_h : float
-        h of machine time from new to worn out, and h that have passed at the first start.
-    noise_mm : float
-        rms, of the position's encoder.
-    bias_v : float
-        On the motor's input, as of an amplifier.
+        "control": the edge runs the law at every sample. "supervise": the machine has its own controller, and its
+        samples come in blocks.
+    policy : str
+        Of its twin.
     outages : bool
         Its link has outages.
     """
@@ -42,92 +36,27 @@ class ServoPlan(NamedTuple):
     name: str
     trait: str
     role: str
-    model: str
-    wears_h: float
-    age_h: float
-    noise_mm: float = 0.0
-    bias_v: float = 0.0
+    policy: str
     outages: bool = False
 
 
-SERVOS = (
-    ServoPlan("quick", "wears quickest", "control", "certified", 4.0, 1.0, bias_v=0.05),
-    ServoPlan("noisy", "noisy encoder", "supervise", "certified", 8.0, 2.0, noise_mm=0.05, bias_v=-0.03),
-    ServoPlan("remote", "outages", "supervise", "dead-zone", 12.0, 2.5, outages=True),
-)
+class Plan(Protocol):
+    """What a new folder is made from."""
 
+    @property
+    def servos(self) -> tuple[ServoPlan, ...]:
+        """The servos."""
 
-def twin_toml(servos: tuple[ServoPlan, ...], most_speed: float) -> str:
-    """Text of the twin's file."""
-    named = "".join(f'"{servo.name}" = "{servo.model}"\n' for servo in servos)
-    return _SERVICE.format(speed=most_speed) + "".join(map(_model, POLICIES)) + f"\n[servos]\n{named}"
+    @property
+    def speed(self) -> float | None:
+        """Machine time per time; None: as fast as the processor's share allows."""
 
+    @property
+    def digest(self) -> str:
+        """Digest of everything that the folder is made from."""
 
-def machine_toml(servo: ServoPlan) -> str:
-    """Text of a machine's file."""
-    values = {**servo._asdict(), "rate": RATE, "new": NEW_GAP, "worn": WORN_GAP, "over": servo.wears_h * HOUR}
-    noise = f"\n[scenario.noise]\nstd_mm = {servo.noise_mm}\n" if servo.noise_mm else ""
-    return _MACHINE.format(**values, begin=-servo.age_h * HOUR) + noise
+    def write_twin(self, path: Path) -> None:
+        """Write the twin's file into the folder."""
 
-
-def _model(name: str) -> str:
-    return _MODEL.format(name=name, policy=POLICIES[name])
-
-
-_SERVICE = """\
-[service]
-port = 0                      # any free port
-tokens = "tokens.toml"
-workers = 1
-speed = {speed:.1f}                 # machine time passes that much faster than the clock, at most
-retention_days = 0.1
-log_level = "warning"
-"""
-_MODEL = """
-[models.{name}]
-servo = "paper"
-[models.{name}.twin]
-policy = "{policy}"
-gap_limit_deg = 50.0
-validity_s = 1800.0           # machine time: half a minute at sixty times real time
-[models.{name}.twin.trend]
-wear_deg = 10.0
-over_s = 3600.0
-[models.{name}.twin.triage]   # a window in which the gap has hardly moved is only screened
-every = 10
-"""
-_MACHINE = """\
-role = "{role}"
-listen = "unix:drive.sock"
-speed = 5.0
-state_file = "state.json"     # machine time so far; without this file the machine is new again
-speed_file = "speed"          # overrides speed; servotwin up writes it
-
-[scenario]
-servo = "paper"
-name = "{name}"
-duration_s = {over}
-
-[scenario.reference]
-kind = "square"
-amplitude_mm = 1.0
-period_s = 40.0
-
-[scenario.gap]                # total gap
-from_deg = {new}
-to_deg = {worn}
-over_s = {over}
-begin_s = {begin}
-
-[scenario.disturbances]
-input_bias_v = {bias_v}
-
-[scenario.recording]
-sample_rate_hz = {rate}
-
-[scenario.controller]
-sample_rate_hz = {rate}
-
-[scenario.twin]               # not used here: gains and dead zone come from the edge
-policy = "paper"
-"""
+    def write_servo(self, servo: ServoPlan, path: Path) -> None:
+        """Write the files of a servo's machine and edge into its folder in this one, and enrol it."""

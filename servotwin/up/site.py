@@ -6,9 +6,9 @@ import time
 from collections.abc import Callable, Collection
 
 from servotwin.runtime.child_process import Child
-from servotwin.up.folder import EDGE, MACHINE, TWIN, Folder
+from servotwin.up.folder import Folder
 from servotwin.up.outages import Forwarder, Outages
-from servotwin.up.plan import SERVOS
+from servotwin.up.plan import EDGE, MACHINE, TWIN
 
 _LISTENING = "servotwin twin: listening on "
 _READY_S, _STOP_S, _POLL_S = 600.0, 20.0, 0.05
@@ -39,8 +39,8 @@ class Site:
     ) -> None:
         self._folder, self._outages, self._signals, self._announce = folder, outages, signals, announce
         self.twin = self._child("twin", ("servotwin", "twin", "--config", str(folder.path / TWIN), "--port", "0"))
-        self.machines = {servo.name: self._machine(servo.name) for servo in SERVOS}
-        self.edges = {servo.name: self._edge(servo.name) for servo in SERVOS}
+        self.machines = {servo.name: self._machine(servo.name) for servo in self._folder.servos}
+        self.edges = {servo.name: self._edge(servo.name) for servo in self._folder.servos}
         self.forwarder: Forwarder | None = None
 
     @property
@@ -76,7 +76,7 @@ class Site:
         self.twin.command = (*self.twin.command[:-1], port)
         self.forwarder = Forwarder(int(port), self._outages)
         self.forwarder.start()
-        for servo in SERVOS:
+        for servo in self._folder.servos:
             url = f"http://127.0.0.1:{self.forwarder.port}" if servo.outages else self.url
             self._folder.connect(servo, url)
         for child in self.edges.values():

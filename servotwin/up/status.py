@@ -14,17 +14,19 @@ from urllib.parse import urlsplit
 
 import msgspec
 
+from servotwin.config.own_units import VOLTS_METRES, OwnUnits
 from servotwin.drives.simulated.machine_state import MachineState, read_state
 from servotwin.drives.simulated.settings import MachineSettings
 from servotwin.edge_process.monitoring import read_status
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import NORMAL_95
-from servotwin.up.folder import MACHINE
-from servotwin.up.plan import ServoPlan
+from servotwin.plant.own_units import own_units
+from servotwin.up.plan import MACHINE, ServoPlan
 
 _POLL_S, _TIMEOUT_S = 2.0, 5.0
-_FIRST_WINDOWS, _WINDOWS = 20, 4
-"""Windows that are searched for the newest estimate, in the first query and in later ones."""
+_FIRST_WINDOWS, _WINDOWS, _MOST_WINDOWS = 20, 4, 1000
+"""Windows that are searched for the newest estimate, in the first query and in later ones, beside those that wait; most
+that the twin shows at once."""
 _METRICS = {
     'servotwin_messages_total{kind="window",put="new"}': "windows",
     'servotwin_evidence_total{kind="estimate"}': "estimates",
@@ -129,7 +131,8 @@ class TwinPoller:
         waiting = msgspec.json.decode(self._get(connection, "/healthz"))["waiting"]
         counts = read_metrics(self._get(connection, "/metrics").decode())
         for servo in self._servos:
-            limit = _WINDOWS if servo in self.estimates else _FIRST_WINDOWS
+            # The newest windows are those that wait.
+            limit = min(_MOST_WINDOWS, waiting["messages"] + (_WINDOWS if servo in self.estimates else _FIRST_WINDOWS))
             traces = msgspec.json.decode(self._get(connection, f"/v1/servos/{servo}/audit?limit={limit}"))
             newest = newest_estimate(traces)
             if newest is not None:
@@ -232,6 +235,8 @@ class ServoStatus(NamedTuple):
         s until the present outage of its link ends; 0: there is none.
     restarts : int
         Of its machine and its edge.
+    units : OwnUnits
+        In which the edge's status counts.
     """
 
     plan: ServoPlan
@@ -241,6 +246,7 @@ class ServoStatus(NamedTuple):
     cut: int
     outage: float
     restarts: int
+    units: OwnUnits = VOLTS_METRES
 
 
 class ServoReader:
@@ -275,6 +281,7 @@ class ServoReader:
             cut=sum(self._cuts.values()),
             outage=outage,
             restarts=restarts,
+            units=own_units(self._settings.scenario.servo),
         )
 
     def machine(self) -> MachineState | None:

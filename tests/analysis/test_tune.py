@@ -10,6 +10,7 @@ from hypothesis import assume, example, given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from servotwin.analysis.tuning import candidates
 from servotwin.analysis.tuning.candidates import CONTROLLER_TYPES, Factors
 from servotwin.analysis.tuning.response import FrequencyData, Plant, nyquist_stable
 from servotwin.analysis.tuning.setpoint import overshoot, prefilter
@@ -18,6 +19,7 @@ from servotwin.cli import app as cli
 from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.plant import linear, loop
+from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Samples
 from servotwin.simulation.simulate import simulate
@@ -255,3 +257,24 @@ def test_a_user_error_is_one_sentence_and_exit_code_2(arguments):
     assert result.stderr.count("\n") == 1
     assert result.stderr.startswith("error: ")
     assert "rad" not in result.stderr.replace("rad/s", "")  # the arguments are in degrees
+
+
+@pytest.mark.parametrize(
+    ("name", "crossover", "margin_deg", "Ms"),
+    [("stepper-stage", 20.0, 60.0, 1.06), ("stepper-stage", 2.4, 30.0, 2.1), ("telescope", 0.31, 45.0, 1.32)],
+)
+def test_gains_do_not_cancel_one_another(name, crossover, margin_deg, Ms):
+    """A lag by a filter far below the crossover has a Kp and a Kd / Tf that are thousands of times their sum."""
+    axis = Axis.preset(name).replace(sample_rate=None)
+    law = tune(axis.plant(), Specification(crossover, math.radians(margin_deg))).controller
+    found = axis.replace(controller=law).margins()
+    at = loop.pidf(law).response([crossover])[0]
+    assert abs(law.Kp) + abs(law.Kd) / law.Tf <= 10.01 * abs(at)
+    assert found.gain_crossovers[0].omega == pytest.approx(crossover)
+    assert found.Ms < Ms
+
+
+def test_a_margin_that_only_cancelling_gains_give_is_refused_with_the_reason(monkeypatch):
+    monkeypatch.setattr(candidates, "_MOST_CANCELLATION", 0.5)
+    with pytest.raises(InvalidInput, match=r"60 deg without Kp and Kd / Tf that are 0\.5 times their sum and more"):
+        tune(Axis.preset("stepper-stage").plant(), Specification(20.0, math.radians(60.0)))

@@ -63,10 +63,19 @@ def test_a_twin_that_can_verify_nothing_is_refused(tmp_path: Path, twin: str) ->
         Scenario.load(file_of(tmp_path, "emps", twin))
 
 
-def test_a_twin_that_cannot_estimate_the_gap_is_refused(tmp_path: Path) -> None:
-    scenario = Scenario.load(file_of(tmp_path, "emps", '[twin]\npolicy = "paper"\nk_dz = 0.0\n'))
-    with pytest.raises(InvalidInput, match="the motor's encoder and the command do not show the gap"):
-        cosimulate(scenario)
+@pytest.mark.parametrize(
+    ("servo", "twin", "words"),
+    [
+        ("emps", 'policy = "paper"\nk_dz = 0.0\n', "the motor's encoder and the command do not show the gap"),
+        ("ball-screw", 'policy = "margin"\n', 'policy = "margin": is computed for one gap and scaled to others'),
+    ],
+)
+def test_a_twin_that_cannot_work_with_the_axis_is_refused_with_the_file_before_anything_runs(
+    tmp_path: Path, servo: str, twin: str, words: str
+) -> None:
+    with pytest.raises(InvalidInput, match=rf"scenario\.toml: {words}.*; without a twin .* enabled = false in"):
+        Scenario.load(file_of(tmp_path, servo, f"[twin]\n{twin}"))
+    assert not Scenario.load(file_of(tmp_path, servo, OFF + twin)).twin.enabled
 
 
 def test_an_edge_whose_twin_is_away_keeps_its_policy(tmp_path: Path) -> None:

@@ -134,6 +134,13 @@ def test_a_converted_log_keeps_its_first_sample_and_its_metadata(tmp_path, made)
     assert log.metadata == described
 
 
+def test_a_log_of_a_long_scenario_is_read_back(tmp_path, made):
+    """Its metadata are one cell."""
+    described = {"scenario": "values_mm = [" + ", ".join(["0.25", "-1.5"] * 20_000) + "]"}
+    write_log(SignalTable({"time_s": made.time, "position_m": made.load}, described), tmp_path / "run.csv")
+    assert read_log(tmp_path / "run.csv").metadata == described
+
+
 @pytest.mark.parametrize("rate", [-5.0, 0.0, np.nan])
 def test_a_rate_that_is_none_is_refused(tmp_path, made, rate):
     path = csv(tmp_path / "a.csv", rows(made), "timestamp,motor,load")

@@ -224,7 +224,7 @@ def test_a_file_of_an_axis_holds_its_cascade(name: str) -> None:
         (lambda: AXES["two masses"][0].check_loop(Cascade(900.0, 1.0, velocity_gain=30.0)), "is unstable on this axis"),
         (
             lambda: simulate(AXES["two masses"][0].replace(sensors=Sensors(feedback="motor")), 1.0),
-            'sensors feedback = "motor": the controller reads y_load',
+            'sensors feedback = "motor": the controller reads y_load, .* or on = "motor" in .controller. of a cascade',
         ),
         (
             lambda: simulate(

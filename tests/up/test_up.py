@@ -20,11 +20,14 @@ from typer.testing import CliRunner
 from servotwin.cli.app import app
 from servotwin.drives.simulated.machine_state import read_state
 from servotwin.edge_process.config_file import load
+from servotwin.edge_process.monitoring import read_status
 from servotwin.errors import InvalidInput
+from servotwin.plant.axis import Axis
 from servotwin.store.store import open_store
 from servotwin.up import command, folder
+from servotwin.up.demonstration import SERVOS
 from servotwin.up.outages import Outages
-from servotwin.up.plan import SERVOS
+from servotwin.up.plan import Plan
 from servotwin.up.site import Site
 
 RUNNING = "x real time"
@@ -32,9 +35,9 @@ PATIENCE_S = 120.0
 NUMBER = 2
 """Servos: one whose edge runs the law, one whose machine does; a third one would only take its time."""
 COMMAND = f"""
-from servotwin.up import plan
+from servotwin.up import demonstration
 
-plan.SERVOS = tuple(servo._replace(model="dead-zone") for servo in plan.SERVOS[:{NUMBER}])
+demonstration.SERVOS = tuple(servo._replace(model="dead-zone") for servo in demonstration.SERVOS[:{NUMBER}])
 
 from servotwin.cli.app import main
 
@@ -120,9 +123,8 @@ def stored(path: Path) -> dict[str, set[str]]:
 
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
-def test_it_continues_after_a_kill_and_ends_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_continues_after_a_kill_and_ends_in_order(tmp_path: Path) -> None:
     """What it finds after an orderly end is what it leaves at every time, and a kill is the worst one."""
-    monkeypatch.setattr(folder, "SERVOS", STARTED)
     path = tmp_path / "up"
     with started(path, "--speed", "10") as first:
         lines = lines_until(first, RUNNING)
@@ -159,9 +161,40 @@ def test_it_continues_after_a_kill_and_ends_in_order(tmp_path: Path, monkeypatch
         assert not left.new
 
 
+SCENARIO = """
+servo = "screw.toml"
+name = "screw"
+duration_s = 600.0
+reference = {kind = "square", amplitude_mm = 0.3, period_s = 2.0}
+gap = {from_deg = 0.5, to_deg = 3.0, over_s = 600.0}
+twin = {policy = "paper", k_dz = 0.5}
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="looks for processes in /proc")
+def test_machines_of_an_own_axis_run_get_updates_and_their_estimates_repeat(tmp_path: Path) -> None:
+    (tmp_path / "screw.toml").write_text(Axis.preset("ball-screw").dumps())
+    (tmp_path / "scenario.toml").write_text(SCENARIO)
+    path, names = tmp_path / "up", ("screw-1", "screw-2")
+    with started(path, str(tmp_path / "scenario.toml"), "--machines", "2") as process:
+        lines_until(process, RUNNING)
+        status = [path / name / "status.json" for name in names]
+        assert eventually(lambda: all((read_status(file) or {}).get("version", 0) > 0 for file in status))
+        process.send_signal(signal.SIGINT)
+        lines = lines_until(process, "all processes have ended")
+        assert process.wait(PATIENCE_S) == 0
+    for name in names:
+        assert any(line.startswith(f"{name}: ") for line in lines)
+        done = CliRunner().invoke(app, ["replay", name, "--config", str(path / "twin.toml")])
+        assert done.exit_code == 0
+        assert "the same, bit for bit" in done.stdout
+    assert eventually(lambda: not left_behind(path))
+
+
 def test_a_folder_of_something_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("mine")
-    with pytest.raises(InvalidInput, match="was not made by servotwin up"), folder.opened(tmp_path):
+    with pytest.raises(InvalidInput, match="was not made by this version of servotwin up"), folder.opened(tmp_path):
         pass
     assert [each.name for each in tmp_path.iterdir()] == ["thesis.txt"]
 
@@ -184,16 +217,15 @@ def test_the_first_start_says_what_takes_so_long_before_it_begins(
 ) -> None:
     written, said = io.StringIO(), []
 
-    def make(path: Path) -> None:
+    def make(path: Path, _plan: Plan) -> None:
         said.append(written.getvalue())
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
     monkeypatch.setattr(folder, "_make", make)
     with pytest.raises(InvalidInput, match="no space left"):
         command.up(tmp_path / "up", console=Console(file=written, width=300))
-    assert said == [
-        f"making {tmp_path / 'up'}: a twin and three servos (the very first time, code is compiled for minutes) ...\n"
-    ]
+    makes = "a twin for quick, noisy, remote (the very first time, code is compiled for minutes) ..."
+    assert said == [f"making {tmp_path / 'up'}: {makes}\n"]
 
 
 @pytest.fixture(scope="module")
@@ -223,10 +255,10 @@ def test_it_ends_by_itself_after_the_time_that_is_given(made: Path) -> None:
 @pytest.mark.slow
 def test_a_made_folder_is_whole_or_refused_and_one_at_a_time(made: Path) -> None:
     with folder.opened(made) as opened:
-        assert opened.machine(SERVOS[0]) is None
+        assert opened.machine(opened.servos[0]) is None
         with pytest.raises(InvalidInput, match=f"another servotwin up .process {os.getpid()}"), folder.opened(made):
             pass
-        opened.connect(SERVOS[0], "http://127.0.0.1:4321")
+        opened.connect(opened.servos[0], "http://127.0.0.1:4321")
         assert 'url = "http://127.0.0.1:4321"' in (made / SERVOS[0].name / "edge.toml").read_text()
     assert [each.name for each in made.parent.iterdir()] == ["up"]
     bands = {servo.name: load(made / servo.name / "edge.toml").agent.supervision.fallback for servo in SERVOS}

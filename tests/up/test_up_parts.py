@@ -11,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 from rich.console import Console
 
+from servotwin.config.own_units import OwnUnits
 from servotwin.drives.simulated.machine_state import MachineState, read_state, write_speed, write_state
 from servotwin.drives.simulated.pace import Pace
 from servotwin.drives.simulated.settings import MachineSettings
@@ -18,8 +19,9 @@ from servotwin.drives.simulated.state_recorder import StateRecorder
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import PiecewiseCubic, SCurve
 from servotwin.up import display
+from servotwin.up.demonstration import SERVOS, machine_toml
 from servotwin.up.outages import Forwarder, Outages
-from servotwin.up.plan import SERVOS, machine_toml
+from servotwin.up.plan import ServoPlan
 from servotwin.up.speed import (
     FASTEST,
     LIMIT,
@@ -33,7 +35,15 @@ from servotwin.up.speed import (
     processor_times,
     share_of,
 )
-from servotwin.up.status import EstimateError, ServoEstimate, ServoStatus, TwinStatus, newest_estimate, read_metrics
+from servotwin.up.status import (
+    EstimateError,
+    ServoEstimate,
+    ServoStatus,
+    TwinPoller,
+    TwinStatus,
+    newest_estimate,
+    read_metrics,
+)
 
 SPEEDS = some.floats(SLOWEST, FASTEST)
 
@@ -269,7 +279,7 @@ def text_of(shown: display.Snapshot, width: int = 80) -> str:
 
 
 def test_the_table_of_nothing_known_yet_shows_dashes() -> None:
-    shown = picture(ServoStatus(SERVOS[0], None, {}, None, 0, 0.0, 0), None)
+    shown = picture(ServoStatus(SERVOS[0].plan, None, {}, None, 0, 0.0, 0), None)
     text = text_of(shown)
     assert "true gap, deg" in text
     assert "no answer" in text
@@ -287,11 +297,12 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
         "kd_v_s_per_m": -135.1, "feedforward_v": -0.05, "up": {"windows": 41, "trouble": ""}, "down": {"trouble": ""},
         "windows": {"waiting": 3, "dropped": {"withheld": 2, "outbox full": 1}},
     }  # fmt: skip
-    view = ServoStatus(SERVOS[2], state, edge, EstimateError(newest, 9.0003, 58.0), 47, 4.2, 2)
+    view = ServoStatus(SERVOS[2].plan, state, edge, EstimateError(newest, 9.0003, 58.0), 47, 4.2, 2)
     shown = picture(view, TwinStatus(5, 0.1, {"windows": 121, "refused": 0}))
     text = text_of(shown)
     for expected in (
-        "1:02:03", "9.131", "9.000 ± 0.040", "-0.0003 58 s ago", "7 fallback set", "0.0316", "1.38 18.9 -0.14", "-50.0",
+        "1:02:03", "9.131", "9.000 ± 0.040", "-0.0003 58 s ago", "7 fallback set", "0.0316", "Kp Ki Kd, V/mm",
+        "1.38 18.9 -0.135", "-50.0",
         "outage, 4 s left", "11.9 x real time", "1.10 of 2 cores = 55 %", "121 windows", "5 in its queue",
     ):  # fmt: skip
         assert expected in text, expected
@@ -300,6 +311,73 @@ def test_the_table_has_field_units_the_error_and_what_waits_and_fits_a_small_ter
     assert "version 7 fallback set, link cut, 3 wait" in display.line(shown)
     assert display.line(shown).endswith("twin: 5 in its queue")
     assert "47 cut, 41 acknowledged, 3 waiting, 3 dropped" in next(iter(display.summary(shown)))
+
+
+AXES = {
+    OwnUnits("N m", "rad"): (
+        {"tolerance_rad": pi / 1800.0, "kp_n_m_per_rad": 15.0, "ki_n_m_per_rad_s": 7.0, "kd_n_m_s_per_rad": 3.0},
+        {"dead zone, deg": "0.1000", "Kp Ki Kd, N m/rad": "15 7 3"},
+    ),
+    OwnUnits("N m", "m"): (
+        {"tolerance_m": 2e-6, "position_gain_per_s": 40.0, "velocity_gain_n_m_s_per_rad": 0.25,
+         "integral_time_s": 0.02, "feedforward_n_m": 0.01},
+        {"dead zone, mm": "0.0020", "Kv Kp Ti": "40 0.25 0.02", "feedforward, mN m": "10.0"},
+    ),
+    OwnUnits("rad/s", "m"): ({"position_gain_per_s": 20.0, "integral_time_s": 0.0}, {"Kv": "20"}),
+}  # fmt: skip
+
+
+def test_the_table_has_the_units_of_each_machine() -> None:
+    views = [ServoStatus(SERVOS[0].plan, None, edge, None, 0, 0.0, 0, units) for units, (edge, _) in AXES.items()]
+    lines = text_of(picture(views[0], None)._replace(servos=tuple(views)), 120).splitlines()
+    for number, (_, expected) in enumerate(AXES.values()):
+        for name, shown in expected.items():
+            [row] = [line.removeprefix(name) for line in lines if line.startswith(f"{name}  ")]
+            assert row.split() == ["-"] * number + shown.split() + ["-"] * (2 - number)
+
+
+def test_many_machines_are_rows_that_fit_a_small_terminal() -> None:
+    state = MachineState(time_s=10.0, gap_deg=9.131, speed=1.0, begun_s=0.0, written=0.0)
+    newest = ServoEstimate("b1", 10.0, radians(9.0), (radians(8.96), radians(9.04)), "ok", 1e-5 * pi, 1e-6)
+    edge = {"version": 7, "fallback": True, "windows": {"waiting": 3}}
+    plans = [one_of_many(number) for number in range(30)]
+    views = [ServoStatus(plan, state, edge, EstimateError(newest, 9.0003, 58.0), 47, 0.0, 0) for plan in plans]
+    lines = text_of(picture(views[0], None)._replace(servos=tuple(views))).splitlines()
+    for plan in plans:
+        [row] = [line.split() for line in lines if line.startswith(f"{plan.name}  ")]
+        assert row == f"{plan.name} 9.000 ± 0.040 -0.0003 58 s ago 7 fallback set 3 up".split()
+
+
+def one_of_many(number: int) -> ServoPlan:
+    """A servo of many."""
+    return ServoPlan(f"machine-{number:02d}", "rack", "supervise", "certified")
+
+
+@pytest.mark.parametrize(
+    ("speed", "reached", "said"), [(1.0, 0.99, ""), (1.0, 0.5, "reach 1)"), (20.0, 4.0, "reach 5)")]
+)
+def test_a_machine_that_does_not_keep_its_speed_is_said(speed: float, reached: float, said: str) -> None:
+    view = ServoStatus(SERVOS[0].plan, None, {}, None, 0, 0.0, 0)
+    line = display.line(picture(view, None)._replace(speed=speed, reached=reached))
+    assert said in line
+    assert ("does not reach" in line) == bool(said)
+
+
+@pytest.mark.parametrize(("waiting", "limit"), [(0, 20), (50, 70), (5000, 1000)])
+def test_the_newest_estimate_is_looked_for_behind_the_windows_that_wait(
+    monkeypatch: pytest.MonkeyPatch, waiting: int, limit: int
+) -> None:
+    health = b'{"waiting": {"messages": %d, "age": 0.0}}' % waiting
+    asked = []
+
+    def get(_self: TwinPoller, _connection: object, path: str) -> bytes:
+        asked.append(path)
+        return {"/healthz": health, "/metrics": b""}.get(path, b"[]")
+
+    monkeypatch.setattr(TwinPoller, "_get", get)
+    poller = TwinPoller("http://127.0.0.1:1", "token", ["a"])
+    assert poller._poll(None) is not None
+    assert asked[-1] == f"/v1/servos/a/audit?limit={limit}"
 
 
 def test_a_truth_outside_of_the_interval_is_marked() -> None:

@@ -59,6 +59,15 @@ class Factors(NamedTuple):
         # Without derivative action the filter has no input, but the law's filter time must be positive.
         return Controller(Kp, Ki, Kd, time if time > 0.0 else FASTEST_FILTER / self.wc)
 
+    @property
+    def cancellation(self) -> float:
+        """abs(Kp) + abs(Kd) / Tf relative to abs(C(j wc)) where they have opposite signs and act against one another.
+
+        An error of 1 % of one of the gains is that many per cent of the controller.
+        """
+        Kp, _, Kd, time = (float(value) for value in _gains(self))
+        return (abs(Kp) + abs(Kd) / time) / abs(self.K) if Kp * Kd < 0.0 else 0.0
+
     def response(self, omega: ArrayLike) -> Complex:
         """C(j omega)."""
         s, w = 1j * np.asarray(omega, dtype=float), self.wc
@@ -90,6 +99,11 @@ _ANGLES, _ZOOMS = 16, 4
 _LOWEST, _HIGHEST = math.radians(1.0), math.radians(89.0)
 
 
+# Gains of opposite signs that are more than this larger than their sum are no setting of a machine: the published servo
+# has 3, and a lag by a filter far below the crossover thousands.
+_MOST_CANCELLATION = 10.0
+
+
 class Candidate(NamedTuple):
     """A stable candidate; `integral` is abs(Ki), and without integral action abs(Kp)."""
 
@@ -117,7 +131,7 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
     kind, at = CONTROLLER_TYPES[name], _at_crossover(plant, wc)
     omega = plant.search_frequencies(wc)
     values = plant.response(omega)
-    possible = False
+    possible, cancelling = False, list[Factors]()
     # Positive gains first; a plant of negative gain needs negative ones.
     for sign in (1.0, -1.0):
         turn = _wrapped(margin - math.pi - np.angle(sign * at))
@@ -128,6 +142,8 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
         be, al = (0.5 * _HIGHEST, _HIGHEST), (0.5 * (_LOWEST + _HIGHEST), _HIGHEST - _LOWEST)
         for zoom in range(_ZOOMS):
             grid = _grid(kind, wc, turn, sign / abs(at), be, al, zoom)
+            cancelling += [factors for factors in grid if factors.cancellation > _MOST_CANCELLATION]
+            grid = [factors for factors in grid if factors.cancellation <= _MOST_CANCELLATION]
             if not grid:
                 break
             count, possible = count + len(grid), True
@@ -138,10 +154,11 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
             be, al = (best.be, _HIGHEST / 4 ** (zoom + 1)), (best.al, _HIGHEST / 4 ** (zoom + 1))
         if stable:
             return ControllerSearch(stable, count)
-    if not possible:
+    if not (possible or cancelling):
         raise InvalidInput(_unreachable(name, kind, wc, margin, at))
     where = f"crossover of {wc:g} rad/s with a phase margin of {math.degrees(margin):g} deg"
-    raise InvalidInput(f"no stable {name} controller gives this plant a {where}")
+    but = "" if not cancelling else f" without Kp and Kd / Tf that are {_MOST_CANCELLATION:g} times their sum and more"
+    raise InvalidInput(f"no stable {name} controller gives this plant a {where}{but}")
 
 
 def _at_crossover(plant: Plant, wc: float) -> complex:

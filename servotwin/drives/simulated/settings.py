@@ -17,7 +17,7 @@ from servotwin.drives.simulated.machine_state import read_speed, read_state
 from servotwin.errors import InvalidInput
 from servotwin.plant.signals import as_pieces
 
-_NO_TWIN: Mapping[str, object] = {"policy": "paper", "k_dz": 0.0}
+_NO_TWIN: Mapping[str, object] = {"enabled": False, "policy": "paper", "k_dz": 0.0}
 
 
 def _scenario(table: Table, name: str, scenario: object, folder: Path) -> Scenario:

@@ -122,12 +122,8 @@ def simulated_log(axis: Axis, offset: float, recording: DriveRecording, band: Re
 def refine(
     first: ParameterFit, law: FittedLaw, recording: DriveRecording, band: RegressionBand, cycle: float, p: float
 ) -> Refinement | None:
-    """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track.
-
-    Raises
-    ------
-    InvalidInput
-        A parameter is out of its range.
+    """Fit the recorded force to the simulated motion until the parameters rest; None: the simulation does not track, or
+    the fit leaves what an axis can be.
     """
     fit, found = first, None
     for _ in range(_ROUNDS):
@@ -139,6 +135,8 @@ def refine(
         change = np.abs(symmetric.values - fit.values)
         converged = bool(np.all(change < _CONVERGED * np.maximum(np.abs(fit.values), np.abs(fit["coulomb"]))))
         found, fit = Refinement(symmetric, asymmetric, simulated, converged), symmetric
+        if not symmetric["inertia"] > 0.0:  # it runs away, towards an axis that cannot be
+            return None
         if converged:
             break
     return found

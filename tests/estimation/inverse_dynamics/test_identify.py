@@ -1,5 +1,6 @@
 """Parameters of a drive from its command and position."""
 
+import math
 import re
 from dataclasses import replace
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 from drive_recordings import GAINS, PARAMETERS, prescribed, recording_of, simulated, strokes
 
+import servotwin as st
 from servotwin.errors import InvalidInput
 from servotwin.estimation.inverse_dynamics.conditioning import band_of
 from servotwin.estimation.inverse_dynamics.fitted_cascade import GivenGains, fitted_cascade
@@ -168,3 +170,23 @@ def test_a_command_that_is_not_of_the_positions_time_is_told(shift):
     sense = "later" if shift > 0 else "earlier"
     assert re.search(rf"best (3[6-9]|4\d)\.?\d* ms {sense} than it was logged", found.late)
     assert identify_drive([log]).late == ""
+
+
+def test_a_fit_that_runs_away_is_left_for_the_one_before_the_simulation():
+    """A reference in steps of 10 ms shakes the motor alone; its simulated fit left what an axis can be."""
+    p = 0.02 / (2.0 * math.pi)
+    axis = st.Axis(
+        st.TorqueDrive(9e-4, 4e-4, friction=5e-4, coulomb=0.05),
+        st.Transmission(p, 3e7, 3e4, "free"),
+        st.Load((150.0,), (0.0,), (800.0,), friction=60.0),
+        st.Cascade(55.0, p, 1.03, 0.011, sample_rate=10000.0),
+    )
+    time = np.arange(0.0, 12.0, 0.01)
+    begun = np.minimum(1.0, time / 2.0)
+    steps = 0.04 * begun * np.sin(0.8 * math.pi * time) + 0.006 * begun * np.sin(3.4 * math.pi * time)
+    run = st.simulate(axis, 12.0, reference=st.Samples(tuple(time), tuple(steps)), gap=0.005, sample_rate=2000.0)
+    recording = recording_of(run.theta_m * p, run.voltage / p, run.reference, rate=2000.0)
+    drive = identify_drive([recording], p=p)
+    assert drive.refinement is None
+    assert drive.doubts == ("the simulated loop does not follow the log",)
+    assert drive.symmetric["inertia"] > 0.0
