@@ -168,6 +168,10 @@ class Connection:
         info = self._client.publish(topic, payload, qos=1, properties=properties)
         return info.mid if info.rc in (0, _NO_CONNECTION) else None
 
+    def renew(self) -> None:
+        """Cut the connection; it is restored, and both ends send again what the other has not acknowledged."""
+        _shut(self._client.socket())
+
     def close(self) -> None:
         """Disconnect; a broker that does not respond delays this by `_LINGER_S` at most."""
         self._closing = True
