@@ -1,13 +1,18 @@
 """Tables, rows and rights that are gone from a PostgreSQL store."""
 
 import math
+import os
+import signal
 from collections.abc import Iterator
 from contextlib import closing
+from typing import Any
 
 import postgres
+import psycopg
 import pytest
 import sqlalchemy as sa
 from store_cases import claim, outcome, postgresql_addresses, window
+from waiting import until
 
 from servotwin.errors import InvalidInput
 from servotwin.store import engine
@@ -91,6 +96,54 @@ def test_an_index_that_does_not_have_the_rows_of_its_table_is_found(filled: Stor
     run(filled, entered.format("true"))
     expected = "table evidence: 4 rows, and 3 in its index ix_evidence_message"
     assert check_pages(filled, math.inf).faults == (expected,)
+
+
+def crash(server: postgres.Server, name: str) -> None:
+    """Have the server begin with empty buffers, as after a crash of one of its processes."""
+    with server.connect(name) as idle:
+        with server.connect(name) as victim:
+            os.kill(victim.info.backend_pid, signal.SIGKILL)
+        until(lambda: is_cut(idle))
+    until(server.answers)
+
+
+def is_cut(connection: psycopg.Connection[Any]) -> bool:
+    try:
+        connection.execute("SELECT 1")
+    except psycopg.OperationalError:
+        return True
+    return False
+
+
+def test_every_page_of_zeros_in_an_index_is_found_above_its_leaves_too() -> None:
+    with postgres.running() as server:
+        address = server.database("wide")
+        open_store(address).close()
+        server.run("wide", "INSERT INTO twins (servo) VALUES ('a'); "
+            "INSERT INTO messages (servo, kind, key, boot, sequence, start, encoding, digest, received) "
+            "SELECT 'a', 'window', repeat('b', 400) || lpad(g::text, 8, '0'), 'b', g, 0, '', '', 0 "
+            "FROM generate_series(1, 3000) g; "
+            "INSERT INTO bodies SELECT id, '' FROM messages; CREATE EXTENSION pageinspect; CHECKPOINT")  # fmt: skip
+        with server.connect("wide") as connection:
+            above = connection.execute(
+                "SELECT page FROM generate_series(1, pg_relation_size('uq_messages_servo_key') / 8192 - 1) AS page, "
+                "LATERAL bt_page_stats('uq_messages_servo_key', page) AS stats WHERE type IN ('i', 'r') ORDER BY page"
+            ).fetchall()
+            place = connection.execute("SELECT pg_relation_filepath('uq_messages_servo_key')").fetchone()
+        assert len(above) > 3
+        assert place is not None
+        file = server.folder / "data" / place[0]
+        whole = file.read_bytes()
+        for (page,) in above:
+            with file.open("r+b") as index:
+                index.seek(8192 * page)
+                index.write(bytes(8192))
+            crash(server, "wide")
+            with closing(open_store(address)) as store:
+                [fault] = check_pages(store, math.inf).faults
+            assert f"contains unexpected zero page at block {page}" in fault
+            with file.open("r+b") as index:
+                index.write(whole)
 
 
 def test_a_check_of_tables_ends_in_time_and_says_so(filled: Store) -> None:
