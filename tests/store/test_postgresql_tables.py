@@ -4,19 +4,22 @@ import math
 import os
 import signal
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
 from typing import Any
 
 import postgres
 import psycopg
 import pytest
 import sqlalchemy as sa
+import waiting
+from relay import Relay, State
 from store_cases import claim, outcome, postgresql_addresses, window
 from waiting import until
 
 from servotwin.errors import InvalidInput
 from servotwin.store import engine
-from servotwin.store.engine import StoreUnavailable
+from servotwin.store.engine import StoreUnavailable, parse_address
 from servotwin.store.integrity import check_pages
 from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.store import Store, open_store
@@ -55,6 +58,26 @@ def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
             ):
                 store.put([window()])
         assert store.put([window()]) == [PutResult.NEW]
+
+
+def test_a_call_whose_answer_a_proxy_has_swallowed_ends_when_connections_are_cut(
+    postgres_server: postgres.Server,
+) -> None:
+    name = parse_address(postgresql_addresses(postgres_server)()).database
+    with ExitStack() as stack:
+        pool = stack.enter_context(ThreadPoolExecutor(1))
+        relay = stack.enter_context(Relay(postgres_server.folder / ".s.PGSQL.5432"))
+        address = f"postgresql://{postgres_server.user}@127.0.0.1:{relay.port}/{name}"
+        store = stack.enter_context(closing(open_store(address)))
+        assert store.put([window()]) == [PutResult.NEW]
+        relay.become(State.HALF_OPEN)
+        lost = pool.submit(store.put, [window(sequence=5)])
+        until(lambda: relay.counts["swallowed"])
+        relay.become(State.FLOWING)
+        store.engines.cut()
+        with pytest.raises(StoreUnavailable):
+            lost.result(waiting.PATIENCE)
+        assert store.put([window(sequence=5)]) == [PutResult.NEW]
 
 
 @pytest.mark.parametrize("given", ["", "&connect_timeout=3"])
