@@ -92,7 +92,7 @@ class StoredFiles:
     outbox: Annotated[str, key(help="Outbox: messages that the twin has not acknowledged.")] = "outbox.sqlite"
     parameters: Annotated[str, key(help="Last parameters under which the loop kept its band.")] = "parameters.json"
     status: Annotated[str, key(help="Status that `servotwin edge` shows.")] = "status.json"
-    boots: Annotated[str, key(help="Number of starts of this edge.")] = "boots"
+    boots: Annotated[str, key(help="Number of starts of this edge that had an outbox on the disk.")] = "boots"
     metrics: Annotated[
         str | None,
         key(

@@ -7,7 +7,7 @@ from typing import Any
 
 from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.monitoring import log
-from servotwin.edge_process.startup import is_later_start
+from servotwin.edge_process.startup import count_start, is_later_start
 from servotwin.link.outbox_index import AcknowledgedLimits, LastStatus
 from servotwin.link.sqlite_outbox import INCOMPLETE, SqliteOutbox
 
@@ -18,7 +18,7 @@ _NOTHING_LEFT = (
 
 
 def open_outbox(config: EdgeConfig, last_status: Mapping[str, Any], run: str) -> SqliteOutbox:
-    """Open the outbox; the last status tells how many windows waited in it, and how many it had had."""
+    """Open the outbox and count the start; the last status tells how many windows waited in it, and how many it had."""
     files = config.files
     windows = last_status.get("windows")
     known = windows if isinstance(windows, dict) else {}
@@ -29,4 +29,6 @@ def open_outbox(config: EdgeConfig, last_status: Mapping[str, Any], run: str) ->
     if box.empty and not known and is_later_start(run):
         box.faults[INCOMPLETE] += 1
         log(INCOMPLETE, why=_NOTHING_LEFT)
+    if box.flushed:
+        count_start(config.path(files.boots), run)
     return box

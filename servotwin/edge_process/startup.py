@@ -79,23 +79,31 @@ def exclusive(config: EdgeConfig) -> Iterator[None]:
 
 
 def next_boot(path: Path, random: bytes) -> str:
-    """Name this start by its number, and by random bytes that make it unique where the count is lost.
+    """Name this start by its number, and by random bytes that make it unique where an earlier one was not counted.
 
     Parameters
     ----------
     path : path
-        File with the number of starts; it need not be readable or writable.
+        File with the number of starts; it need not be readable.
     random : bytes
         8 bytes.
     """
-    count = _count(path) + 1
-    with suppress(OSError):
-        replace_file(path, f"{count}\n".encode("ascii"), durable=True, mode=0o600)
-    return f"b{count}-{random.hex()}"
+    return f"b{_count(path) + 1}-{random.hex()}"
+
+
+def count_start(path: Path, boot: str) -> None:
+    """Count the start of this name, once its outbox is on the disk: from then on a missing outbox is a loss.
+
+    Counted before, a start that is killed before it has an outbox would look as if it had lost one.
+    """
+    number = int(boot.partition("-")[0].removeprefix("b"))
+    if _count(path) < number:
+        with suppress(OSError):
+            replace_file(path, f"{number}\n".encode("ascii"), durable=True, mode=0o600)
 
 
 def is_later_start(boot: str) -> bool:
-    """True where `next_boot` had counted a start before the one of this name."""
+    """True where a start before the one of this name was counted."""
     return not boot.startswith("b1-")
 
 

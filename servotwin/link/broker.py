@@ -22,7 +22,8 @@ if TYPE_CHECKING:
 
 _SCHEMES = {"mqtt": 1883, "mqtts": 8883}
 _KEEP_ALIVE_S = 20
-"""Period of the pings; a connection that is silent for half as long again counts as broken."""
+"""Longest silence before a ping, and longest wait for its answer or for that to CONNECT; the broker itself counts a
+connection as broken that is silent for half as long again."""
 _MOST_QUEUED = 10_000
 """Largest number of messages that wait for the broker."""
 _LINGER_S = 1.0
@@ -168,6 +169,10 @@ class Connection:
         info = self._client.publish(topic, payload, qos=1, properties=properties)
         return info.mid if info.rc in (0, _NO_CONNECTION) else None
 
+    def renew(self) -> None:
+        """Cut the connection; it is restored, and both ends send again what the other has not acknowledged."""
+        _shut(self._client.socket())
+
     def close(self) -> None:
         """Disconnect; a broker that does not respond delays this by `_LINGER_S` at most."""
         self._closing = True
@@ -196,9 +201,13 @@ class Connection:
         self._events.ready(self._fresh)
 
     def _disconnected(self, _client: Client, _user: Any, _flags: Any, reason: Any, _properties: Any) -> None:
-        if self._up and not self._closing:
+        if self._closing:
+            return
+        if reason.value == _SILENT:  # this end has given up, not the broker
+            self._events.lost(f"the broker has not answered for {_KEEP_ALIVE_S} s: it, or the network between, hangs")
+        elif self._up:
             self._events.lost(f"the connection to the broker broke ({reason})")
-        if not (self._answered or self._closing):
+        elif not self._answered:
             self._events.lost(f"the broker ended the connection before it answered{self._hint}")
         self._up = self._answered = False
 
@@ -224,6 +233,8 @@ class Connection:
 
 _NO_SUBSCRIBERS = 0x10
 """MQTT's reason code "no matching subscribers"."""
+_SILENT = 0x8D
+"""MQTT's reason code "keep alive timeout"."""
 _NO_CONNECTION = 4
 """paho's code for a message that is queued until there is a connection."""
 

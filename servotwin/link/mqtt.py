@@ -8,10 +8,13 @@ messages, so that none is missed while the broker or the edge is away.
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Callable
 from concurrent.futures import Future, InvalidStateError
+from contextlib import suppress
 from itertools import count
 from threading import Event, Lock
+from typing import NamedTuple
 
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.claim import HeldClaim
@@ -30,6 +33,7 @@ from servotwin.link.mqtt_messages import (
     request_topic,
     response_topic,
 )
+from servotwin.link.round_trip import RoundTrip
 from servotwin.link.seal import key_of, verifier_of
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, ClaimStatus, EdgeClaim, InvalidMessage, Refusal
@@ -39,6 +43,19 @@ _SESSION_S = 3600
 _NO_MESSAGE = 2**53
 """Above every serial of a message."""
 _NO_SUBSCRIBER = "no twin listens at the broker"
+_MOST_UNANSWERED = 25
+"""Requests and copies without an answer after which the connection is made anew: each may be a packet that was lost on
+its way, and of such the broker and paho allow a hundred before they send none at all."""
+
+_Answer = Future[MqttResponse | UnknownPeer]
+
+
+class _Copy(NamedTuple):
+    """One sending of a request, at `sent` (s); `measured`: the twin does not wait before it answers."""
+
+    answer: _Answer
+    sent: float
+    measured: bool
 
 
 class MqttTransport:
@@ -74,9 +91,10 @@ class MqttTransport:
         self._timeout, self._wait = timeout_s, wait_s
         # Serials begin at random, so that a response to an earlier process does not match a request of this one.
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
-        self._waiting: dict[int, Future[MqttResponse | UnknownPeer]] = {}
-        self._published: dict[int, Future[MqttResponse | UnknownPeer]] = {}
+        self._waiting: dict[int, _Copy] = {}
+        self._published: dict[int, _Answer] = {}
         self._not_delivered: dict[int, str] = {}
+        self._round_trip, self._unanswered = RoundTrip(timeout_s), 0
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
         name = f"servotwin-edge-{servo}" + (f"-{run}" if run else "")
         session = MqttSession(name, (response_topic(servo), TWIN_GONE), session_s)
@@ -88,13 +106,13 @@ class MqttTransport:
         """Return when a twin has the message safe; see `Transport`."""
         if len(parcel.body) > MAX_BYTES:
             raise Refused(Refusal.TOO_LARGE, f"a message of {len(parcel.body)} bytes: at most {MAX_BYTES} are allowed")
-        response = self._request(PutRequest(parcel.body, parcel.encoding, self.claim.text), self._timeout)
+        response = self._request(PutRequest(parcel.body, parcel.encoding, self.claim.text))
         if not isinstance(response, PutResponse):
             raise Unreachable("the answer to a message does not acknowledge it")
 
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
-        response = self._request(PollRequest(after, self._wait, self.claim.text), self._wait + self._timeout)
+        response = self._request(PollRequest(after, self._wait, self.claim.text), self._wait)
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a poll holds no messages")
         return response.messages
@@ -102,7 +120,7 @@ class MqttTransport:
     def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         """Send a question or a claim; see `ClaimingTransport`."""
         # In a poll for messages that there cannot be: a twin without claims answers it like any other.
-        response = self._request(PollRequest(_NO_MESSAGE, 0.0, question=claim), self._timeout)
+        response = self._request(PollRequest(_NO_MESSAGE, 0.0, question=claim))
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a claim is none")
         return response.claim_status
@@ -112,7 +130,7 @@ class MqttTransport:
         wait = 0.0 if columns.columns else self._wait
         # In a poll, as a claim is: a twin of an earlier version answers it like any other.
         asked = PollRequest(_NO_MESSAGE, wait, claim.text, live=encode_live(columns))
-        response = self._request(asked, wait + self._timeout)
+        response = self._request(asked, wait)
         if not isinstance(response, PollResponse):
             raise Unreachable("the answer to a live view is none")
         if response.watched is None:
@@ -126,35 +144,52 @@ class MqttTransport:
         self._ready.set()
         self._connection.close()
 
-    def _request(self, request: MqttRequest, patience: float) -> MqttResponse:
-        """Send a request and return its response; raises Refused and Unreachable."""
+    def _request(self, request: MqttRequest, wait: float = 0.0) -> MqttResponse:
+        """Send a request, with which the twin may wait, and return its response; raises Refused and Unreachable."""
         if not self._ready.wait(self._timeout):
             raise Unreachable(self._why)
-        serial, future = self._expect()
-        number = 0
+        future = _Answer()
         try:
-            number = self._send(encode_request(self._key, self._servo, serial, request), patience, future)
-            response = future.result(patience)
-        except TimeoutError:
-            raise Unreachable(f"no answer of a twin within {patience:g} s") from None
+            response = self._answer(request, future, wait)
         finally:
             with self._lock:
-                del self._waiting[serial]
-                self._published.pop(number, None)
+                self._waiting = {serial: copy for serial, copy in self._waiting.items() if copy.answer is not future}
+                self._published = {number: each for number, each in self._published.items() if each is not future}
         if isinstance(response, UnknownPeer):
             raise Refused(Refusal.BAD_TOKEN, "the twin knows the servo by another token")
         if isinstance(response, RefusedResponse):
             raise Refused(response.code, response.detail, response.after_s)
         return response
 
-    def _expect(self) -> tuple[int, Future[MqttResponse | UnknownPeer]]:
-        serial, future = next(self._serials), Future[MqttResponse | UnknownPeer]()
-        with self._lock:
-            self._waiting[serial] = future
-        return serial, future
+    def _answer(self, request: MqttRequest, future: _Answer, wait: float) -> MqttResponse | UnknownPeer:
+        """Send a request, and again after one round trip without an answer, two more, four ...; any answer counts."""
+        patience, pause = wait + self._timeout, self._round_trip.wait_s
+        until, copies = time.monotonic() + patience, 0
+        while (left := until - time.monotonic()) > 0.0:
+            if copies == 0 or self._ready.is_set():  # what is on its way is sent again once there is a connection
+                self._send(request, future, left, measured=wait == 0.0)
+                copies += 1
+            with suppress(TimeoutError):
+                return future.result(min(left, wait + pause))
+            self._missed()
+            pause *= 2.0
+        raise Unreachable(f"no answer of a twin within {patience:g} s")
 
-    def _send(self, data: bytes, patience: float, future: Future[MqttResponse | UnknownPeer]) -> int:
-        """Publish a request and return its number at the broker."""
+    def _missed(self) -> None:
+        """Note that a copy of a request was not answered; make the connection anew after a number of them."""
+        with self._lock:
+            self._unanswered += 1
+            renew = self._unanswered >= _MOST_UNANSWERED
+            self._unanswered = 0 if renew else self._unanswered
+        if renew:
+            self._connection.renew()
+
+    def _send(self, request: MqttRequest, future: _Answer, patience: float, measured: bool) -> None:
+        """Publish a copy of a request; its own serial tells which copy an answer belongs to."""
+        serial = next(self._serials)
+        data = encode_request(self._key, self._servo, serial, request)
+        with self._lock:
+            self._waiting[serial] = _Copy(future, time.monotonic(), measured)
         number = None if self._closed else self._connection.publish(request_topic(self._servo), data, patience)
         if number is None:
             raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
@@ -164,7 +199,6 @@ class MqttTransport:
             why = self._not_delivered.pop(number, None)
         if why is not None:
             _set_result(future, Unreachable(why))
-        return number
 
     def _undelivered(self, number: int, why: str) -> None:
         why = why or _NO_SUBSCRIBER
@@ -188,12 +222,15 @@ class MqttTransport:
         except InvalidMessage:
             return
         with self._lock:
-            future = self._waiting.get(serial)
-        if future is not None:
-            _set_result(future, response)
+            copy = self._waiting.get(serial)
+            if copy is not None and copy.measured:
+                self._round_trip.answered(time.monotonic() - copy.sent)
+        if copy is not None:
+            _set_result(copy.answer, response)
 
     def _connected(self, forgotten: bool) -> None:
         """Fail the requests under way where the broker has forgotten the session, and them with it."""
+        self._unanswered = 0
         if forgotten:
             self._fail_all("the broker has forgotten this edge")
         self._ready.set()
@@ -201,12 +238,14 @@ class MqttTransport:
     def _lost(self, why: str) -> None:
         """Keep the requests under way: broker and edge go on with them when the connection is restored."""
         self._why = why
+        with self._lock:  # their answers will tell how long the connection was away
+            self._waiting = {serial: copy._replace(measured=False) for serial, copy in self._waiting.items()}
         if not self._closed:
             self._ready.clear()
 
     def _fail_all(self, why: str) -> None:
         with self._lock:
-            waiting = list(self._waiting.values())
+            waiting = [copy.answer for copy in self._waiting.values()]
         for future in waiting:
             _set_result(future, Unreachable(why))
 
@@ -239,7 +278,7 @@ class LiveMqtt:
         self._transport.close()
 
 
-def _set_result(future: Future[MqttResponse | UnknownPeer], result: MqttResponse | UnknownPeer | Exception) -> None:
+def _set_result(future: _Answer, result: MqttResponse | UnknownPeer | Exception) -> None:
     """Set the result of a future; where it has one already, that one counts."""
     try:
         if isinstance(result, Exception):

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import socket
 import sqlite3
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Set as AbstractSet
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
+from weakref import WeakSet
 
 import sqlalchemy as sa
 from sqlalchemy import event
@@ -97,10 +100,25 @@ def _refuse(fault: str) -> sa.URL:
 
 
 class Engines(NamedTuple):
-    """Engines for writing and reading; SQLite has one writing connection, which serialises writers."""
+    """Engines for writing and reading; SQLite has one writing connection, which serialises writers.
+
+    Attributes
+    ----------
+    writer, reader : sa.Engine
+    opened : set
+        Connections to a PostgreSQL server.
+    """
 
     writer: sa.Engine
     reader: sa.Engine
+    opened: AbstractSet[Any] = frozenset()
+
+    def cut(self) -> None:
+        """Cut the connections to a PostgreSQL server: calls that wait for an answer fail, and the next ones connect."""
+        for connection in tuple(self.opened):
+            # Closed meanwhile, perhaps, by the thread that has it.
+            with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
+                line.shutdown(socket.SHUT_RDWR)
 
     def dispose(self) -> None:
         """Close every connection."""
@@ -117,8 +135,9 @@ def engines_of(address: sa.URL) -> Engines:
         The driver of PostgreSQL is missing, or an SQLite file cannot be created, or is missing beside its log.
     """
     if address.get_backend_name() != SQLITE:
-        engine = _postgresql(address)
-        return Engines(engine, engine)
+        opened = WeakSet[Any]()
+        engine = _postgresql(address, opened)
+        return Engines(engine, engine, opened)
     path = sqlite_file(address)
     if path is None:
         writer = _sqlite(address, 1, reading=False)
@@ -182,7 +201,7 @@ def _closed_files(engine: sa.Engine) -> str:
     return f"; this user may not write {' and '.join(closed)}" if closed else ""
 
 
-def _postgresql(address: sa.URL) -> sa.Engine:
+def _postgresql(address: sa.URL, opened: WeakSet[Any]) -> sa.Engine:
     times = {name: value for name, value in _SERVER_TIMES.items() if name not in address.query}
     try:
         engine = sa.create_engine(
@@ -195,6 +214,7 @@ def _postgresql(address: sa.URL) -> sa.Engine:
 
     @event.listens_for(engine, "connect")
     def limit_locks(connection: Any, _record: Any) -> None:
+        opened.add(connection)
         # PostgreSQL itself waits for a lock for ever: VACUUM FULL, or a session that somebody forgot, would go unsaid.
         connection.execute(f"SET lock_timeout = {round(1000.0 * _BUSY_S)}")
         connection.commit()

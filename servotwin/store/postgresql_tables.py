@@ -16,6 +16,8 @@ _BY_INDEX = ("enable_indexscan", "enable_indexonlyscan")
 _BY_TABLE = ("enable_seqscan", "enable_sort")
 _BITMAP = "enable_bitmapscan"
 """Plans that read an index in its order, plans that read the table in its own, and one that reads both."""
+_SOUGHT_PERCENT = 5.0
+"""Share of the rows that are sought by each index in a bounded time: a page above its leaves leads to thousands."""
 _CANCELED = "57014"
 _LEAST_MS = 1
 
@@ -67,7 +69,7 @@ def _lost_references(connection: sa.Connection, until: float) -> tuple[str, ...]
 
 
 def _lost_rows(connection: sa.Connection, until: float) -> tuple[str, ...]:
-    """Count the rows by table and by each index; to read an index also finds its damaged pages."""
+    """Count the rows by table and by each index, which reads its leaves; seek them, which reads the pages above."""
     faults = []
     for index in _indexes():
         counts = []
@@ -75,6 +77,8 @@ def _lost_rows(connection: sa.Connection, until: float) -> tuple[str, ...]:
             _read_by_table(connection, by_table)
             _limit(connection, until)
             counts.append(connection.execute(_count(index)).scalar_one())
+        _limit(connection, until)
+        connection.execute(_seek(index, 100.0 if math.isinf(until) else _SOUGHT_PERCENT))
         if counts[0] != counts[1]:
             faults.append(f"table {index.table.name}: {counts[0]} rows, and {counts[1]} in its index {index.name}")
     return tuple(faults)
@@ -101,6 +105,20 @@ def _count(index: _Index) -> sa.Select[Any]:
     rows: sa.Select[Any] = sa.select(sa.literal_column("1")).select_from(index.table).order_by(*index.columns).offset(0)
     rows = rows if index.where is None else rows.where(index.where)
     return sa.select(sa.func.count()).select_from(rows.subquery())
+
+
+def _seek(index: _Index, percent: float) -> sa.Select[Any]:
+    """Seek a share of an index's rows from its root: to read it in its order visits the leftmost pages above leaves.
+
+    Only this index gives its order, so that no plan can use another.
+    """
+    sample = index.table.tablesample(sa.func.bernoulli(percent), name="sample")
+    sought = [sample.c[column.name] for column in index.columns]
+    from_there = sa.tuple_(*index.columns) >= sa.tuple_(*sought)
+    first: sa.Select[Any] = sa.select(sa.literal_column("1").label("found")).select_from(index.table).where(from_there)
+    first = first if index.where is None else first.where(index.where)
+    found = first.order_by(*index.columns).limit(1).correlate(sample).lateral()
+    return sa.select(sa.func.count()).select_from(sample.join(found, sa.true()))
 
 
 def _read_by_table(connection: sa.Connection, by_table: bool) -> None:

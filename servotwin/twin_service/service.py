@@ -115,9 +115,8 @@ class TwinService:
         if config.webhook is not None:
             self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
         self.dispatcher = self._make_dispatcher()
-        self._store_health = StoreHealth(
-            self.executor, self._writes, lambda: self.dispatcher.away, lambda: self.watch.fault, self.clocks.monotonic
-        )
+        away, damage, cut = lambda: self.dispatcher.away, lambda: self.watch.fault, store.engines.cut
+        self._store_health = StoreHealth(self.executor, self._writes, away, damage, cut, self.clocks.monotonic)
         self.claims = self._make_claims()
         only_here = config.mqtt is None and not self._shared
         presence = EdgePresence(lambda: self.polls.waiting, only_here, self.clocks.monotonic)

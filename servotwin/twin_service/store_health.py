@@ -17,6 +17,9 @@ _UNHEALTHY_S = 60.0
 _STALLED_S = 12.0
 """s after which a store that does not answer is not available: it fails by itself where it waits 10 s for a lock, and
 edges do not wait longer."""
+_CUT_S = 60.0
+"""s after which the connections of a store that does not answer are cut: a proxy that has swallowed a request keeps its
+connection alive for ever, and nobody else would end the wait. A working server needs less for any call but a check."""
 _LOOK_S, _LASTS_S, _OVER_S = 1.0, 5.0, 10.0
 """s between two looks; after which trouble is no moment's, and posted; without trouble after which it is over: on a
 full disk reads succeed between writes that fail."""
@@ -33,6 +36,8 @@ class StoreHealth:
         Why the dispatcher cannot take work from the store; empty: it can.
     damage : callable
         Damage of the store, which is told elsewhere; empty: none.
+    cut : callable
+        Cuts the connections to the store.
     monotonic : callable
         s.
     """
@@ -43,10 +48,12 @@ class StoreHealth:
         writes: AwaitedCommits,
         leases: Callable[[], str],
         damage: Callable[[], str],
+        cut: Callable[[], None],
         monotonic: Callable[[], float],
     ) -> None:
         self._executor, self._writes, self._now = executor, writes, monotonic
-        self._leases, self._damage = leases, damage
+        self._leases, self._damage, self._cut = leases, damage, cut
+        self._last_cut = -math.inf
         self._logged = set[str]()
         self._posted, self._since, self._seen = False, 0.0, -math.inf
 
@@ -58,15 +65,23 @@ class StoreHealth:
         failed = self._writes.failure if self._now() - self._writes.failed_at < _UNHEALTHY_S else ""
         return self._leases() or failed or self._executor.fault or self._stalled()
 
+    @property
+    def _waited(self) -> float:
+        """Time for which the oldest call has waited, s."""
+        return max(self._executor.waited, self._writes.waited)
+
     def _stalled(self) -> str:
         """A server that hangs, or a disk that does, gives no error."""
-        if max(self._executor.waited, self._writes.waited) < _STALLED_S:
+        if self._waited < _STALLED_S:
             return ""
         return f"the store has not answered for {_STALLED_S:g} s: its server, its disk or the network between hangs"
 
     def look(self, announce: Callable[[str, str], None]) -> None:
         """Log trouble, each reason once, since a log fills a full disk too; announce it once it lasts."""
         trouble, now = self.trouble, self._now()
+        if self._waited >= _CUT_S and now - self._last_cut >= _CUT_S:
+            self._last_cut = now
+            self._cut()
         if trouble:
             self._since, self._seen = self._since if self._logged else now, now
             if trouble not in self._logged:

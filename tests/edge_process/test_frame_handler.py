@@ -23,7 +23,7 @@ from servotwin.edge_process.monitoring import (
     summarise,
     write_status,
 )
-from servotwin.edge_process.startup import next_boot, stored_parameters
+from servotwin.edge_process.startup import count_start, next_boot, stored_parameters
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.messages import Setting
 
@@ -67,16 +67,24 @@ def test_the_cursor_only_rises(handler: FrameHandler) -> None:
 
 
 def test_the_count_of_boots_is_its_owner_s_alone(tmp_path: Path) -> None:
-    next_boot(tmp_path / "boots", bytes(8))
+    count_start(tmp_path / "boots", "b1-00")
     assert (tmp_path / "boots").stat().st_mode & 0o777 == 0o600
 
 
 def test_boot_names_are_unique_whatever_becomes_of_the_count(tmp_path: Path) -> None:
     file = tmp_path / "boots"
-    assert [next_boot(file, bytes([k])) for k in range(3)] == ["b1-00", "b2-01", "b3-02"]
+    for k in range(3):
+        boot = next_boot(file, bytes([k]))
+        assert boot == f"b{k + 1}-0{k}"
+        count_start(file, boot)
+    assert next_boot(file, b"\x05") == "b4-05"
+    assert next_boot(file, b"\x06") == "b4-06", "the one before was not counted"
+    count_start(file, "b1-00")
+    assert next_boot(file, b"\x07") == "b4-07", "the count does not fall"
     file.write_text("rubbish")
-    assert next_boot(file, b"\x07") == "b1-07"
-    assert next_boot(tmp_path / "absent" / "boots", b"\x08") == "b1-08"
+    assert next_boot(file, b"\x08") == "b1-08"
+    count_start(tmp_path / "absent" / "boots", "b1-09")
+    assert next_boot(tmp_path / "absent" / "boots", b"\x0a") == "b1-0a"
 
 
 def test_last_parameters_that_cannot_be_read_do_not_stop_the_machine(tmp_path: Path) -> None:

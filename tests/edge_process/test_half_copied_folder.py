@@ -16,8 +16,9 @@ from outbox_cases import window
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.link_process import LinkProcess
 from servotwin.edge_process.monitoring import read_status
-from servotwin.edge_process.startup import check
+from servotwin.edge_process.startup import check, next_boot
 from servotwin.errors import InvalidInput
+from servotwin.link.sqlite_file import connect
 from servotwin.link.sqlite_outbox import SqliteOutbox
 
 WINDOWS, OF_LOG = 24, 8
@@ -90,6 +91,7 @@ def test_an_outbox_and_a_status_that_are_both_lost_are_said_once(
         path = folder / name
         path.write_bytes(path.read_bytes()[:left])
     for run in ("b2-bb", "b3-cc"):
+        assert next_boot(folder / "boots", bytes.fromhex(run[-2:])) == run, "the start of the fixture was counted"
         with link(folder, run):
             faults = (read_status(folder / "status.json") or {})["disk"]["faults"]
             assert sum(faults.values()) == (run == "b2-bb")
@@ -103,6 +105,23 @@ def test_a_new_edge_has_lost_no_outbox(folder: Path, capfd: pytest.CaptureFixtur
     with link(folder):
         assert (read_status(folder / "status.json") or {})["disk"]["faults"] == {}
     assert "outbox" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("left", ["nothing", "a file", "tables"])
+def test_a_first_start_that_was_killed_before_it_had_an_outbox_is_no_loss(
+    folder: Path, left: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    for path in (*folder.glob("outbox.sqlite*"), folder / "status.json", *folder.glob("boots")):
+        path.unlink()
+    next_boot(folder / "boots", b"\xaa")
+    if left == "a file":
+        (folder / "outbox.sqlite").touch(0o600)
+    if left == "tables":
+        connect(folder / "outbox.sqlite").close()
+    with link(folder, next_boot(folder / "boots", b"\xbb")):
+        assert (read_status(folder / "status.json") or {})["disk"]["faults"] == {}
+    assert "outbox" not in capfd.readouterr().err
+    assert next_boot(folder / "boots", b"\xcc") == "b2-cc"
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.7, 0.95])

@@ -8,6 +8,7 @@ import pytest
 from mosquitto import free_port
 from mqttparts import PATIENCE
 
+from servotwin.link import broker
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.twin_service.mqtt import MqttServer
 
@@ -43,3 +44,20 @@ def test_a_broker_that_ends_the_connection_unanswered_is_said_with_the_likely_re
         why
         == "the broker ended the connection before it answered: where its port is one with TLS, url begins with mqtts://"
     )
+
+
+def test_a_broker_that_accepts_the_connection_and_never_answers_is_said_to_hang(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(broker, "_KEEP_ALIVE_S", 1)
+    said: queue.Queue[str] = queue.Queue()
+    with socket.create_server(("127.0.0.1", 0)) as port:  # the kernel accepts, and nobody reads
+        url = f"mqtt://127.0.0.1:{port.getsockname()[1]}"
+        quiet = MqttCallbacks(lambda *_: None, lambda _: None, said.put)
+        connection = Connection(Broker(url), MqttSession("edge", ("t",), 60), quiet)
+        try:
+            assert said.get(timeout=PATIENCE) == (
+                "the broker has not answered for 1 s: it, or the network between, hangs"
+            )
+        finally:
+            connection.close()

@@ -1,17 +1,25 @@
 """Tables, rows and rights that are gone from a PostgreSQL store."""
 
 import math
+import os
+import signal
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, closing
+from typing import Any
 
 import postgres
+import psycopg
 import pytest
 import sqlalchemy as sa
+import waiting
+from relay import Relay, State
 from store_cases import claim, outcome, postgresql_addresses, window
+from waiting import until
 
 from servotwin.errors import InvalidInput
 from servotwin.store import engine
-from servotwin.store.engine import StoreUnavailable
+from servotwin.store.engine import StoreUnavailable, parse_address
 from servotwin.store.integrity import check_pages
 from servotwin.store.records import EvidenceRecord, PutResult
 from servotwin.store.store import Store, open_store
@@ -50,6 +58,26 @@ def test_a_table_that_somebody_locks_is_not_waited_for_without_end(
             ):
                 store.put([window()])
         assert store.put([window()]) == [PutResult.NEW]
+
+
+def test_a_call_whose_answer_a_proxy_has_swallowed_ends_when_connections_are_cut(
+    postgres_server: postgres.Server,
+) -> None:
+    name = parse_address(postgresql_addresses(postgres_server)()).database
+    with ExitStack() as stack:
+        pool = stack.enter_context(ThreadPoolExecutor(1))
+        relay = stack.enter_context(Relay(postgres_server.folder / ".s.PGSQL.5432"))
+        address = f"postgresql://{postgres_server.user}@127.0.0.1:{relay.port}/{name}"
+        store = stack.enter_context(closing(open_store(address)))
+        assert store.put([window()]) == [PutResult.NEW]
+        relay.become(State.HALF_OPEN)
+        lost = pool.submit(store.put, [window(sequence=5)])
+        until(lambda: relay.counts["swallowed"])
+        relay.become(State.FLOWING)
+        store.engines.cut()
+        with pytest.raises(StoreUnavailable):
+            lost.result(waiting.PATIENCE)
+        assert store.put([window(sequence=5)]) == [PutResult.NEW]
 
 
 @pytest.mark.parametrize("given", ["", "&connect_timeout=3"])
@@ -91,6 +119,54 @@ def test_an_index_that_does_not_have_the_rows_of_its_table_is_found(filled: Stor
     run(filled, entered.format("true"))
     expected = "table evidence: 4 rows, and 3 in its index ix_evidence_message"
     assert check_pages(filled, math.inf).faults == (expected,)
+
+
+def crash(server: postgres.Server, name: str) -> None:
+    """Have the server begin with empty buffers, as after a crash of one of its processes."""
+    with server.connect(name) as idle:
+        with server.connect(name) as victim:
+            os.kill(victim.info.backend_pid, signal.SIGKILL)
+        until(lambda: is_cut(idle))
+    until(server.answers)
+
+
+def is_cut(connection: psycopg.Connection[Any]) -> bool:
+    try:
+        connection.execute("SELECT 1")
+    except psycopg.OperationalError:
+        return True
+    return False
+
+
+def test_every_page_of_zeros_in_an_index_is_found_above_its_leaves_too() -> None:
+    with postgres.running() as server:
+        address = server.database("wide")
+        open_store(address).close()
+        server.run("wide", "INSERT INTO twins (servo) VALUES ('a'); "
+            "INSERT INTO messages (servo, kind, key, boot, sequence, start, encoding, digest, received) "
+            "SELECT 'a', 'window', repeat('b', 400) || lpad(g::text, 8, '0'), 'b', g, 0, '', '', 0 "
+            "FROM generate_series(1, 3000) g; "
+            "INSERT INTO bodies SELECT id, '' FROM messages; CREATE EXTENSION pageinspect; CHECKPOINT")  # fmt: skip
+        with server.connect("wide") as connection:
+            above = connection.execute(
+                "SELECT page FROM generate_series(1, pg_relation_size('uq_messages_servo_key') / 8192 - 1) AS page, "
+                "LATERAL bt_page_stats('uq_messages_servo_key', page) AS stats WHERE type IN ('i', 'r') ORDER BY page"
+            ).fetchall()
+            place = connection.execute("SELECT pg_relation_filepath('uq_messages_servo_key')").fetchone()
+        assert len(above) > 3
+        assert place is not None
+        file = server.folder / "data" / place[0]
+        whole = file.read_bytes()
+        for (page,) in above:
+            with file.open("r+b") as index:
+                index.seek(8192 * page)
+                index.write(bytes(8192))
+            crash(server, "wide")
+            with closing(open_store(address)) as store:
+                [fault] = check_pages(store, math.inf).faults
+            assert f"contains unexpected zero page at block {page}" in fault
+            with file.open("r+b") as index:
+                index.write(whole)
 
 
 def test_a_check_of_tables_ends_in_time_and_says_so(filled: Store) -> None:

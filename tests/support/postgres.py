@@ -9,7 +9,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import psycopg
 from mosquitto import free_port
@@ -35,8 +35,12 @@ class Server(NamedTuple):
 
     def run(self, name: str, statement: str) -> None:
         """Run a statement in a database."""
-        with psycopg.connect(self._parameters(name), autocommit=True) as connection:
+        with self.connect(name) as connection:
             connection.execute(statement)
+
+    def connect(self, name: str) -> psycopg.Connection[tuple[Any, ...]]:
+        """Connect to a database."""
+        return psycopg.connect(self._parameters(name), autocommit=True)
 
     def answers(self) -> bool:
         """True where it accepts connections."""

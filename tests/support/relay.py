@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from enum import StrEnum
+from pathlib import Path
 from random import Random
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -47,7 +48,7 @@ class Weather(NamedTuple):
 
 
 class Relay:
-    """Listens on a port of its own and passes on to `target` (a port of this machine, which may be set anew).
+    """Listens on a port of its own and passes on to `target`: a port of this machine, which may be set anew, or a path.
 
     Attributes
     ----------
@@ -56,7 +57,7 @@ class Relay:
         What happened: "connection", "cut", "refused", "unreachable" ...
     """
 
-    def __init__(self, target: int, weather: Weather = Weather(), seed: int = 0) -> None:  # noqa: B008
+    def __init__(self, target: int | Path, weather: Weather = Weather(), seed: int = 0) -> None:  # noqa: B008
         self.target, self.port = target, 0
         self.counts: Counter[str] = Counter()
         self._weather, self._random = weather, Random(seed)
@@ -161,7 +162,10 @@ class Relay:
     async def connected(self, use: Callable[[Reader, Writer], Awaitable[None]]) -> None:
         """A connection to the target, used and let go."""
         try:
-            reader, writer = await asyncio.open_connection("127.0.0.1", self.target)
+            if isinstance(self.target, Path):
+                reader, writer = await asyncio.open_unix_connection(self.target)
+            else:
+                reader, writer = await asyncio.open_connection("127.0.0.1", self.target)
         except OSError:
             self.counts["unreachable"] += 1
             return

@@ -25,7 +25,13 @@ class Watched:
         self.now, self.leases, self.damage = 1000.0, "", ""
         self.reads, self.told = SimpleNamespace(fault="", waited=0.0), list[tuple[str, str]]()
         self.writes = SimpleNamespace(failure="", failed_at=-1e9, waited=0.0)
-        self.health = StoreHealth(self.reads, self.writes, lambda: self.leases, lambda: self.damage, lambda: self.now)
+        self.cuts = 0
+        self.health = StoreHealth(
+            self.reads, self.writes, lambda: self.leases, lambda: self.damage, self.cut, lambda: self.now
+        )
+
+    def cut(self) -> None:
+        self.cuts += 1
 
     def looked(self, seconds: int) -> None:
         for _ in range(seconds):
@@ -60,6 +66,20 @@ def test_failed_writes_are_logged_at_once_posted_when_they_last_and_over_when_th
     watched.leases = "read-only"
     watched.looked(20)
     assert watched.told[1:] == [(KIND, "read-only" + MEANWHILE)]
+
+
+@pytest.mark.parametrize("which", ["reads", "writes"])
+def test_connections_of_a_store_that_does_not_answer_for_a_minute_are_cut_once_a_minute(which: str) -> None:
+    watched = Watched()
+    getattr(watched, which).waited = 59.0
+    watched.looked(300)
+    assert watched.cuts == 0
+    getattr(watched, which).waited = 60.0
+    watched.looked(181)
+    assert watched.cuts == 4
+    getattr(watched, which).waited = 0.0
+    watched.looked(300)
+    assert watched.cuts == 4
 
 
 def test_a_moments_trouble_is_not_posted_and_reads_that_succeed_in_between_are_no_end(
