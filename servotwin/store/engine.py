@@ -7,9 +7,9 @@ import socket
 import sqlite3
 import time
 from collections.abc import Iterator
-from collections.abc import Set as AbstractSet
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Lock
 from typing import Any, NamedTuple
 from weakref import WeakSet
 
@@ -99,26 +99,41 @@ def _refuse(fault: str) -> sa.URL:
     raise InvalidInput(f"the store's address {fault}; {_ALLOWED}")
 
 
+class OpenConnections:
+    """Connections to a PostgreSQL server that are not closed yet; used by all threads."""
+
+    def __init__(self) -> None:
+        # Without the lock a thread that connects during a cut would end it: a set must not grow while it is read.
+        self._opened, self._lock = WeakSet[Any](), Lock()
+
+    def add(self, connection: Any) -> None:
+        """Note a new connection."""
+        with self._lock:
+            self._opened.add(connection)
+
+    def cut(self) -> None:
+        """Cut them all: calls that wait for an answer fail, and the next ones connect."""
+        with self._lock:
+            opened = tuple(self._opened)
+        for connection in opened:
+            # Closed meanwhile, perhaps, by the thread that has it.
+            with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
+                line.shutdown(socket.SHUT_RDWR)
+
+
 class Engines(NamedTuple):
     """Engines for writing and reading; SQLite has one writing connection, which serialises writers.
 
     Attributes
     ----------
     writer, reader : sa.Engine
-    opened : set
-        Connections to a PostgreSQL server.
+    opened : OpenConnections
+        None of an SQLite file.
     """
 
     writer: sa.Engine
     reader: sa.Engine
-    opened: AbstractSet[Any] = frozenset()
-
-    def cut(self) -> None:
-        """Cut the connections to a PostgreSQL server: calls that wait for an answer fail, and the next ones connect."""
-        for connection in tuple(self.opened):
-            # Closed meanwhile, perhaps, by the thread that has it.
-            with suppress(Exception), socket.socket(fileno=os.dup(connection.fileno())) as line:
-                line.shutdown(socket.SHUT_RDWR)
+    opened: OpenConnections
 
     def dispose(self) -> None:
         """Close every connection."""
@@ -134,16 +149,16 @@ def engines_of(address: sa.URL) -> Engines:
     InvalidInput
         The driver of PostgreSQL is missing, or an SQLite file cannot be created, or is missing beside its log.
     """
+    opened = OpenConnections()
     if address.get_backend_name() != SQLITE:
-        opened = WeakSet[Any]()
         engine = _postgresql(address, opened)
         return Engines(engine, engine, opened)
     path = sqlite_file(address)
     if path is None:
         writer = _sqlite(address, 1, reading=False)
-        return Engines(writer, writer)
+        return Engines(writer, writer, opened)
     _make_private(path)
-    return Engines(_sqlite(address, 1, reading=False), _sqlite(address, _READERS, reading=True))
+    return Engines(_sqlite(address, 1, reading=False), _sqlite(address, _READERS, reading=True), opened)
 
 
 @contextmanager
@@ -201,7 +216,7 @@ def _closed_files(engine: sa.Engine) -> str:
     return f"; this user may not write {' and '.join(closed)}" if closed else ""
 
 
-def _postgresql(address: sa.URL, opened: WeakSet[Any]) -> sa.Engine:
+def _postgresql(address: sa.URL, opened: OpenConnections) -> sa.Engine:
     times = {name: value for name, value in _SERVER_TIMES.items() if name not in address.query}
     try:
         engine = sa.create_engine(

@@ -115,7 +115,7 @@ class TwinService:
         if config.webhook is not None:
             self.webhook = AlarmWebhook(config.webhook, self.metrics.webhook, self.clocks.wall, self.clocks.monotonic)
         self.dispatcher = self._make_dispatcher()
-        away, damage, cut = lambda: self.dispatcher.away, lambda: self.watch.fault, store.engines.cut
+        away, damage, cut = lambda: self.dispatcher.away, lambda: self.watch.fault, store.engines.opened.cut
         self._store_health = StoreHealth(self.executor, self._writes, away, damage, cut, self.clocks.monotonic)
         self.claims = self._make_claims()
         only_here = config.mqtt is None and not self._shared

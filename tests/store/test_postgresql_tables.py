@@ -74,7 +74,7 @@ def test_a_call_whose_answer_a_proxy_has_swallowed_ends_when_connections_are_cut
         lost = pool.submit(store.put, [window(sequence=5)])
         until(lambda: relay.counts["swallowed"])
         relay.become(State.FLOWING)
-        store.engines.cut()
+        store.engines.opened.cut()
         with pytest.raises(StoreUnavailable):
             lost.result(waiting.PATIENCE)
         assert store.put([window(sequence=5)]) == [PutResult.NEW]

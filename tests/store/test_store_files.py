@@ -19,7 +19,15 @@ from store_cases import MORE, NEXT, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
 from servotwin.store import migrate as migrations
-from servotwin.store.engine import StoreUnavailable, _set_pragma, engines_of, parse_address, public_address, transaction
+from servotwin.store.engine import (
+    OpenConnections,
+    StoreUnavailable,
+    _set_pragma,
+    engines_of,
+    parse_address,
+    public_address,
+    transaction,
+)
 from servotwin.store.records import MessageKind, PutResult
 from servotwin.store.results import _locked_serials
 from servotwin.store.schema import REVISION, metadata, twins
@@ -296,3 +304,30 @@ def test_a_log_whose_store_was_moved_away_is_not_deleted_by_a_new_store(url: str
     (tmp_path / "moved.db").rename(tmp_path / "store.db")
     open_store(url).close()
     store.close()
+
+
+class Unconnected:
+    """Connection that is closed already."""
+
+    def fileno(self) -> int:
+        raise OSError("closed")
+
+
+def test_connections_are_cut_while_threads_make_others() -> None:
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    opened, kept, done = OpenConnections(), [Unconnected() for _ in range(30_000)], threading.Event()
+
+    def connect() -> None:
+        for each in kept:
+            opened.add(each)
+        done.set()
+
+    connecting = threading.Thread(target=connect)
+    connecting.start()
+    try:
+        while not done.is_set():
+            opened.cut()
+    finally:
+        connecting.join()
+        sys.setswitchinterval(before)
