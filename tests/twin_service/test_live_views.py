@@ -58,6 +58,20 @@ def test_a_short_gap_stays_a_gap_and_a_long_one_and_a_new_boot_begin_anew():
     assert live.look("ax-1", 1, 8)["first"] == 0
 
 
+def test_columns_that_come_again_over_a_broker_leave_the_view_as_it_is():
+    live, _ = views()
+    live.look("ax-1", 0, 0)
+    chunks = [LiveColumns("ax-1", 1, first, 0.1, ((float(first), *COLUMN[1:]),) * 2) for first in (0, 2, 4)]
+    for chunk in (*chunks[:2], chunks[1], chunks[0], chunks[2], chunks[2]):
+        assert live.take("ax-1", chunk)
+    shown = live.look("ax-1", 0, 0)
+    assert (shown["first"], [column[0] for column in shown["columns"]]) == (0, [0.0, 0.0, 2.0, 2.0, 4.0, 4.0])
+    # Other columns with the same numbers are those of another run of the edge.
+    other = ((9.0, *COLUMN[1:]),) * 2
+    live.take("ax-1", LiveColumns("ax-1", 1, 0, 0.1, other))
+    assert live.look("ax-1", 0, 0)["columns"] == list(other)
+
+
 def test_a_page_is_told_in_a_word_why_it_sees_nothing():
     for connected, word in ((False, "away"), (True, "off"), (None, "off")):
         live, clock = views(connected=connected)
