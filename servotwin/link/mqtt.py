@@ -93,7 +93,7 @@ class MqttTransport:
         self._serials, self._lock = count(secrets.randbits(52)), Lock()
         self._waiting: dict[int, _Copy] = {}
         self._published: dict[int, _Answer] = {}
-        self._not_delivered: dict[int, str] = {}
+        self._sending, self._not_delivered = 0, dict[int, str]()
         self._round_trip, self._unanswered = RoundTrip(timeout_s), 0
         self._ready, self._closed, self._why = Event(), False, "the broker has not answered yet"
         name = f"servotwin-edge-{servo}" + (f"-{run}" if run else "")
@@ -190,13 +190,21 @@ class MqttTransport:
         data = encode_request(self._key, self._servo, serial, request)
         with self._lock:
             self._waiting[serial] = _Copy(future, time.monotonic(), measured)
-        number = None if self._closed else self._connection.publish(request_topic(self._servo), data, patience)
+            self._sending += 1
+        number, why = None, None
+        try:
+            number = None if self._closed else self._connection.publish(request_topic(self._servo), data, patience)
+        finally:
+            with self._lock:
+                self._sending -= 1
+                if number is not None:
+                    self._published[number] = future
+                    # The broker may report this before `publish` has returned the number.
+                    why = self._not_delivered.pop(number, None)
+                if not self._sending:  # what is left is of copies that nobody waits for; their numbers come again
+                    self._not_delivered.clear()
         if number is None:
             raise Unreachable("the link is closed" if self._closed else "too much waits for the broker")
-        with self._lock:
-            self._published[number] = future
-            # The broker may report this before `publish` has returned the number.
-            why = self._not_delivered.pop(number, None)
         if why is not None:
             _set_result(future, Unreachable(why))
 
@@ -204,7 +212,7 @@ class MqttTransport:
         why = why or _NO_SUBSCRIBER
         with self._lock:
             future = self._published.get(number)
-            if future is None:
+            if future is None and self._sending:
                 self._not_delivered[number] = why
         if future is not None:
             _set_result(future, Unreachable(why))
@@ -230,7 +238,8 @@ class MqttTransport:
 
     def _connected(self, forgotten: bool) -> None:
         """Fail the requests under way where the broker has forgotten the session, and them with it."""
-        self._unanswered = 0
+        with self._lock:
+            self._unanswered = 0
         if forgotten:
             self._fail_all("the broker has forgotten this edge")
         self._ready.set()

@@ -5,20 +5,17 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from mosquitto import Mosquitto, broker, free_port
+from mosquitto import Mosquitto, free_port
 from mqttparts import PATIENCE, SERVOS, TOKENS, edge, insist, kept, parcel, raw, refusals, twin
-from mqttrelay import MqttRelay
 from relay import Relay, State, Weather
 
 from servotwin.link import mqtt_messages as wire
-from servotwin.link import round_trip
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
 from servotwin.link.claim import ExclusiveTransport, HeldClaim
 from servotwin.link.mqtt import LiveMqtt
@@ -26,20 +23,7 @@ from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, opened, seal, verifier
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, Hello, InvalidMessage, Refusal, Setting, encode
 from servotwin.messages.live import LiveColumns
-from servotwin.store.store import Store, open_store
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Mosquitto]:
-    with broker(tmp_path / "broker") as running:
-        yield running
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    store = open_store(f"sqlite:///{tmp_path}/twin.db")
-    yield store
-    store.close()
+from servotwin.store.store import Store
 
 
 def test_windows_letters_and_messages_go_both_ways(server: Mosquitto, store: Store) -> None:
@@ -260,38 +244,6 @@ def test_a_twin_that_does_not_answer_is_not_waited_for_for_ever(server: Mosquitt
         with pytest.raises(Unreachable, match=r"no answer of a twin within 0\.3 s"):
             here.deliver(parcel(0))
     deaf.close()
-
-
-@pytest.mark.parametrize("way", ["up", "down"])
-def test_a_request_or_an_answer_that_is_lost_on_the_way_is_repeated_before_its_time_is_over(
-    server: Mosquitto, store: Store, way: str
-) -> None:
-    with (
-        MqttRelay(server.port, lambda each, number: each == way and number % 2 == 0) as relay,
-        twin(Broker(server.url), store) as there,
-        edge(Broker(f"mqtt://127.0.0.1:{relay.port}"), timeout_s=PATIENCE) as here,
-    ):
-        for number in range(2):
-            here.deliver(parcel(number))
-        assert relay.counts["lost"] >= 2
-    assert kept(store) == [0, 1]
-    assert there.metrics.stored.values[("window", "new")] == 2
-
-
-def test_answers_that_are_lost_for_ever_do_not_use_up_what_the_broker_allows(
-    server: Mosquitto, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(round_trip, "SHORTEST_S", 0.02)
-    session = MqttSession("any", (), 0)
-    with (
-        MqttRelay(server.port, lambda way, number: way == "down" and number % 2 == 0) as relay,
-        twin(Broker(server.url), store),
-        edge(Broker(f"mqtt://127.0.0.1:{relay.port}"), timeout_s=PATIENCE) as here,
-    ):
-        for number in range(session.receive + 10):
-            here.deliver(parcel(number))
-        assert relay.counts["lost"] > session.receive
-    assert kept(store) == list(range(session.receive + 10))
 
 
 def test_a_response_belongs_to_its_request() -> None:
