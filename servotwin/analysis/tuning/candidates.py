@@ -61,9 +61,9 @@ class Factors(NamedTuple):
 
     @property
     def cancellation(self) -> float:
-        """abs(Kp) + abs(Kd) / Tf relative to abs(C(j wc)) where they have opposite signs and act against one another.
+        """abs(Kp) + abs(Kd) / Tf over abs(C(j wc)) where they act against one another by their signs; 0 elsewhere.
 
-        An error of 1 % of one of the gains is that many per cent of the controller.
+        An error of 1 % of one of the gains is up to that many per cent of the controller.
         """
         Kp, _, Kd, time = (float(value) for value in _gains(self))
         return (abs(Kp) + abs(Kd) / time) / abs(self.K) if Kp * Kd < 0.0 else 0.0
@@ -97,10 +97,8 @@ def _gains(factors: Factors) -> tuple[float, float, float, float]:
 _ANGLES, _ZOOMS = 16, 4
 # Filters from 1 to 89 deg; the second zero from infinity (0 deg) to nearly 0 (89 deg).
 _LOWEST, _HIGHEST = math.radians(1.0), math.radians(89.0)
-
-
-# Gains of opposite signs that are more than this larger than their sum are no setting of a machine: the published servo
-# has 3, and a lag by a filter far below the crossover thousands.
+# A larger `Factors.cancellation` is no setting of a machine: the published servo has 3, and a lag by a filter far below
+# the crossover thousands.
 _MOST_CANCELLATION = 10.0
 
 
@@ -131,7 +129,7 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
     kind, at = CONTROLLER_TYPES[name], _at_crossover(plant, wc)
     omega = plant.search_frequencies(wc)
     values = plant.response(omega)
-    possible, cancelling = False, list[Factors]()
+    possible = cancelling = False
     # Positive gains first; a plant of negative gain needs negative ones.
     for sign in (1.0, -1.0):
         turn = _wrapped(margin - math.pi - np.angle(sign * at))
@@ -142,8 +140,8 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
         be, al = (0.5 * _HIGHEST, _HIGHEST), (0.5 * (_LOWEST + _HIGHEST), _HIGHEST - _LOWEST)
         for zoom in range(_ZOOMS):
             grid = _grid(kind, wc, turn, sign / abs(at), be, al, zoom)
-            cancelling += [factors for factors in grid if factors.cancellation > _MOST_CANCELLATION]
-            grid = [factors for factors in grid if factors.cancellation <= _MOST_CANCELLATION]
+            kept = [factors for factors in grid if factors.cancellation <= _MOST_CANCELLATION]
+            cancelling, grid = cancelling or len(kept) < len(grid), kept
             if not grid:
                 break
             count, possible = count + len(grid), True
@@ -157,7 +155,8 @@ def search(plant: Plant, name: str, wc: float, margin: float, cost: Callable[[Ca
     if not (possible or cancelling):
         raise InvalidInput(_unreachable(name, kind, wc, margin, at))
     where = f"crossover of {wc:g} rad/s with a phase margin of {math.degrees(margin):g} deg"
-    but = "" if not cancelling else f" without Kp and Kd / Tf that are {_MOST_CANCELLATION:g} times their sum and more"
+    limit = f"together are over {_MOST_CANCELLATION:g} times its gain there"
+    but = f" without Kp and Kd / Tf that act against one another and {limit}" if cancelling else ""
     raise InvalidInput(f"no stable {name} controller gives this plant a {where}{but}")
 
 
