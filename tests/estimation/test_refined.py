@@ -49,5 +49,7 @@ def test_only_sharp_motions_need_parts() -> None:
     assert needed == sorted(needed, reverse=True)
     assert needed[0] == 8
     assert needed[-1] == 1
+    # Without counts, noise, or a motor that is ever before its load nothing is small enough.
+    assert parts_needed(sharp, sharp, 0.0, 1) == 8
     # Three lines in each part do as much as three parts.
     assert parts_needed(sharp, np.zeros(400), 1e-4, 3) == 3

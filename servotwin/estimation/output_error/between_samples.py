@@ -21,8 +21,10 @@ _SHARP, _SMALL, _MOST = 3.0, 1e-4, 8
 
 
 def error_between_samples(found: Search, fewest: int) -> Array:
-    """Errors (m or rad at the load) of the motor's place between samples; of a load without dynamics they do not count:
-    zeros, `fewest` of them."""
+    """(N - 4,) errors (m or rad at the load) of the motor's place between samples.
+
+    They do not count, and are `fewest` zeros, where the load has no dynamics.
+    """
     problem = found.problem
     if problem.model.speed == 0.0:
         return np.zeros(fewest)
@@ -30,16 +32,20 @@ def error_between_samples(found: Search, fewest: int) -> Array:
 
 
 def parts_needed(drive: Array, position: Array, count: float, lines: int) -> int:
-    """Parts of an interval at which a model needs the motor's place (N,); position (N,) and count are in its unit.
+    """Number of parts of an interval at whose ends a model needs the motor's place.
+
+    The arrays (N,) and the count are m or rad at the load; `lines` is the number of straight lines that the model
+    itself lays through each part.
 
     One, unless the motor turns so sharply that a cubic leaves more than its noise open; then as many as make the lines,
-    so many in each part, as good as that, up to 8 lines in an interval.
+    so many in each part, as good as that, up to 8 lines in an interval, rounded up to whole parts.
     """
     allowed = max(count, _SHARP * noise_of(drive), _SMALL * float(np.ptp(drive - position)))
     if float(np.max(np.abs(np.diff(drive, 4)))) * _CUBIC <= allowed:
         return 1
     bent = float(np.max(np.abs(np.diff(drive, 2)))) / 8.0
-    return math.ceil(min(_MOST, math.sqrt(bent / allowed)) / lines)
+    needed = math.sqrt(bent / allowed) if allowed > 0.0 else math.inf
+    return math.ceil(min(_MOST, needed) / lines)
 
 
 def moved_between_samples(found: Search, which: int = HALF) -> float:
