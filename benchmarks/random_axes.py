@@ -3,8 +3,8 @@
 ``python -m benchmarks.batch axes-random --seed 5 --count 40 FILE``: torque drives, DC motors and velocity drives, one
 to three masses, with and without friction, encoders of any fineness, a controller by `tune`, 7.5 to 30 samples in a
 period of the motor against its load; stiffness 5 %, damping 30 %, motor 10 %, friction 40 % off the model. Axes for
-which no controller is found are drawn anew. Shafts are free in the gap, and the blocks are the actuators; ``--blocks``
-with `HELD_BLOCKS` draws screws that the gap holds, half of them under a constant force.
+which no controller is found are drawn anew. `BLOCKS` are shafts that are free in the gap, by their actuators, and
+`HELD_BLOCKS` screws that the gap holds, half of them under a constant force: ``--blocks "held,held cascade"``.
 
 ``windows-random`` estimates from windows of their second to fourth step without a twin, below 6000 samples: faster.
 """
@@ -112,14 +112,13 @@ def _drawn(block: str, random: np.random.Generator) -> RandomAxis:
     yields = 0.0 if speed else mass * pitch**2 / inertia
     rate = shaft / (2.0 * math.pi) * math.sqrt(1.0 + yields) * log(math.log10(7.5), math.log10(30.0))
     if block == "held cascade":
-        axis = axis.replace(
-            controller=_cascade(axis.p, inertia + mass * pitch**2, crossover, log).replace(sample_rate=rate)
-        )
+        law = _cascade(pitch, inertia + mass * pitch**2, crossover, log)
+        axis = axis.replace(controller=law.replace(sample_rate=rate))
         if not axis.margins().stable:
             raise InvalidInput("the cascade is unstable")
     else:
-        law = tune(axis, crossover, margin, kind=kind).controller
-        axis = axis.replace(controller=law.replace(sample_rate=rate, Tf=max(law.Tf, 0.05 / crossover)))
+        tuned = tune(axis, crossover, margin, kind=kind).controller
+        axis = axis.replace(controller=tuned.replace(sample_rate=rate, Tf=max(tuned.Tf, 0.05 / crossover)))
     errors = {name: 1.0 + width * random.uniform(-1.0, 1.0) for name, width in _ERRORS.items()}
     half_period = round(max(24.0 * math.pi / crossover * random.uniform(0.5, 1.2), 1000.0 / rate) * rate) / rate
     gap = min(log(-1.7, -0.3), 0.25 * amplitude / pitch)
@@ -203,9 +202,9 @@ def axis_tasks(blocks: Sequence[str], count: int, seed: int) -> Iterator[tuple[s
 
 
 def _show(found: Mapping[str, Any], console: Console) -> None:
-    """A line for each actuator, and the axes with false estimates."""
+    """A line for each block, and the axes with false estimates or bounds above the gap."""
     table = Table(title="random axes: estimates of a gap that stands still", title_justify="left", box=None)
-    table.add_column("actuator")
+    table.add_column("block")
     for heading in ("axes", "refused", "windows", "accepted", "inside", "near", "false", "bounds", "above"):
         table.add_column(heading, justify="right")
     for block in (*BLOCKS, *HELD_BLOCKS):
@@ -214,7 +213,7 @@ def _show(found: Mapping[str, Any], console: Console) -> None:
         estimates = [estimate for each in ran for estimate in each["estimates"]]
         counts = [len(axes), len(axes) - len(ran), sum(each["windows"] for each in ran), len(estimates)]
         counts += [int(sum(each[name] for each in estimates)) for name in ("inside", "near")]
-        bounds = [bound for each in ran for bound in each["bounds"]]
+        bounds = [bound for each in ran for bound in each.get("bounds", ())]
         counts += [sum(map(_is_false, estimates)), len(bounds), sum(bound > 1.0 for bound in bounds)]
         table.add_row(block, *map(str, counts))
     console.print(table)
