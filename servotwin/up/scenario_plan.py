@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from servotwin.cosim.scenario import PRESETS, Scenario, preset_text
 from servotwin.edge_process.config import UNBOOTED, EdgeConfig, TwinLink
 from servotwin.edge_process.config_file import edge_toml
 from servotwin.errors import InvalidInput
+from servotwin.messages import NAME_PATTERN
 from servotwin.plant.axis import AXES
 from servotwin.plant.own_units import own_units
 from servotwin.plant.servo import PRESETS as SERVO_PRESETS
@@ -127,10 +129,14 @@ class ScenarioPlan:
         sources, members = dict[str, Path](), list[_Member]()
         for file in files:
             member = _read(file)
-            if (first := sources.setdefault(member.name, file)) is not file:
+            where = f"{file}: name = {member.name!r}"
+            if member.name in sources:
                 remedy = "give each scenario another name, or --machines N for several machines of one"
-                raise InvalidInput(f"{file}: name = {member.name!r}: {first} has it already; {remedy}")
+                raise InvalidInput(f"{where}: {sources[member.name]} has it already; {remedy}")
+            sources[member.name] = file
             members += _numbered(member, machines)
+            if not re.fullmatch(NAME_PATTERN, members[-1].name):
+                raise InvalidInput(f"{where}: is longer than 64 characters with a machine's number; give a shorter one")
         return cls(tuple(members))
 
     @property

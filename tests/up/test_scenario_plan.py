@@ -181,9 +181,20 @@ def test_two_scenarios_of_one_name_and_too_many_machines_are_refused(scenario: P
     other.write_text(SCENARIO)
     with pytest.raises(InvalidInput, match=r"other\.toml: name = 'joint': .*scenario\.toml has it already"):
         ScenarioPlan.read([scenario, other])
+    with pytest.raises(InvalidInput, match=r"scenario\.toml has it already"):
+        ScenarioPlan.read([scenario, scenario])
     for machines in (0, 101):
         with pytest.raises(InvalidInput, match=f"--machines {machines}: must be 1 to 100"):
             ScenarioPlan.read([scenario], machines)
+
+
+def test_a_name_that_a_number_makes_too_long_is_refused_with_its_file(scenario: Path) -> None:
+    scenario.write_text(SCENARIO.replace('name = "joint"', f'name = "{"x" * 62}"'))
+    assert len(ScenarioPlan.read([scenario], 9).servos) == 9
+    with pytest.raises(
+        InvalidInput, match=r"scenario\.toml: name = 'x+': is longer than 64 characters with a machine's"
+    ):
+        ScenarioPlan.read([scenario], 10)
 
 
 def test_the_command_refuses_machines_without_a_scenario_and_makes_nothing(scenario: Path, tmp_path: Path) -> None:
