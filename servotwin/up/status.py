@@ -25,8 +25,7 @@ from servotwin.up.plan import MACHINE, ServoPlan
 
 _POLL_S, _TIMEOUT_S = 2.0, 5.0
 _FIRST_WINDOWS, _WINDOWS, _MOST_WINDOWS = 20, 4, 1000
-"""Windows that are searched for the newest estimate, in the first query and in later ones, beside those that wait; most
-that the twin shows at once."""
+"""Windows that are searched for the newest estimate, at first and later, and most that the twin shows at once."""
 _METRICS = {
     'servotwin_messages_total{kind="window",put="new"}': "windows",
     'servotwin_evidence_total{kind="estimate"}': "estimates",
@@ -131,13 +130,17 @@ class TwinPoller:
         waiting = msgspec.json.decode(self._get(connection, "/healthz"))["waiting"]
         counts = read_metrics(self._get(connection, "/metrics").decode())
         for servo in self._servos:
-            # The newest windows are those that wait.
-            limit = min(_MOST_WINDOWS, waiting["messages"] + (_WINDOWS if servo in self.estimates else _FIRST_WINDOWS))
-            traces = msgspec.json.decode(self._get(connection, f"/v1/servos/{servo}/audit?limit={limit}"))
-            newest = newest_estimate(traces)
+            few = _WINDOWS if servo in self.estimates else _FIRST_WINDOWS
+            newest = self._newest(connection, servo, few)
+            if newest is None and waiting["messages"]:  # the newest windows may be those that wait
+                newest = self._newest(connection, servo, min(_MOST_WINDOWS, waiting["messages"] + few))
             if newest is not None:
                 self.estimates[servo] = newest
         return TwinStatus(waiting["messages"], waiting["age"], counts)
+
+    def _newest(self, connection: HTTPConnection, servo: str, limit: int) -> ServoEstimate | None:
+        """Newest estimate among the last windows of a servo, at most `limit`."""
+        return newest_estimate(msgspec.json.decode(self._get(connection, f"/v1/servos/{servo}/audit?limit={limit}")))
 
     def _get(self, connection: HTTPConnection, path: str) -> bytes:
         connection.request("GET", path, headers=self._headers)
