@@ -200,10 +200,10 @@ class Connection:
             return
         self._events.ready(self._fresh)
 
-    def _disconnected(self, _client: Client, _user: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _disconnected(self, _client: Client, _user: Any, flags: Any, reason: Any, _properties: Any) -> None:
         if self._closing:
             return
-        if reason.value == _SILENT:  # this end has given up, not the broker
+        if reason.value == _SILENT and not flags.is_disconnect_packet_from_server:  # this end has given up
             self._events.lost(f"the broker has not answered for {_KEEP_ALIVE_S} s: it, or the network between, hangs")
         elif self._up:
             self._events.lost(f"the connection to the broker broke ({reason})")

@@ -61,3 +61,21 @@ def test_a_broker_that_accepts_the_connection_and_never_answers_is_said_to_hang(
             )
         finally:
             connection.close()
+
+
+def test_a_broker_that_misses_the_pings_itself_is_not_said_to_hang() -> None:
+    said: queue.Queue[str] = queue.Queue()
+    with socket.create_server(("127.0.0.1", 0)) as port:
+        url = f"mqtt://127.0.0.1:{port.getsockname()[1]}"
+        quiet = MqttCallbacks(lambda *_: None, lambda _: None, said.put)
+        connection = Connection(Broker(url), MqttSession("edge", ("t",), 60), quiet)
+        try:
+            line, _ = port.accept()
+            with line:
+                line.recv(1000)
+                line.sendall(bytes([0x20, 3, 0, 0, 0]))  # accepted
+                line.recv(1000)
+                line.sendall(bytes([0xE0, 2, 0x8D, 0]))  # disconnected: keep alive timeout
+                assert said.get(timeout=PATIENCE) == "the connection to the broker broke (Keep alive timeout)"
+        finally:
+            connection.close()
