@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from mosquitto import Mosquitto, free_port
 from mqttparts import PATIENCE, SERVOS, TOKENS, edge, insist, kept, parcel, raw, refusals, twin
 from relay import Relay, State, Weather
+from waiting import until
 
 from servotwin.link import mqtt_messages as wire
 from servotwin.link.broker import Broker, Connection, MqttCallbacks, MqttSession
@@ -123,12 +124,13 @@ def test_news_that_a_twin_is_gone_ends_a_poll(server: Mosquitto, store: Store) -
     at = Broker(server.url)
     with (
         Relay(server.port) as relay,
-        twin(Broker(f"mqtt://127.0.0.1:{relay.port}"), store),
+        twin(Broker(f"mqtt://127.0.0.1:{relay.port}"), store) as there,
         edge(at, wait_s=30.0, timeout_s=PATIENCE) as here,
         ThreadPoolExecutor(1) as pool,
     ):
         here.deliver(parcel(0))
         polled = pool.submit(here.listen, 0)
+        until(lambda: there.polls.waiting)  # otherwise no twin is there to ask
         relay.become(State.DOWN)
         with pytest.raises(Unreachable, match="gone"):
             polled.result(PATIENCE)
