@@ -24,6 +24,7 @@ from benchmarks.batch import Batch
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.control.cascade import Cascade
 from servotwin.control.controller import Controller
+from servotwin.control.laws import AnyController
 from servotwin.cosim import Cosimulation, SimulatedMachine
 from servotwin.cosim.machine import simulation_of
 from servotwin.cosim.scenario import Scenario
@@ -109,16 +110,17 @@ def _drawn(block: str, random: np.random.Generator) -> RandomAxis:
     sensors = Sensors(log(-4.5, -2.5), amplitude * log(-5.5, -3.5))
     axis = Axis(motor, screw, load, Controller(1.0, 0.0, 0.0, 1.0 / crossover), sensors)
     kind, margin = str(random.choice(_KINDS)), math.radians(random.uniform(45.0, 65.0))
-    yields = 0.0 if speed else mass * pitch**2 / inertia
-    rate = shaft / (2.0 * math.pi) * math.sqrt(1.0 + yields) * log(math.log10(7.5), math.log10(30.0))
+    law: AnyController
     if block == "held cascade":
         law = _cascade(pitch, inertia + mass * pitch**2, crossover, log)
-        axis = axis.replace(controller=law.replace(sample_rate=rate))
-        if not axis.margins().stable:
-            raise InvalidInput("the cascade is unstable")
     else:
         tuned = tune(axis, crossover, margin, kind=kind).controller
-        axis = axis.replace(controller=tuned.replace(sample_rate=rate, Tf=max(tuned.Tf, 0.05 / crossover)))
+        law = tuned.replace(Tf=max(tuned.Tf, 0.05 / crossover))
+    yields = 0.0 if speed else mass * pitch**2 / inertia
+    rate = shaft / (2.0 * math.pi) * math.sqrt(1.0 + yields) * log(math.log10(7.5), math.log10(30.0))
+    axis = axis.replace(controller=law.replace(sample_rate=rate))
+    if block == "held cascade" and not axis.margins().stable:
+        raise InvalidInput("the cascade is unstable at its sample rate")
     errors = {name: 1.0 + width * random.uniform(-1.0, 1.0) for name, width in _ERRORS.items()}
     half_period = round(max(24.0 * math.pi / crossover * random.uniform(0.5, 1.2), 1000.0 / rate) * rate) / rate
     gap = min(log(-1.7, -0.3), 0.25 * amplitude / pitch)

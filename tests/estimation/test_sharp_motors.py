@@ -15,8 +15,9 @@ from servotwin.design import tune
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error.between_samples import moved_between_samples
-from servotwin.estimation.output_error.estimator import OutputErrorSettings, fit
+from servotwin.estimation.output_error.estimator import OutputErrorSettings, fit, problem_of
 from servotwin.estimation.output_error.fit import Search, descend
+from servotwin.estimation.output_error.held_chain import HeldChainModel
 from servotwin.estimation.output_error.models import HALF
 from servotwin.estimation.output_error.problem import Problem
 from servotwin.estimation.output_error.refined import PARABOLA, refined
@@ -137,3 +138,15 @@ def test_few_samples_of_a_sharp_start_are_refined_and_what_they_leave_open_count
     drive = refined(problem.drive, problem.parts, PARABOLA)
     apart = problem.less_measured(problem.under(drive, values).position) - problem.misfit(values)
     assert float(np.max(np.abs(apart))) > problem.count
+
+
+def test_samples_are_not_averaged_over_a_corner() -> None:
+    """Of a motor that starts at once, and of one that turns as slowly as its load swings."""
+    rate, time = 6000.0, np.arange(12000) / 6000.0
+    started = np.maximum(time - 1.0, 0.0)
+    for motor, sharp in ((0.5 * np.sin(3.0 * time), False), (np.minimum(60.0 * started, 4.0), True)):
+        window = Window(theta_m=motor, position=MODEL.p * motor, voltage=0.0 * motor, sample_rate=rate)
+        problem, _ = problem_of(window, MODEL, None)
+        assert isinstance(problem.model, HeldChainModel)
+        averaged, usual = round(problem.interval * rate), problem.model.decimation(1.0 / rate, 12000 // 400)
+        assert averaged <= 0.5 * usual if sharp else averaged == usual > 1

@@ -319,14 +319,26 @@ def _problem(
     priors = Priors(settings.stiffness, settings.damping, settings.mass_ratio, settings.ratio, settings.delay or late)
     model, travel = _model(axis, priors, learnt), lever(axis)
     count, drive, position = math.hypot(travel * at_motor, at_load), travel * theta_m, window.position
-    if isinstance(model, HeldChainModel):
-        reduce = decimation(model.decimation(interval, theta_m.size // SHORTEST))
-        drive, position = reduce.rows(np.vstack([drive, position]))
-        interval *= reduce.factor
     if model.speed == 0.0:
         return Problem(model, drive, position, interval, count)
-    parts = parts_needed(drive, position, count, FRICTION_PARTS if axis.load.friction > 0.0 else 1)
-    return Problem(model, drive, position, interval, count, parts)
+    lines = FRICTION_PARTS if axis.load.friction > 0.0 else 1
+    if isinstance(model, HeldChainModel):
+        drive, position, interval = _averaged(model, drive, position, interval, count)
+    return Problem(model, drive, position, interval, count, parts_needed(drive, position, count, lines))
+
+
+def _averaged(
+    model: HeldChainModel, drive: Array, position: Array, interval: float, count: float
+) -> tuple[Array, Array, float]:
+    """Drive and position (n,) at an interval (s) that shows the chain, and no motor that starts within few samples
+    where the ones given (N,) do not."""
+    factor = model.decimation(interval, drive.size // SHORTEST)
+    while True:
+        reduce = decimation(factor)
+        fewer, seen = reduce.rows(np.vstack([drive, position]))
+        if factor == 1 or parts_needed(fewer, seen, count, 1) == 1:
+            return fewer, seen, interval * reduce.factor
+        factor //= 2
 
 
 def _own_rate(axis: Axis) -> float:
