@@ -236,6 +236,24 @@ def test_a_lag_that_averages_the_motor_s_rounding_is_not_taken_for_one(seed: int
     assert not made.estimate.ok or made.estimate.interval[0] <= gap <= made.estimate.interval[1]
 
 
+@pytest.mark.parametrize("seed", [5, 20])
+def test_gaps_far_above_the_best_one_of_a_small_gap_are_weighed(seed: int) -> None:
+    """Noise of four counts: the best fits of 0.21 deg are at 0.01 and 0.03 deg, and gaps up to twice as wide alone were
+    tried: 0.02 and 0.04 deg were said, within 0.08 deg."""
+    axis, gap = Axis.preset("stepper-stage"), math.radians(0.2)
+    run = simulate(
+        axis.scaled({"p": 1.003}),
+        10.0,
+        reference=SquareWave(0.2e-3, 4.0),
+        gap=gap,
+        sample_rate=200.0,
+        noise=Noise(200e-9, kind="white"),
+        seed=seed,
+    )
+    estimate = estimate_gap(Window.from_run(run, 4.5, 4.0), axis)
+    assert not estimate.ok or estimate.interval[0] <= gap <= estimate.interval[1]
+
+
 def test_samples_where_the_motor_s_speed_jumps_do_not_count() -> None:
     axis = Axis.preset("stepper-stage")
     window, *_ = _counted(_creep, 110)
