@@ -22,7 +22,7 @@ from servotwin.estimation.output_error.fit import Fit, Search, descend, only_rou
 from servotwin.estimation.output_error.models import DELAY, HALF, RATIO, Flags
 from servotwin.plant.signals import Array
 
-_FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next, of the best gap, and their growth
+_COARSEST, _FINEST, _GROWTH = 0.01, 0.01, 1.15  # steps from one gap to the next: of the best gap; of that; growth
 _WIDEST, _NARROWEST = 2.0, 0.99  # times the best gap: the farthest ones, and how far smaller ones are from it
 _TRAVEL, _COUNTS, _PART = 2e-3, 2.0, 0.01  # of the motor's travel; counts; of either: a step, where that is more
 _STEPS, _DEEPER = 15, 8
@@ -145,7 +145,7 @@ def _profile(found: Search, side: float, rise: float) -> Iterator[Fit]:
     farthest = max(_WIDEST * best, best + beyond) - best if side > 0.0 else _NARROWEST * best
     coarsest = max(_COARSEST * best, _PART * beyond)
     fit, away, likely = found.best, 0.0, 0.0
-    step = min(coarsest, max(_FINEST * best, found.best.std(HALF, found.free)))
+    step = min(coarsest, max(_FINEST * coarsest, found.best.std(HALF, found.free)))
     while away < min(farthest, likely + _PATIENCE * coarsest):
         away, step = min(farthest, away + step), min(coarsest, _GROWTH * step)
         start = fit.values.copy()
