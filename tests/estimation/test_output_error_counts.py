@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from servotwin.estimation.core.motor_angle import without_noise
+from servotwin.estimation.core.motor_angle import without_counts, without_noise
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
-from servotwin.estimation.output_error.estimator import _problem
+from servotwin.estimation.output_error.estimator import _problem, fitted
 from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.output_error.play_model import lagged
 from servotwin.estimation.output_error.possible import possible_half
@@ -22,6 +22,7 @@ from servotwin.estimation.output_error.search import search
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.backlash import play
+from servotwin.plant.noise import Noise
 from servotwin.plant.signals import Array, SquareWave
 from servotwin.simulation import simulate
 
@@ -207,6 +208,50 @@ def test_an_angle_without_its_noise_keeps_its_reversals() -> None:
     assert 0.5 < seen.noise / np.std(errors) < 2.0
     quiet = count * np.round(truth / count)
     assert np.array_equal(without_noise(quiet, count).angle, quiet)
+
+
+def test_an_angle_without_its_counts_stays_within_them() -> None:
+    time, count = np.arange(4000) / 1000.0, 1e-4
+    # Creeping to a place, and back at full speed: from 50 counts a sample to many samples a count.
+    truth = np.where(time < 2.0, 1.0 - np.exp(-5.0 * time), np.exp(-5.0 * (time - 2.0)))
+    shown = count * np.round(truth / count)
+    errors = without_counts(shown, count) - truth
+    assert np.std(errors) < 0.6 * np.std(shown - truth)
+    assert np.abs(errors).max() <= count * (1.0 + 1e-9)
+    assert np.array_equal(without_counts(truth, 0.0), truth)
+
+
+@pytest.mark.parametrize("seed", [5, 8])
+def test_a_lag_that_averages_the_motor_s_rounding_is_not_taken_for_one(seed: int) -> None:
+    """Noise of one count at the load, and steps of a loop in it: 1.8 +- 0.5 and 2.6 +- 1.0 deg were said of 1.04 and
+    1.08."""
+    axis, random = Axis.preset("stepper-stage"), np.random.default_rng([seed, 11])
+    gap = math.radians(1.0 + 0.1 * random.random())
+    run = simulate(
+        axis, 8.5, reference=SquareWave(0.5e-3, 3.0), gap=gap, sample_rate=1000.0, noise=Noise(50e-9), seed=seed
+    )
+    made = fitted(Window.from_run(run, 3.0, 4.0), axis, None, OutputErrorSettings())
+    assert made.search is not None
+    assert made.search.best.values[0] == pytest.approx(0.5 * axis.p * gap, rel=0.1)
+    assert not made.estimate.ok or made.estimate.interval[0] <= gap <= made.estimate.interval[1]
+
+
+@pytest.mark.parametrize("seed", [5, 20])
+def test_gaps_far_above_the_best_one_of_a_small_gap_are_weighed(seed: int) -> None:
+    """Noise of four counts: the best fits of 0.2 deg are at 0.01 and 0.03 deg, and gaps up to twice as wide alone were
+    tried: 0.02 and 0.04 deg were said, within 0.08 deg."""
+    axis, gap = Axis.preset("stepper-stage"), math.radians(0.2)
+    run = simulate(
+        axis.scaled({"p": 1.003}),
+        10.0,
+        reference=SquareWave(0.2e-3, 4.0),
+        gap=gap,
+        sample_rate=200.0,
+        noise=Noise(200e-9, kind="white"),
+        seed=seed,
+    )
+    estimate = estimate_gap(Window.from_run(run, 4.5, 4.0), axis)
+    assert not estimate.ok or estimate.interval[0] <= gap <= estimate.interval[1]
 
 
 def test_samples_where_the_motor_s_speed_jumps_do_not_count() -> None:

@@ -8,15 +8,18 @@ intervals, Goldenshluger and Nemirovski 1997), so that reversals stay as sharp a
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from servotwin.estimation.core.counts import between_counts
 from servotwin.plant.signals import Array
 
 _ONE_STD = 0.683  # share of a normal distribution within one standard deviation
 _REACHES = (4, 8, 16, 32, 64)  # samples to a side
 _INTERVAL = 2.5  # standard deviations, half-width of the intervals that intersect
+_EVENLY = 1.0 / math.sqrt(12.0)  # of a count: standard deviation of its rounding
 _DITHERED = 0.5  # of a count: from this noise on errors of rounding do not depend on each other
 
 
@@ -33,12 +36,30 @@ def without_noise(theta_m: Array, count: float) -> MotorAngle:
     jitter = float(np.sqrt(max(0.0, spread**2 - count**2 / 12.0)))
     if jitter <= _DITHERED * count:
         return MotorAngle(theta_m, jitter)
-    total, weight = np.zeros(theta_m.size), np.zeros(theta_m.size)
+    smooth, variance = _smooth(theta_m, spread)
+    return MotorAngle(smooth, float(np.sqrt(np.mean(variance))))
+
+
+def without_counts(theta_m: Array, count: float) -> Array:
+    """Smooth an angle (N,) that comes in counts (rad) without other noise, within half a count of what it shows.
+
+    A lag, as a delay by half a sample, averages errors of rounding that are left in, and fits better for that alone.
+    """
+    if count == 0.0:
+        return theta_m
+    between = between_counts(theta_m, count)
+    smooth, _ = _smooth(between, max(noise_of(between), count * _EVENLY))
+    return np.clip(smooth, theta_m - 0.5 * count, theta_m + 0.5 * count)
+
+
+def _smooth(values: Array, std: float) -> tuple[Array, Array]:
+    """(N,) values in noise of a standard deviation by parabolas to either side and both, and variances of that."""
+    total, weight = np.zeros(values.size), np.zeros(values.size)
     for side in (-1, 0, 1):
-        value, variance = _on_one_side(theta_m, spread, side)
+        value, variance = _on_one_side(values, std, side)
         total += value / variance
         weight += 1.0 / variance
-    return MotorAngle(total / weight, float(np.sqrt(np.mean(1.0 / weight))))
+    return total / weight, 1.0 / weight
 
 
 def noise_of(values: Array) -> float:

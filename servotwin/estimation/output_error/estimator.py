@@ -14,7 +14,7 @@ import numpy as np
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo
 from servotwin.estimation.core.decimation import decimation
-from servotwin.estimation.core.motor_angle import MotorAngle, noise_of, without_noise
+from servotwin.estimation.core.motor_angle import MotorAngle, noise_of, without_counts, without_noise
 from servotwin.estimation.core.upsampling import upsampled
 from servotwin.estimation.core.visible import counted
 from servotwin.estimation.estimate import NORMAL_95, GapEstimate, GapStatus, LastContact, no_estimate
@@ -277,10 +277,15 @@ def _prepared(
     window: Window, theta_m: Array, axis: Axis, settings: OutputErrorSettings, machine: FactorPrior | None
 ) -> tuple[Problem, float]:
     """The window with its model, and the noise (rad) of the motor's angle (n,) that was smoothed for it."""
-    swings = not follows(axis)
-    motor = MotorAngle(theta_m, 0.0) if swings else without_noise(theta_m, _count_of_motor(axis, theta_m))
+    motor = _seen_by_load(theta_m, _count_of_motor(axis, theta_m)) if follows(axis) else MotorAngle(theta_m, 0.0)
     learnt = None if machine is None else machine.covariance
     return _problem(window, motor.angle, axis, settings, learnt), motor.noise
+
+
+def _seen_by_load(theta_m: Array, count: float) -> MotorAngle:
+    """Angle (N,) of a motor without noise and counts (rad) of its encoder."""
+    quiet = without_noise(theta_m, count)
+    return quiet if quiet.angle is not theta_m else quiet._replace(angle=without_counts(theta_m, count))
 
 
 def _checked(window: Window, axis: Axis | Servo) -> Array:

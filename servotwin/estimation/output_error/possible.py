@@ -22,14 +22,15 @@ from servotwin.estimation.output_error.fit import Fit, Search, descend, only_rou
 from servotwin.estimation.output_error.models import DELAY, HALF, RATIO, Flags
 from servotwin.plant.signals import Array
 
-_FINEST, _COARSEST, _GROWTH = 1e-4, 0.01, 1.15  # steps from one gap to the next, of the gap, and their growth
-_WIDEST = 2.0  # factor between the best gap and the farthest ones
+_COARSEST, _FINEST, _GROWTH = 0.01, 0.01, 1.15  # steps from one gap to the next: of the best gap; of that; growth
+_WIDEST, _NARROWEST = 2.0, 0.99  # times the best gap: the farthest ones, and how far smaller ones are from it
+_TRAVEL, _COUNTS, _PART = 2e-3, 2.0, 0.01  # of the motor's travel; counts; of either: a step, where that is more
 _STEPS, _DEEPER = 15, 8
 _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
 INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
 _IMPOSSIBLE = 200.0  # rise of the cost in noise, over its variance; in rounding the cost doubles
 _WALL = 0.1  # of that rise: what may be a wall
-_PATIENCE = 0.03  # logarithm of a ratio of gaps
+_PATIENCE = 3.0  # steps
 
 
 class PossibleHalf(NamedTuple):
@@ -139,19 +140,26 @@ def _profile(found: Search, side: float, rise: float) -> Iterator[Fit]:
     They end where none of the last ones has cost less than `rise` more than the best. Minima a sample of delay apart
     have walls between them where the motor's speed jumps.
     """
-    free, best = found.free.copy(), float(found.best.values[HALF])
+    free, best, beyond = found.free.copy(), float(found.best.values[HALF]), _beyond(found)
     free[HALF] = False
-    fit, share, likely = found.best, 0.0, 0.0
-    step = min(_COARSEST, max(_FINEST, found.best.std(HALF, found.free) / best))
-    while share < min(math.log(_WIDEST), likely + _PATIENCE):
-        share, step = share + step, min(_COARSEST, _GROWTH * step)
+    farthest = max(_WIDEST * best, best + beyond) - best if side > 0.0 else _NARROWEST * best
+    coarsest = max(_COARSEST * best, _PART * beyond)
+    fit, away, likely = found.best, 0.0, 0.0
+    step = min(coarsest, max(_FINEST * coarsest, found.best.std(HALF, found.free)))
+    while away < min(farthest, likely + _PATIENCE * coarsest):
+        away, step = min(farthest, away + step), min(coarsest, _GROWTH * step)
         start = fit.values.copy()
-        start[HALF] = best * math.exp(side * share)
+        start[HALF] = best + side * away
         fit = descend(found.problem, start, found.noise, free, _STEPS)
         if fit.cost > found.best.cost + _WALL * rise:
             fit = min((fit, *_a_sample_away(found, fit, free)), key=lambda one: one.cost)
-        likely = share if fit.cost < found.best.cost + rise else likely
+        likely = away if fit.cost < found.best.cost + rise else likely
         yield fit
+
+
+def _beyond(found: Search) -> float:
+    """Distance (m or rad at the load) of half gaps: where it is possible, no gap counts as known, however small."""
+    return max(_TRAVEL * float(np.ptp(found.problem.drive)), _COUNTS * found.problem.count)
 
 
 def _a_sample_away(found: Search, fit: Fit, free: Flags) -> Iterator[Fit]:
