@@ -40,7 +40,7 @@ def measure(store: Store, together: int, rounds: int) -> StoreCosts:
     def note(*_: object) -> None:
         made[0] += 1
 
-    for engine in {id(each): each for each in store.engines}.values():
+    for engine in store.engines.distinct:
         sa.event.listen(engine, "before_cursor_execute", note)
 
     def timed(what: str, call: Callable[[], _Result]) -> _Result:

@@ -8,9 +8,10 @@ import sqlite3
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 from weakref import WeakSet
 
 import sqlalchemy as sa
@@ -121,7 +122,8 @@ class OpenConnections:
                 line.shutdown(socket.SHUT_RDWR)
 
 
-class Engines(NamedTuple):
+@dataclass(frozen=True)
+class Engines:
     """Engines for writing and reading; SQLite has one writing connection, which serialises writers.
 
     Attributes
@@ -135,10 +137,15 @@ class Engines(NamedTuple):
     reader: sa.Engine
     opened: OpenConnections
 
+    @property
+    def distinct(self) -> tuple[sa.Engine, ...]:
+        """Writer and reader; one where they are the same."""
+        return (self.writer,) if self.writer is self.reader else (self.writer, self.reader)
+
     def dispose(self) -> None:
         """Close every connection."""
-        self.reader.dispose()
-        self.writer.dispose()
+        for engine in self.distinct:
+            engine.dispose()
 
 
 def engines_of(address: sa.URL) -> Engines:

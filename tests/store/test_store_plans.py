@@ -32,7 +32,7 @@ def traced_store(tmp_path: Path) -> tuple[Store, dict[str, Any]]:
         many = bool(parameters) and isinstance(parameters[0], tuple)
         statements.setdefault(statement, parameters[0] if many else parameters)
 
-    for engine in store.engines:
+    for engine in store.engines.distinct:
         sa.event.listen(engine, "before_cursor_execute", note)
     return store, statements
 

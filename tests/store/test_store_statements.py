@@ -29,7 +29,7 @@ def counted(store: Store) -> Iterator[list[str]]:
         if not statement.startswith("BEGIN"):
             made.append(statement)
 
-    engines = {id(engine): engine for engine in store.engines}.values()
+    engines = store.engines.distinct
     for engine in engines:
         sa.event.listen(engine, "before_cursor_execute", note)
     try:
