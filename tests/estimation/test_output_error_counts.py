@@ -238,7 +238,7 @@ def test_a_lag_that_averages_the_motor_s_rounding_is_not_taken_for_one(seed: int
 
 @pytest.mark.parametrize("seed", [5, 20])
 def test_gaps_far_above_the_best_one_of_a_small_gap_are_weighed(seed: int) -> None:
-    """Noise of four counts: the best fits of 0.2 deg are at 0.01 and 0.03 deg, and gaps up to twice as wide alone were
+    """In loud noise the best fits of 0.2 deg are at 0.01 and 0.03 deg, and gaps up to twice as wide alone were
     tried: 0.02 and 0.04 deg were said, within 0.08 deg."""
     axis, gap = Axis.preset("stepper-stage"), math.radians(0.2)
     run = simulate(

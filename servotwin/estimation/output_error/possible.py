@@ -20,11 +20,12 @@ import numpy as np
 
 from servotwin.estimation.output_error.fit import Fit, Search, descend, only_rounding
 from servotwin.estimation.output_error.models import DELAY, HALF, RATIO, Flags
+from servotwin.estimation.output_error.search import rms
 from servotwin.plant.signals import Array
 
 _COARSEST, _FINEST, _GROWTH = 0.01, 0.01, 1.15  # steps from one gap to the next: of the best gap; of that; growth
 _WIDEST, _NARROWEST = 2.0, 0.99  # times the best gap: the farthest ones, and how far smaller ones are from it
-_TRAVEL, _COUNTS, _PART = 2e-3, 2.0, 0.01  # of the motor's travel; counts; of either: a step, where that is more
+_HIDDEN, _PART = 2.0, 0.01  # times what the best fit leaves: gaps that it may hide; of that: a step, where that is more
 _STEPS, _DEEPER = 15, 8
 _BELL = math.sqrt(2.0 * math.pi)  # standard deviations: width of a normal distribution over its height
 INDEPENDENT = 30.0  # errors of rounding; from 10 to 100 no accepted gap of 120 windows was outside its interval
@@ -158,8 +159,8 @@ def _profile(found: Search, side: float, rise: float) -> Iterator[Fit]:
 
 
 def _beyond(found: Search) -> float:
-    """Distance (m or rad at the load) of half gaps: where it is possible, no gap counts as known, however small."""
-    return max(_TRAVEL * float(np.ptp(found.problem.drive)), _COUNTS * found.problem.count)
+    """Distance (m or rad at the load) of half gaps that noise of the position may hide, however small the best one."""
+    return _HIDDEN * rms(found.best.raw)
 
 
 def _a_sample_away(found: Search, fit: Fit, free: Flags) -> Iterator[Fit]:
