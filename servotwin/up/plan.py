@@ -41,7 +41,7 @@ class ServoPlan(msgspec.Struct, frozen=True):
 
 
 class Plan(Protocol):
-    """What a new folder is made from."""
+    """Source of a new folder: its servos and their files."""
 
     @property
     def servos(self) -> tuple[ServoPlan, ...]:
