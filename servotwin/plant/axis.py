@@ -26,14 +26,14 @@ from servotwin.plant.actuator import Actuator, ShaftMatrices, static_torque
 from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
 from servotwin.plant.basis import BacklashKind, Guide, Stribeck
 from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
-from servotwin.plant.law_loop import LawLoop, check_encoders
+from servotwin.plant.law_loop import LawLoop
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, ROTARY, Load
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.numbers import tolerance_of
 from servotwin.plant.rest import Rest, rest_under_force
 from servotwin.plant.scaled_parts import scaled_parts
-from servotwin.plant.sensors import MOTOR, Sensors
+from servotwin.plant.sensors import MOTOR, Sensors, check_encoders
 from servotwin.plant.signals import LARGEST_GAP, Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.plant.transmission import Transmission

@@ -193,6 +193,8 @@ def read_parts(table: Table, folder: Path, tuned: bool = True) -> Parts:
     load: Load = read_kind(tables["load"], LOADS, Path())
     law = _read_controller(described, folder, actuator.unit, motion, transmission.p, tuned)
     encoders = table.table("sensors").in_units(units_of(actuator.unit, motion))
+    if motion == LINEAR and "position_counts_per_rev" in encoders.values:
+        raise encoders.invalid("position_counts_per_rev", "position_resolution_m, for a linear load makes no turns")
     sensors: Sensors = read(encoders, Sensors)
     encoders.done()
     table.done()

@@ -8,11 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from servotwin.control.laws import Law
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearState, linear_tick
 from servotwin.errors import InvalidInput
-from servotwin.plant.basis import PlantNumbers
 from servotwin.plant.linear import Complex, LinearSystem, zero_order_hold
 from servotwin.plant.margins import Margins, margins_of_response, search_frequencies
 from servotwin.plant.signals import Array
@@ -230,18 +228,3 @@ def _zeros(system: LinearSystem) -> Complex:
     # A zero at infinity comes out infinite or huge.
     largest = _ZERO_AT_INFINITY * max(float(np.abs(A).max()), 1.0)
     return np.asarray(found[np.isfinite(found) & (np.abs(found) < largest)], dtype=complex)
-
-
-def check_encoders(plant: PlantNumbers, law: Law) -> None:
-    """Refuse a linear law that reads an encoder which the plant's controller does not have.
-
-    Raises
-    ------
-    InvalidInput
-        The law reads the load, and the controller acts on the motor's encoder.
-    """
-    if isinstance(law, LinearLaw) and plant.at_motor and law.reads("y_load"):
-        raise InvalidInput(
-            'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be '
-            '"load", or on = "motor" in [controller] of a cascade'
-        )

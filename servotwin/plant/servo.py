@@ -28,6 +28,7 @@ from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
 from servotwin.plant.numbers import tolerance_of
+from servotwin.plant.sensors import Sensors
 from servotwin.plant.servo_changes import PerMass, ServoChanges
 from servotwin.plant.signals import LARGEST_GAP, Array
 from servotwin.plant.structure import Chain, Structure, chain
@@ -255,6 +256,11 @@ class Servo:
     def takes_friction(self) -> bool:
         """True where Coulomb friction on the motor can be simulated."""
         return True
+
+    @property
+    def sensors(self) -> Sensors:
+        """Encoders, whose readings are off by nothing but their counts."""
+        return Sensors(self.encoder_resolution, self.position_resolution)
 
     def with_position_resolution(self, resolution: float) -> Servo:
         """A copy whose position sensor has another resolution, m."""

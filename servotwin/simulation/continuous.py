@@ -22,6 +22,7 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.plant.turns import direction_after, turns_of
 from servotwin.simulation.inputs import RunInputs, about, quantised
+from servotwin.simulation.readings import PositionErrors
 from servotwin.simulation.start import holding_integral, holding_states, plant_start, set_states
 
 _NOISE_BLOCK = 4096
@@ -36,7 +37,7 @@ class ContinuousEngine:
     inputs: RunInputs
     theta_d0: float = 0.0
     refine: int = 1
-    noise: NoiseSource | None = None
+    noise: NoiseSource | PositionErrors | None = None
 
     def __post_init__(self) -> None:
         _refuse_rate_limit(self.controller)

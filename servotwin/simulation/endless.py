@@ -156,8 +156,15 @@ class OpenLoopPlant:
     def sample(self) -> tuple[float, float, float]:
         """Reference (m), motor angle (rad) and measured position (m) of the present sample."""
         here, state = self._engine.base - self._first, self._engine.state
-        angle, position = float(state[self._theta_m]), float(state[self._position]) + self._noise[here]
-        return self._reference[here], _rounded(angle, self._finest[0]), _rounded(position, self._finest[1])
+        position, late = float(state[self._position]) + self._noise[here], self._engine.port.late
+        shown = float(late[self._engine.base % late.size]) if late.size else _rounded(position, self._finest[1])
+        return self._reference[here], self._angle(float(state[self._theta_m])), shown
+
+    def _angle(self, angle: float) -> float:
+        """Reading of the motor's encoder at the present sample, where the motor has an angle."""
+        if self._machine.simulation.readings is None:
+            return _rounded(angle, self._finest[0])
+        return float(self._machine.measured("theta_m", self.index, self.index + 1)[0])
 
     def hold(self, voltage: float) -> None:
         """Advance the plant to the next sample under a voltage (V)."""

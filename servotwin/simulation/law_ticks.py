@@ -13,7 +13,7 @@ from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.tables import Tables
-from servotwin.simulation.ticks import Output, Port, TickInputs, measured, to_hold, write_sample
+from servotwin.simulation.ticks import Output, Port, TickInputs, in_turn, measured, write_sample
 
 tick = verbatim(linear_tick.linear_tick)
 
@@ -25,6 +25,7 @@ class TwoSensors(NamedTuple):
     motor: int  # state of the motor's angle
     resolution: float  # rad per count of its encoder
     counted: int  # 1: it counts, 0: it is ideal
+    late: Array  # (d,) readings of it that are not shown yet, tick i's at i % d
 
 
 @inlined
@@ -50,8 +51,9 @@ def take_law_tick(
     k, at = i - tick_inputs.first, np.uint64(i - output.first_tick)
     zone = np.uint64(k & tick_inputs.zone_mask)
     noise = tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)]
-    y_load = measured(x[sensors.port.position], noise, sensors.port)
-    y_motor = motor_angle(x[sensors.motor], sensors)
+    y_load = in_turn(i, measured(x[sensors.port.position], noise, sensors.port), sensors.port.late)
+    error = tick_inputs.motor[np.uint64(k & tick_inputs.motor_mask)]
+    y_motor = in_turn(i, motor_angle(x[sensors.motor] + error, sensors), sensors.late)
     now = LinearParameters(
         parameters.advance,
         parameters.output,
@@ -85,7 +87,7 @@ def law_tick_and_record(
     if base % port.tick_every == 0:
         i = base // port.tick_every
         state = take_law_tick(i, x, parameters, state, sensors, tick_inputs, output)
-        x[port.voltage] = to_hold(i, state.command, port)
+        x[port.voltage] = in_turn(i, state.command, port.delayed)
     if base % port.record_every == 0:
         write_sample(base // port.record_every, x, port, output)
     return state
@@ -116,7 +118,7 @@ def run_law_ticks(
         if base % port.tick_every == 0:
             i = base // port.tick_every
             state = take_law_tick(i, x, parameters, state, sensors, tick_inputs, output)
-            x[port.voltage] = to_hold(i, state.command, port)
+            x[port.voltage] = in_turn(i, state.command, port.delayed)
         if base % port.record_every == 0:
             write_sample(base // port.record_every, x, port, output)
         for _ in range(port.searches):

@@ -51,7 +51,7 @@ def advances_in_blocks(servo: Plant, controller: Controller, inputs: RunInputs, 
     """True for a noise-free run that `LiftedEngine` can do: a sampled law, an ideal sensor, ticks at every sample, and
     many ticks, inputs of few pieces with a tolerance that is constant in each; a friction feedforward needs such a
     reference."""
-    if controller.sample_rate is None or servo.position_resolution != 0.0:
+    if controller.sample_rate is None or servo.position_resolution != 0.0 or servo.sensors.fed_back(servo.p).delay:
         return False
     if controller.friction_feedforward != 0.0 and degree(inputs.reference) > 0:
         return False

@@ -37,7 +37,8 @@ def _responses_for(automaton: Automaton, step: float, searches: int, input_index
 def fits_plant_blocks(engine: SampledEngine) -> bool:
     """True for a run of many ticks, with ticks at every sample, that has not begun."""
     ticks = (engine.samples - 1) * engine.record_every
-    return engine.tick_every == 1 and engine.port.searches <= _MOST_SEARCHES and ticks >= _LEAST_TICKS
+    instant = engine.tick_every == 1 and engine.port.late.size == 0
+    return instant and engine.port.searches <= _MOST_SEARCHES and ticks >= _LEAST_TICKS
 
 
 def in_plant_blocks(engine: SampledEngine) -> PlantBlockEngine:

@@ -23,7 +23,7 @@ from servotwin.hybrid.response import (
     hold_input,
 )
 from servotwin.hybrid.tables import Tables
-from servotwin.simulation.ticks import Output, Port, TickInputs, measured, tick_between, to_hold
+from servotwin.simulation.ticks import Output, Port, TickInputs, in_turn, measured, tick_between
 
 _LAW = len(LawState._fields)
 LAW_STATES = _LAW * TICKS
@@ -173,7 +173,7 @@ def run_plant_blocks(
             state = stored(law_states, last)
             x[port.voltage] = output.states[0, tick + last - output.first_sample]
         for j in range(last + 1 if port.delayed.size > 0 else 0):
-            to_hold(tick + j, law_states[j * _LAW + 3], port)
+            in_turn(tick + j, law_states[j * _LAW + 3], port.delayed)
         tick += calm
         fresh = calm < TICKS
         recent = 0.0 if fresh else output.states[0, tick - 1 - output.first_sample]

@@ -12,7 +12,8 @@ from servotwin.hybrid.automaton import Array
 from servotwin.plant.display_units import command_unit, position_unit
 from servotwin.plant.plants import Plant
 from servotwin.runtime.notebook import html_table
-from servotwin.simulation.inputs import RunInputs, quantised
+from servotwin.simulation.inputs import RunInputs
+from servotwin.simulation.readings import Readings, motor_readings
 from servotwin.simulation.views import Panel, arrow_table, pandas_table, stacked_figure
 
 if TYPE_CHECKING:
@@ -33,6 +34,7 @@ class Run:
     samples: int
     channel: Callable[[str, int, int], Array] = field(repr=False)
     list_events: Callable[[], list[tuple[float, str, int, bool]]] = field(repr=False)
+    readings: Readings | None = field(default=None, repr=False)
     _cache: dict[str, Array] = field(default_factory=dict, repr=False)
 
     def _get(self, name: str, make: Callable[[], Array]) -> Array:
@@ -119,7 +121,7 @@ class Run:
     def measured(self, name: str) -> Array:
         """A channel as its sensor measures it: theta_m, position, voltage or reference."""
         if name == "theta_m":
-            return quantised(self.theta_m, self.servo.encoder_resolution)
+            return motor_readings(self.servo, self.readings, lambda a, b: self.theta_m[a:b], 0, self.samples)
         return {"position": self.measured_position, "voltage": self.voltage, "reference": self.reference}[name]
 
     def __repr__(self) -> str:

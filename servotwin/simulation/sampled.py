@@ -6,7 +6,7 @@ Contacts of the gap inside a sample are located.
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -30,9 +30,11 @@ from servotwin.hybrid.trajectory import ON_GRID, Jump, ZenoError, schedule_of, t
 from servotwin.plant.automaton import degree, sampled_plant
 from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.plants import Plant
+from servotwin.plant.sensors import Encoder
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero
 from servotwin.simulation.inputs import RunInputs, quantised, whole_ratio
+from servotwin.simulation.readings import NoiseBuffer, PositionErrors, Readings
 from servotwin.simulation.start import plant_start, set_states, started
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
@@ -54,6 +56,7 @@ class SampledEngine:
     rng: np.random.Generator
     keep: int | None = None
     delay: int = 0
+    readings: Readings | None = None
 
     def __post_init__(self) -> None:
         assert self.controller.sample_rate is not None
@@ -73,8 +76,7 @@ class SampledEngine:
         self.record = new_record(len(self.state), EVENTS_PER_STEP + 8, 4 * EVENTS_PER_STEP)
         self.scratch = new_scratch(self.tables)
         self.law_state, self.parameters = self._started(start.command)
-        source = None if self.noise is None else self.noise.source(self.controller.sample_rate, self.rng)
-        self.draws = NoiseBuffer(source, ahead=0 if self.keep is None else _CHUNK)
+        self.draws = NoiseBuffer(self._noise_source(), ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
@@ -103,7 +105,19 @@ class SampledEngine:
             searches,
             len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
             np.full(self.delay, self._applied),
+            np.full(self._fed_back.late(self.tick_rate), self._reading()),
         )
+
+    def _noise_source(self) -> NoiseSource | PositionErrors | None:
+        """Source of what the measured position is off by at each tick."""
+        if self.readings is not None:
+            return self.readings.source(self.tick_rate, self.tick_every, self.rng)
+        return None if self.noise is None else self.noise.source(self.tick_rate, self.rng)
+
+    @property
+    def _fed_back(self) -> Encoder:
+        """Encoder of the measured position."""
+        return self.servo.sensors.fed_back(self.servo.p)
 
     def _recorded(self) -> list[int]:
         """States that are written at every sample."""
@@ -161,9 +175,13 @@ class SampledEngine:
         count = max(last - first, 0)
         enter, leave = self._thresholds(first, count)
         reference, noise = self._on_ticks(self.inputs.reference, first, count), self.draws.take(count)
-        return TickInputs(
-            first, reference, noise, enter, leave, *(0 if each.size == 1 else -1 for each in (reference, noise, enter))
-        )
+        motor = self._motor_errors(first, count)
+        masks = (0 if each.size == 1 else -1 for each in (reference, noise, enter, motor))
+        return TickInputs(first, reference, noise, enter, leave, motor, *masks)
+
+    def _motor_errors(self, _first: int, _count: int) -> Array:
+        """Errors (rad) of the motor's encoder at ticks, which this law does not read."""
+        return np.zeros(1)
 
     def _on_ticks(self, signal: PiecewiseCubic, first: int, count: int) -> Array:
         """Values at ticks; one value where it is constant."""
@@ -271,16 +289,12 @@ class SampledEngine:
         tick = -(-self.base // self.tick_every)
         time = tick / self.tick_rate
         planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
-        # The transfer needs the measurement of the tick that is due; that tick then takes the same noise again.
-        noise = self.draws.take(1)
-        self.draws.put_back(noise)
-        measured = float(self.plant.rows["sensed"][0] @ self.state + noise[0])
         self.law_state = law.transfer(
             self.controller.law(planned),
             controller.law(planned if tolerance is None else tolerance),
             self.law_state,
             float(self.inputs.reference.value(time)),
-            float(quantised(np.array(measured), self.servo.position_resolution)),
+            self._shown(self._noise_ahead()),
         )
         self.controller, self.parameters = controller, controller.law(None)
 
@@ -306,9 +320,25 @@ class SampledEngine:
         return out
 
     def _measured_now(self) -> float:
-        """Measurement of the present state, without noise."""
-        present = self.channel("sensed", self.index, self.index + 1)
-        return float(quantised(present, self.servo.position_resolution)[0])
+        """Measurement of the present state, without a noise that is still to be drawn."""
+        step = np.array([self.base])
+        return self._shown(0.0 if self.readings is None else float(np.ravel(self.readings.position.at(step))[0]))
+
+    def _noise_ahead(self) -> float:
+        """Noise of the tick that is due, which takes it again."""
+        noise = self.draws.take(1)
+        self.draws.put_back(noise)
+        return float(noise[0])
+
+    def _reading(self, noise: float = 0.0) -> float:
+        """Reading of the position sensor in the present state."""
+        present = np.array(self.plant.rows["sensed"][0] @ self.state + noise)
+        return float(quantised(present, self.servo.position_resolution))
+
+    def _shown(self, noise: float = 0.0) -> float:
+        """Reading that the tick that is due gets: of a late sensor that of some ticks ago."""
+        late = self.port.late
+        return float(late[-(-self.base // self.tick_every) % late.size]) if late.size else self._reading(noise)
 
     def events(self) -> list[tuple[float, str, int, bool]]:
         """Events of the plant and of the ticks, in time order."""
@@ -371,26 +401,3 @@ def _shifted_output(output: Output, sample: int, tick_every: int, record_every: 
         # Source and destination overlap: the copy is needed.
         values[..., : values.shape[-1] - by] = values[..., by:].copy()
     return output._replace(first_sample=sample, first_tick=tick)
-
-
-@dataclass
-class NoiseBuffer:
-    """Noise for tick after tick, drawn at least `ahead` values at a time; the block size changes no value."""
-
-    source: NoiseSource | None
-    ahead: int
-    drawn: Array = field(default_factory=lambda: np.zeros(0))
-
-    def take(self, count: int) -> Array:
-        """Noise (m) of the next ticks; one zero without noise."""
-        if self.source is None:
-            return np.zeros(1)
-        if (missing := count - self.drawn.size) > 0:
-            self.drawn = np.concatenate([self.drawn, self.source.block(max(missing, self.ahead))])
-        values, self.drawn = self.drawn[:count], self.drawn[count:]
-        return values
-
-    def put_back(self, values: Array) -> None:
-        """Return noise that was taken for ticks that are still to come."""
-        if self.source is not None:
-            self.drawn = np.concatenate([values, self.drawn])

@@ -81,11 +81,12 @@ class SampledGroup:
 
 
 def in_blocks(members: SampledMembers, span: SampledSpan) -> list[bool]:
-    """True for each member that advances in blocks: a filtered PID, and ticks at every sample of the output; with a
-    friction feedforward a reference that is constant in every piece."""
+    """True for each member that advances in blocks: a filtered PID with readings of the instant, and ticks at every
+    sample of the output; with a friction feedforward a reference that is constant in every piece."""
     constant = degree(span.shape) == 0
     # Members share laws, and many share a servo.
-    servos = {key: not _hangs(servo) for key, servo in {id(each): each for each in members.servos}.items()}
+    plants = {id(each): each for each in members.servos}
+    servos = {key: not (_hangs(servo) or servo.sensors.fed_back(servo.p).delay) for key, servo in plants.items()}
     laws = {
         key: _in_blocks(law, span, constant) for key, law in {id(each): each for each in members.controllers}.items()
     }

@@ -8,11 +8,12 @@ import numpy as np
 
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearParameters, LinearState
+from servotwin.hybrid.automaton import Array
 from servotwin.simulation.inputs import quantised
 from servotwin.simulation.law_ticks import TwoSensors, law_tick_and_record, run_law_ticks
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.start import linear_start
-from servotwin.simulation.ticks import TickInputs
+from servotwin.simulation.ticks import Port, TickInputs
 
 
 @dataclass
@@ -22,7 +23,8 @@ class SampledLawEngine(SampledEngine):
     controller: LinearLaw  # type: ignore[assignment]
 
     def _started(self, command: float) -> tuple[LinearState, LinearParameters]:
-        return linear_start(self.controller, *self._present(), command), _with_arrays(self.controller.parameters())
+        start = linear_start(self.controller, self._motor_reading(0), self._reading(), command)
+        return start, _with_arrays(self.controller.parameters())
 
     @property
     def _applied(self) -> float:
@@ -33,17 +35,27 @@ class SampledLawEngine(SampledEngine):
         """Port with the motor's encoder."""
         angle = self.plant.automaton.names.index("theta_m")
         counted = 1 if self.servo.encoder_resolution > 0.0 else 0
-        return TwoSensors(self.port, angle, self.servo.encoder_resolution, counted)
+        return TwoSensors(self.port, angle, self.servo.encoder_resolution, counted, self.motor_late)
 
-    def _present(self, noise: float = 0.0) -> tuple[float, float]:
-        """Measurements (motor, load) of the present state."""
-        load = np.array(self.plant.rows["sensed"][0] @ self.state + noise)
-        motor = np.array(self.plant.rows["theta_m"][0] @ self.state)
-        resolutions = (self.servo.encoder_resolution, self.servo.position_resolution)
-        y_motor, y_load = (
-            float(quantised(value, each)) for value, each in zip((motor, load), resolutions, strict=True)
-        )
-        return y_motor, y_load
+    def _make_port(self, searches: int) -> Port:
+        late = self.servo.sensors.motor.late(self.tick_rate)
+        self.motor_late = np.full(late, self._motor_reading(0))
+        return super()._make_port(searches)
+
+    def _motor_errors(self, first: int, count: int) -> Array:
+        if self.readings is None:
+            return np.zeros(1)
+        return np.ravel(self.readings.motor.at(self.tick_every * np.arange(first, first + count)))
+
+    def _motor_reading(self, tick: int) -> float:
+        """Reading of the motor's encoder in the present state, at a tick."""
+        angle = self.plant.rows["theta_m"][0] @ self.state + self._motor_errors(tick, 1)[0]
+        return float(quantised(np.array(angle), self.servo.encoder_resolution))
+
+    def _motor_shown(self) -> float:
+        """Reading of the motor's encoder that the tick that is due gets."""
+        tick, late = -(-self.base // self.tick_every), self.motor_late
+        return float(late[tick % late.size]) if late.size else self._motor_reading(tick)
 
     def flow(self, end: int, tick_inputs: TickInputs) -> None:
         """Advance to a base step; `tick_inputs` covers the ticks on the way, while the gap's cubic stays the same."""
@@ -75,16 +87,10 @@ class SampledLawEngine(SampledEngine):
         None."""
         time = -(-self.base // self.tick_every) / self.tick_rate
         planned = None if self.inputs.tolerance is None else float(self.inputs.tolerance.value(time))
-        # The transfer needs the measurement of the tick that is due; that tick then takes the same noise again.
-        noise = self.draws.take(1)
-        self.draws.put_back(noise)
-        inputs = (float(self.inputs.reference.value(time)), *self._present(float(noise[0])))
+        inputs = (float(self.inputs.reference.value(time)), self._motor_shown(), self._shown(self._noise_ahead()))
         tolerances = (planned, planned if tolerance is None else tolerance)
         self.law_state = controller.transfer(self.controller, self.law_state, inputs, tolerances)
         self.controller, self.parameters = controller, _with_arrays(controller.parameters())
-
-    def _measured_now(self) -> float:
-        return self._present()[1]
 
 
 def _with_arrays(parameters: LinearParameters) -> LinearParameters:

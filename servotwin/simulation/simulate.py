@@ -12,14 +12,15 @@ from servotwin.control.laws import AnyController, Law, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
-from servotwin.plant.law_loop import check_encoders
-from servotwin.plant.noise import Noise
+from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.plants import Plant
+from servotwin.plant.sensors import check_encoders
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
-from servotwin.simulation.inputs import RunInputs, quantised, raised, spliced, whole_ratio
+from servotwin.simulation.inputs import RunInputs, raised, spliced, whole_ratio
 from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
+from servotwin.simulation.readings import PositionErrors, Readings, motor_readings
 from servotwin.simulation.run import Run
 from servotwin.simulation.sampled import SampledEngine
 from servotwin.simulation.sampled_law import SampledLawEngine
@@ -63,7 +64,8 @@ class Simulation:
         Hz, of what is recorded. By default 5000 Hz, or the controller's own rate where the two do not divide one
         another.
     noise : Noise, optional
-        On the measured position; a continuous controller sees it constant between samples.
+        On the measured position, in place of that of its encoder; a continuous controller sees it constant between
+        samples.
     seed : int
         Seed of the noise.
     input_bias : float
@@ -119,18 +121,29 @@ class Simulation:
         self._check_keep()
         if delay < 0 or (delay > 0 and self.controller.sample_rate is None):
             raise InvalidInput(f"delay = {delay!r} samples: must be 0 or more, and 0 for a continuous controller")
+        self.readings = self._readings(noise, rng)
         self.engine: Engine = self._made(theta_d0, noise, rng, delay)
+
+    def _readings(self, noise: Noise | None, rng: np.random.Generator) -> Readings | None:
+        """Errors of the encoders at the steps of the simulation, which are the shorter of samples and ticks."""
+        rate = max(self.inputs.sample_rate, self.controller.sample_rate or 0.0)
+        return Readings.of(self.servo, rate, round(rate / self.inputs.sample_rate), noise, rng)
 
     def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
         servo, law, inputs, samples, keep = self.servo, self.controller, self.inputs, self.samples, self.keep
         if noise is not None and isinstance(law, LinearLaw) and not law.reads("y_load"):
             raise InvalidInput("noise is on the load's encoder, which the controller does not read: noise must be None")
+        readings = self.readings
         if law.sample_rate is None:
-            source = None if noise is None else noise.source(inputs.sample_rate, rng)
+            source: NoiseSource | PositionErrors | None = None
+            if readings is not None:
+                source = readings.source(inputs.sample_rate, 1, rng)
+            elif noise is not None:
+                source = noise.source(inputs.sample_rate, rng)
             return ContinuousEngine(servo, law, inputs, theta_d0, noise=source)
         if isinstance(law, LinearLaw):
-            return SampledLawEngine(servo, law, inputs, theta_d0, samples, noise, rng, keep, delay)
-        return SampledEngine(servo, law, inputs, theta_d0, samples, noise, rng, keep, delay)
+            return SampledLawEngine(servo, law, inputs, theta_d0, samples, noise, rng, keep, delay, readings)
+        return SampledEngine(servo, law, inputs, theta_d0, samples, noise, rng, keep, delay, readings)
 
     @property
     def index(self) -> int:
@@ -240,8 +253,13 @@ class Simulation:
             )
         if name == "reference":
             return self.inputs.reference.on(self.inputs.times(first, last))
-        values = self.engine.channel("measured_position" if name == "position" else name, first, last)
-        return quantised(values, self.servo.encoder_resolution) if name == "theta_m" else values
+        if name == "theta_m":
+
+            def angle(begin: int, end: int) -> Array:
+                return self.engine.channel("theta_m", begin, end)
+
+            return motor_readings(self.servo, self.readings, angle, first, last, oldest)
+        return self.engine.channel("measured_position" if name == "position" else name, first, last)
 
     def run(self) -> Run:
         """Everything up to the present sample.
@@ -253,7 +271,9 @@ class Simulation:
         """
         if self.keep is not None:
             raise InvalidInput(f"keep = {self.keep} samples: a simulation that stores only its last samples has no run")
-        return Run(self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events)
+        return Run(
+            self.servo, self.inputs, self.engine.index + 1, self.engine.channel, self.engine.events, self.readings
+        )
 
 
 def _recorded(rate: float | None) -> float:
@@ -296,7 +316,7 @@ def simulate(
         Hz, of the samples that are returned. By default 5000 Hz, or the controller's own rate where the two do not
         divide one another.
     noise : Noise, optional
-        Noise on the measured position.
+        Noise on the measured position, in place of that of its encoder.
     seed : int or numpy.random.Generator
         Seed of the noise.
     input_bias : float
@@ -317,7 +337,8 @@ def simulate(
     simulation = Simulation(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
     )
-    run = _run_in_blocks(simulation, theta_d0) if noise is None else None
+    exact = noise is None and simulation.readings is None
+    run = _run_in_blocks(simulation, theta_d0) if exact else None
     return run or _run_plant_in_blocks(simulation) or _run_by_steps(simulation)
 
 
@@ -335,7 +356,9 @@ def _run_plant_in_blocks(simulation: Simulation) -> Run | None:
         return None
     engine = in_plant_blocks(simulation.engine)
     engine.advance(engine.samples - 1)
-    return Run(simulation.servo, simulation.inputs, simulation.samples, engine.channel, engine.events)
+    return Run(
+        simulation.servo, simulation.inputs, simulation.samples, engine.channel, engine.events, simulation.readings
+    )
 
 
 def _run_in_blocks(simulation: Simulation, theta_d0: float) -> Run | None:

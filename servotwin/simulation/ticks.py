@@ -31,6 +31,7 @@ class Port(NamedTuple):
     searches: int  # search steps per base step
     room: int  # events after which the record counts as full
     delayed: Array  # (d,) voltages that are computed but not yet applied, tick i's at i % d; empty: no delay
+    late: Array  # (d,) readings of the position sensor that are not shown yet, likewise
 
 
 class TickInputs(NamedTuple):
@@ -41,9 +42,11 @@ class TickInputs(NamedTuple):
     noise: Array
     enter: Array
     leave: Array
+    motor: Array  # rad, errors of the motor's encoder
     reference_mask: int
     noise_mask: int
     zone_mask: int
+    motor_mask: int
 
 
 class Output(NamedTuple):
@@ -64,6 +67,17 @@ def measured(position: float, noise: float, port: Port) -> float:
     for _ in range(port.counted):
         y = np.round(y / port.resolution) * port.resolution
     return y
+
+
+@inlined
+def in_turn(i: int, value: float, waiting: Array) -> float:
+    """The value of `waiting.size` ticks ago; that of tick i waits in its place."""
+    if waiting.size == 0:
+        return value
+    place = i % waiting.size
+    earlier = waiting[place]
+    waiting[place] = value
+    return earlier
 
 
 @inlined
@@ -110,22 +124,12 @@ def take_tick(
     k, at = i - tick_inputs.first, np.uint64(i - output.first_tick)
     zone = np.uint64(k & tick_inputs.zone_mask)
     y = measured(position, tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)], port)
+    y = in_turn(i, y, port.late)
     reference = tick_inputs.reference[np.uint64(k & tick_inputs.reference_mask)]
     state = tick_between(parameters, tick_inputs.enter[zone], tick_inputs.leave[zone], state, reference, y)
     output.measured[at] = y
     output.active[at] = 1 if state.active > 0.5 else 0
     return state
-
-
-@inlined
-def to_hold(i: int, voltage: float, port: Port) -> float:
-    """The voltage to hold from tick i on: that of `delayed.size` ticks ago."""
-    if port.delayed.size == 0:
-        return voltage
-    place = i % port.delayed.size
-    delayed = port.delayed[place]
-    port.delayed[place] = voltage
-    return delayed
 
 
 @inlined
@@ -143,7 +147,7 @@ def tick_and_record(
     if base % port.tick_every == 0:
         i, position = base // port.tick_every, x[port.position]
         state = take_tick(i, position, parameters, state, port, tick_inputs, output)
-        x[port.voltage] = to_hold(i, state.voltage, port)
+        x[port.voltage] = in_turn(i, state.voltage, port.delayed)
     if base % port.record_every == 0:
         write_sample(base // port.record_every, x, port, output)
     return state
@@ -174,7 +178,7 @@ def run_ticks(
             return FULL, base, mode, state
         if to_tick == 0:
             state = take_tick(i, x[port.position], parameters, state, port, tick_inputs, output)
-            x[port.voltage] = to_hold(i, state.voltage, port)
+            x[port.voltage] = in_turn(i, state.voltage, port.delayed)
             to_tick = port.tick_every
             i += 1
         if to_record == 0:

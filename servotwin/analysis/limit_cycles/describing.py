@@ -22,11 +22,11 @@ from servotwin.hybrid.trajectory import ZenoError
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
 from servotwin.plant.display_units import command_unit
-from servotwin.plant.law_loop import check_encoders
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.margins import crossings, direction, gain_crossovers, search_frequencies
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant
+from servotwin.plant.sensors import check_encoders
 
 # Grid intervals within each band of frequencies in which a prediction is possible.
 _GRID = 500
