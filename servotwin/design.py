@@ -45,7 +45,7 @@ def tune(
     prefer : str
         "Ms": the smallest Ms, then the largest Ki; "Ki": the largest Ki within `Ms_max`.
     delay : float
-        Delay in series with the plant, s.
+        Delay in series with the plant, s, beside that of its encoder.
 
     Returns
     -------
@@ -64,7 +64,7 @@ def tune(
         )
     specification = Specification(crossover, phase_margin, kind, Ms_max, prefer)
     law = filtered_pid(servo.controller).replace(sample_rate=None)
-    return tune_system(tuned_system(servo), specification, delay, law)
+    return tune_system(tuned_system(servo), specification, delay + servo.sensors.fed_back(servo.p).delay, law)
 
 
 def tuned_system(servo: Plant) -> LinearSystem:

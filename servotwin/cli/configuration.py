@@ -117,8 +117,7 @@ _SENSORS = TableSpec(
 )
 _SENSORS_SHOWN = TableSpec(
     (Sensors,),
-    "Encoders; ideal where the table is absent. With a rotary load `position_resolution_m` is "
-    "`position_resolution_rad`.",
+    "Encoders; ideal where the table is absent. With a rotary load keys that end with `_m` end with `_rad`.",
 )
 _CONTROLLERS = TableSpec(
     help="The controller that runs; its keys have the units of command and position.",

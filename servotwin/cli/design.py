@@ -63,7 +63,9 @@ def tune(
     prefer: Annotated[
         str, typer.Option(help="Ms: smallest Ms, then largest Ki; Ki: largest Ki within --ms-max.")
     ] = "Ms",
-    delay_ms: Annotated[float, typer.Option(help="Delay in series with the plant, ms.")] = 0.0,
+    delay_ms: Annotated[
+        float, typer.Option(help="Delay in series with the plant, beside that of its encoder, ms.")
+    ] = 0.0,
     b: Annotated[float, typer.Option(help="Setpoint weight of the proportional term.")] = 1.0,
     c: Annotated[float | None, typer.Option(help="Setpoint weight of the derivative term; by default b.")] = None,
     output: Annotated[

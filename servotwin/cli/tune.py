@@ -65,8 +65,8 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
             f'{request.servo}: controller.kind = "{LINEAR_LAW}": tune finds the gains of a filtered PID or a cascade; '
             "describe one of these in the table [controller]"
         )
-    own, delay = filtered_pid(servo.controller), 1e-3 * request.delay_ms
-    servo = servo.replace(sample_rate=None)
+    own, sensor = filtered_pid(servo.controller), servo.sensors.fed_back(servo.p).delay
+    delay = 1e-3 * request.delay_ms
     tuning = tune(
         servo,
         request.crossover,
@@ -78,7 +78,7 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     )
     overshoots = None
     b, c = request.b, request.b if request.c is None else request.c
-    if delay == 0.0:
+    if delay + sensor == 0.0:
         weighted = overshoot(servo, tuning.controller, b, c)
         overshoots = (overshoot(servo, tuning.controller), weighted)
     _write(request, servo, tuning.controller.replace(sample_rate=own.sample_rate))
@@ -88,7 +88,7 @@ def print_tuning(request: TuneOptions, as_json: bool) -> None:
     console = Console()
     laws = {"tuned": (tuning.controller, tuning.margins)}
     if any((own.Kp, own.Ki, own.Kd)):
-        laws["present"] = own, evaluate(tuned_system(servo), own, delay)
+        laws["present"] = own, evaluate(tuned_system(servo), own, delay + sensor)
     _print(console, servo, laws)
     angles = tuning.factors
     shown = ", ".join(f"{n} = {math.degrees(getattr(angles, n)):.3f} deg" for n in ("phz", "be", "al"))

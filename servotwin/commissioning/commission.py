@@ -22,7 +22,7 @@ from servotwin.estimation.inverse_dynamics.shaft import ShaftResponse
 from servotwin.logs.drive_recordings import DriveColumns, DriveLog, read_drive_log
 from servotwin.plant.axis import Axis
 from servotwin.plant.load import Load
-from servotwin.plant.sensors import LOAD, MOTOR, Sensors
+from servotwin.plant.sensors import LOAD, MOTOR
 from servotwin.plant.transmission import FREE, Transmission
 from servotwin.redesign.certified.uncertainty import Uncertainty
 
@@ -181,7 +181,7 @@ def _with_shaft(axis: Axis, shaft: ShaftResponse, split: ParameterFit) -> Axis:
 
 def _with_load_encoder(axis: Axis, resolution: float) -> Axis:
     law = axis.controller.replace(on=LOAD) if isinstance(axis.controller, Cascade) else axis.controller
-    sensors = Sensors(axis.sensors.encoder_resolution, resolution, LOAD)
+    sensors = replace(axis.sensors, position_resolution=resolution, feedback=LOAD)
     return replace(axis, controller=law, sensors=sensors)
 
 

@@ -83,8 +83,8 @@ def unit_of(name: str) -> Unit:
 _POSITIONS = ("m", "rad", "mm", "deg")
 SIGNAL_COLUMNS = {
     "position": tuple(f"{name}_{unit}" for name in ("measured_position", "position") for unit in _POSITIONS),
-    "theta_m": ("theta_m_rad", "theta_m_deg"),
+    "theta_m": ("measured_theta_m_rad", "theta_m_rad", "theta_m_deg"),
     "voltage": ("voltage_v", "command_n_m", "command_rad_per_s", "command_rad"),
     "reference": tuple(f"reference_{unit}" for unit in _POSITIONS),
 }
-"""Columns of logs by signal, in order of preference: the measured position before the true one."""
+"""Columns of logs by signal, in order of preference: what was measured before what was true."""

@@ -14,6 +14,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.gap import options_for
+from servotwin.estimation.late_window import prompt_window
 from servotwin.estimation.output_error.fit import Search
 from servotwin.estimation.whitened.fit import WhitenedFit
 from servotwin.estimation.whitened.reduction import CONSTANT, RESIDUAL
@@ -118,7 +119,7 @@ class _Left:
 def _fit(window: Window, stored: StoredFit) -> _Left:
     """Fit a window with the model and what was expected of it then."""
     servo, settings = described(parts_of(stored.context))
-    settings = settings.on(servo)
+    settings, window = settings.on(servo), prompt_window(window, servo)
     try:
         body = msgspec.msgpack.decode(stored.body, type=StoredEstimate)
         gap = msgspec.msgpack.decode(body.estimate)["gap"]

@@ -11,6 +11,7 @@ from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side, output_error, paper, whitened
 from servotwin.estimation.axis_model import has_servo, servo_of
 from servotwin.estimation.estimate import GapEstimate
+from servotwin.estimation.late_window import prompt_window
 from servotwin.estimation.window import Window
 from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
@@ -69,6 +70,7 @@ def estimate_gap(
     Parameters
     ----------
     window : Window
+        Readings of late encoders (`Axis.sensors`) are taken as of when they were true.
     servo : Servo or Axis
         The model; its controller does not matter.
     method : str, optional
@@ -89,6 +91,7 @@ def estimate_gap(
         An unknown method, a prior that is not a gap, settings of another method, a window that lacks a channel or
         is too short, a method that is not for this axis.
     """
+    window = prompt_window(window, servo)
     method = _method_for(window, servo) if method is None else method
     chosen, known = settings_of(method, settings), _usable_prior(prior)
     if isinstance(servo, Axis) and method != motor_side.METHOD:

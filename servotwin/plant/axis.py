@@ -29,6 +29,7 @@ from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
 from servotwin.plant.law_loop import LawLoop
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.load import LINEAR, ROTARY, Load
+from servotwin.plant.loop_set import sampled_margins
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.numbers import tolerance_of
 from servotwin.plant.rest import Rest, rest_under_force
@@ -367,7 +368,8 @@ class Axis:
 
     def _law_loop(self, law: LinearLaw) -> LawLoop:
         check_encoders(self, law)
-        return LawLoop(*self.plants(), law)
+        late = self.sensors.motor.late(law.sample_rate), self.sensors.load.late(law.sample_rate)
+        return LawLoop(*self.plants(), law, late)
 
     def loop(self, controller: AnyController | None = None) -> LinearSystem:
         """Open loop of controller and plant in continuous time, without a gap; of a linear law cut at the command."""
@@ -380,10 +382,15 @@ class Axis:
         return self._law_loop(law).closed() if isinstance(law, LinearLaw) else loop.closed_loop(self.plant(), law)
 
     def margins(self, controller: AnyController | None = None) -> Margins:
-        """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap."""
+        """All crossovers and margins, Ms, bandwidth and stability of the loop without a gap.
+
+        In continuous time, unless the law has discrete matrices or a sensor is late.
+        """
         law = law_of(controller or self.controller)
         if isinstance(law, LinearLaw):
             return self._law_loop(law).margins()
+        if late := self.sensors.fed_back(self.p).late(law.sample_rate):
+            return sampled_margins(self.plant(), law, late)
         return margins(self.loop(controller), self.closed_loop(controller))
 
     def check_loop(self, controller: AnyController | None = None) -> None:
@@ -403,4 +410,5 @@ class Axis:
                 return
             if self.rigid and self.at_motor:
                 check_damped(self.load, self.chain())
-            loop.check_stable(self.plant(), law, "axis", unit, "m" if motion == LINEAR else "rad")
+            late = self.sensors.fed_back(self.p).late(law.sample_rate)
+            loop.check_stable(self.plant(), law, "axis", unit, "m" if motion == LINEAR else "rad", late)

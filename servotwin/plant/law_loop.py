@@ -11,6 +11,7 @@ import numpy as np
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearState, linear_tick
 from servotwin.errors import InvalidInput
+from servotwin.plant.late_readings import late_readings
 from servotwin.plant.linear import Complex, LinearSystem, zero_order_hold
 from servotwin.plant.margins import Margins, margins_of_response, search_frequencies
 from servotwin.plant.signals import Array
@@ -68,6 +69,14 @@ def law_response(law: LinearLaw, omega: float) -> Complex:
     return np.asarray(C @ np.linalg.solve(point * np.eye(len(A)) - A, B.astype(complex)) + D)
 
 
+class _ReadPlant(NamedTuple):
+    """x' = A x + B command, readings (y_motor, y_load) = readings x; in sampled time x' is the next x."""
+
+    A: Array
+    B: Array
+    readings: Array
+
+
 @dataclass(frozen=True, eq=False)
 class LawLoop:
     """A linear law on a plant without a gap.
@@ -77,37 +86,37 @@ class LawLoop:
     motor, load : LinearSystem
         Command to the motor's angle (rad) and to the load's position (m or rad), with the same states.
     law : LinearLaw
+    late : (int, int)
+        Samples of the law by which motor's and load's readings are late.
     """
 
     motor: LinearSystem
     load: LinearSystem
     law: LinearLaw
+    late: tuple[int, int] = (0, 0)
 
     @property
-    def _measured(self) -> Array:
-        """(2, N) rows of the plant's states that motor's and load's encoders read."""
-        return np.stack([self.motor.C, self.load.C])
+    def _plant(self) -> _ReadPlant:
+        """The plant in continuous time."""
+        return _ReadPlant(self.load.A, self.load.B, np.stack([self.motor.C, self.load.C]))
 
-    def _controlled(self) -> Array:
-        """Row of the plant's states whose error the dead zone looks at."""
-        return np.asarray(np.array(self.law.error) @ self._measured)
-
-    def _opened(self, A: Array, B: Array, law: LawMatrices) -> LinearSystem:
-        """Command in to minus command out, for plant matrices of continuous or of sampled time."""
+    def _opened(self, plant: _ReadPlant, law: LawMatrices) -> LinearSystem:
+        """Command in to minus command out, of a plant in continuous or in sampled time."""
+        A, B, readings = plant
         size, n = B.size, law.C.size
         matrix = np.zeros((size + n, size + n))
         matrix[:size, :size], matrix[size:, size:] = A, law.A
-        matrix[size:, :size] = law.B[:, 1:] @ self._measured
-        row = -np.concatenate([law.D[1:] @ self._measured, law.C])
+        matrix[size:, :size] = law.B[:, 1:] @ readings
+        row = -np.concatenate([law.D[1:] @ readings, law.C])
         return LinearSystem(matrix, np.append(B, np.zeros(n)), row, 0.0, _NO_POLYNOMIAL, _NO_POLYNOMIAL)
 
-    def _closed(self, A: Array, B: Array, law: LawMatrices) -> LinearSystem:
-        """Reference to the controlled measurement."""
-        opened = self._opened(A, B, law)
+    def _closed(self, plant: _ReadPlant, law: LawMatrices) -> LinearSystem:
+        """Reference to the controlled measurement, whose error the dead zone looks at."""
+        opened = self._opened(plant, law)
         matrix = opened.A - np.outer(opened.B, opened.C)
         drive = opened.B * law.D[0]
-        drive[B.size :] += law.B[:, 0]
-        row = np.append(self._controlled(), np.zeros(law.C.size))
+        drive[plant.B.size :] += law.B[:, 0]
+        row = np.append(np.array(self.law.error) @ plant.readings, np.zeros(law.C.size))
         return LinearSystem(matrix, drive, row, 0.0, _NO_POLYNOMIAL, _NO_POLYNOMIAL)
 
     def open(self) -> LinearSystem:
@@ -119,7 +128,7 @@ class LawLoop:
             The law has discrete matrices.
         """
         self._check_continuous()
-        return self._opened(self.load.A, self.load.B, law_matrices(self.law))
+        return self._opened(self._plant, law_matrices(self.law))
 
     def closed(self) -> LinearSystem:
         """Reference to the controlled measurement in continuous time (m or rad).
@@ -130,19 +139,23 @@ class LawLoop:
             The law has discrete matrices.
         """
         self._check_continuous()
-        return self._closed(self.load.A, self.load.B, law_matrices(self.law))
+        return self._closed(self._plant, law_matrices(self.law))
 
     def _check_continuous(self) -> None:
         if self.law.discrete:
             raise InvalidInput("law discrete = True: its loop has no continuous-time system; `margins` takes it")
 
-    def _held_plant(self) -> tuple[Array, Array]:
+    def _held_plant(self) -> _ReadPlant:
+        """The plant from tick to tick, with the lines in which readings of late encoders wait."""
         assert self.law.sample_rate is not None
-        return zero_order_hold(self.load.A, self.load.B, 1.0 / self.law.sample_rate)
+        A, B = zero_order_hold(self.load.A, self.load.B, 1.0 / self.law.sample_rate)
+        rows = self._plant.readings[:, None]
+        whole, drive, readings = late_readings(A[None], B[None], list(rows), self.late)
+        return _ReadPlant(whole[0], drive[0], np.concatenate(readings))
 
     def sampled_poles(self) -> Complex:
         """Poles z of the sampled loop; stable when all abs(z) < 1."""
-        return self._closed(*self._held_plant(), ticked_law(self.law)).poles()
+        return self._closed(self._held_plant(), ticked_law(self.law)).poles()
 
     def slowest_pole(self) -> complex:
         """The closed loop's pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
@@ -153,11 +166,12 @@ class LawLoop:
         return complex(np.log(poles[np.argmax(np.abs(poles))]) * self.law.sample_rate)
 
     def margins(self) -> Margins:
-        """All crossovers and margins, cut at the command; of a law with discrete matrices up to half its rate.
+        """All crossovers and margins, cut at the command.
 
-        The bandwidth is that of the controlled measurement.
+        Of a law with discrete matrices, or with late encoders, sampled and up to half its rate. The bandwidth is that
+        of the controlled measurement.
         """
-        if self.law.discrete:
+        if self.law.discrete or any(self.late):
             return self._sampled_margins()
         opened, closed = self.open(), self.closed()
         corners = np.concatenate([opened.poles(), closed.poles(), _zeros(opened)])
@@ -172,7 +186,7 @@ class LawLoop:
     def _sampled_margins(self) -> Margins:
         assert self.law.sample_rate is not None
         rate, plant, law = self.law.sample_rate, self._held_plant(), ticked_law(self.law)
-        opened, closed = self._opened(*plant, law), self._closed(*plant, law)
+        opened, closed = self._opened(plant, law), self._closed(plant, law)
         corners = np.concatenate([opened.poles(), closed.poles(), _zeros(opened)])
         corners = np.log(corners[np.abs(corners) > 0.0]) * rate
         omega = _above_integrators(search_frequencies(also=corners), corners)

@@ -13,9 +13,17 @@ from numpy.typing import NDArray
 from servotwin.control.laws import AnyController, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.plant.axis import Axis
+from servotwin.plant.late_readings import late_readings
 from servotwin.plant.law_loop import LawMatrices, law_matrices, ticked_law
 from servotwin.plant.linear import Complex
-from servotwin.plant.loop_set import PlantSet, SetMargins, about_poles, eigenvalues, margins_of_responses, response_of
+from servotwin.plant.loop_set import (
+    PlantSet,
+    SetMargins,
+    about_poles,
+    eigenvalues,
+    margins_of_responses,
+    response_of,
+)
 from servotwin.plant.signals import Array
 
 
@@ -34,9 +42,14 @@ class LawSet:
 
     @staticmethod
     def of(axes: Sequence[Axis], rate: float | None) -> LawSet:
-        """Discretise axes, by zero-order hold where there is a rate."""
+        """Discretise axes, by zero-order hold where there is a rate, with their late encoders."""
         motors, loads = zip(*(axis.plants() for axis in axes), strict=True)
-        return LawSet(PlantSet.of(motors, rate), PlantSet.of(loads, rate))
+        motor, load = PlantSet.of(motors, rate), PlantSet.of(loads, rate)
+        if rate is None:
+            return LawSet(motor, load)
+        delays = [encoder.late(rate) for encoder in (axes[0].sensors.motor, axes[0].sensors.load)]
+        A, B, rows = late_readings(load.A, load.B, [motor.C, load.C], delays, rate)
+        return LawSet(*(PlantSet(A, B, row, rate) for row in rows))
 
     @property
     def count(self) -> int:

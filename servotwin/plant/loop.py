@@ -146,7 +146,9 @@ def computable(described: Callable[[], Mapping[str, Mapping[str, Any]]]) -> Iter
         ) from None
 
 
-def check_stable(plant: LinearSystem, law: Controller, described: str, command: str = "V", position: str = "m") -> None:
+def check_stable(
+    plant: LinearSystem, law: Controller, described: str, command: str = "V", position: str = "m", late: int = 0
+) -> None:
     """Refuse a controller that does not stabilise a plant, at its sample rate if it has one.
 
     Parameters
@@ -155,13 +157,15 @@ def check_stable(plant: LinearSystem, law: Controller, described: str, command: 
         The plant in words.
     command, position : str
         Units of the gains.
+    late : int
+        Samples by which the readings of the position are late.
 
     Raises
     ------
     InvalidInput
         With the fastest growing pole.
     """
-    worst = slowest_pole(plant, law)
+    worst = slowest_pole(plant, law, late)
     if not worst.real < 0.0:
         rate = "" if law.sample_rate is None else f" at {law.sample_rate:g} Hz"
         units = gain_units(command, position)
@@ -273,10 +277,11 @@ def sampled_poles(plant: LinearSystem, controller: Controller, delay: int = 0) -
     return np.asarray(np.linalg.eigvals(matrix), dtype=complex)
 
 
-def slowest_pole(plant: LinearSystem, controller: Controller) -> complex:
-    """The closed loop's pole with the largest real part, 1/s; of a sampled loop log(z) times the rate."""
+def slowest_pole(plant: LinearSystem, controller: Controller, late: int = 0) -> complex:
+    """The closed loop's pole with the largest real part, 1/s; of a sampled loop, whose sensor is `late` samples late,
+    log(z) times the rate."""
     if controller.sample_rate is None:
         poles = closed_loop(plant, controller).poles()
         return complex(poles[np.argmax(poles.real)])
-    poles = sampled_poles(plant, controller)
+    poles = sampled_poles(plant, controller, late)
     return complex(np.log(poles[np.argmax(np.abs(poles))]) * controller.sample_rate)

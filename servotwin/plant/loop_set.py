@@ -16,12 +16,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, filtered_pid
 from servotwin.control.retuning import integrates
 from servotwin.hybrid.exponential import expm1
 from servotwin.plant.frequency_curves import distances, encirclements, least_values, squares
+from servotwin.plant.late_readings import late_readings
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.loop import StateMatrices, continuous_law, sampled_law
+from servotwin.plant.margins import Margins, margins_of_response
 from servotwin.plant.signals import Array
 
 _PER_DECADE = 60
@@ -82,14 +85,15 @@ class PlantSet:
     rate: float | None
 
     @staticmethod
-    def of(plants: Sequence[LinearSystem], rate: float | None) -> PlantSet:
-        """Discretise plants, by zero-order hold where there is a rate."""
+    def of(plants: Sequence[LinearSystem], rate: float | None, late: int = 0) -> PlantSet:
+        """Discretise plants, by zero-order hold where there is a rate; their sensor is so many samples late."""
         A, B, C = (np.array([getattr(plant, name) for plant in plants]) for name in ("A", "B", "C"))
         if rate is not None:
             flows = np.zeros((len(A), B.shape[1] + 1, B.shape[1] + 1))
             flows[:, :-1, :-1], flows[:, :-1, -1] = A, B
             discrete = rate * np.array([expm1(flow, 1.0 / rate) for flow in flows])
             A, B = discrete[:, :-1, :-1], discrete[:, :-1, -1]
+            A, B, (C,) = late_readings(A, B, [C], [late], rate)
         return PlantSet(A, B, C, rate)
 
     @property
@@ -301,6 +305,16 @@ def margins_of_responses(omega: Array, loop: Complex, value: Callable[[Array], C
     peak = np.where(stable, 1.0 / closest, np.inf)
     passivity = 1.0 + least_values(omega, loop.real, lambda w: value(w).real)
     return SetMargins(stable, peak, gain, phase, late, -growth, passivity)
+
+
+def sampled_margins(plant: LinearSystem, law: Controller, late: int = 0) -> Margins:
+    """Margins of a law on one plant at the law's own rate (Hz), whose sensor is so many samples late."""
+    plants = PlantSet.of([plant], law.sample_rate, late)
+    return margins_of_response(
+        lambda omega: plants.loop(law, 0, np.atleast_1d(omega)[None])[0],
+        np.unique(plants.omega[0]),
+        stable=bool(plants.margins(law).stable[0]),
+    )
 
 
 class FrequencyGrid(NamedTuple):

@@ -169,6 +169,11 @@ class Readings:
             every,
         )
 
+    @property
+    def motor_late(self) -> int:
+        """Samples by which the motor's readings are late."""
+        return self.motor.late // self.every
+
     def source(self, tick_rate: float, every: int, rng: np.random.Generator) -> PositionErrors:
         """Errors of the measured position at ticks, which are `every` steps apart."""
         added = None if self.noise is None else self.noise.source(tick_rate, rng)
@@ -181,15 +186,11 @@ def motor_readings(
     theta_m: Callable[[int, int], Array],
     first: int,
     last: int,
-    oldest: int = 0,
 ) -> Array:
-    """(last - first,) rad, the motor's encoder at samples first .. last - 1.
-
-    `theta_m` gives the true angle at samples, from `oldest` on.
-    """
+    """(last - first,) rad, the motor's encoder at samples first .. last - 1, whose true angles `theta_m` gives."""
     if readings is None or last == first:
         return quantised(theta_m(first, last), servo.encoder_resolution)
-    seen = np.maximum(np.arange(first, last) - readings.motor.late // readings.every, oldest)
+    seen = np.maximum(np.arange(first, last) - readings.motor_late, 0)
     begin = int(seen[0])
     angle = theta_m(begin, int(seen[-1]) + 1)[seen - begin]
     return quantised(angle + readings.motor.at(seen * readings.every), servo.encoder_resolution)

@@ -104,6 +104,15 @@ class Run:
         return self._column("measured_position")
 
     @property
+    def measured_theta_m(self) -> Array:
+        """Output of the motor's encoder, rad."""
+
+        def angle(first: int, last: int) -> Array:
+            return self.theta_m[first:last]
+
+        return self._get("measured theta_m", lambda: motor_readings(self.servo, self.readings, angle, 0, self.samples))
+
+    @property
     def events(self) -> np.recarray[tuple[int], np.dtype[np.void]]:
         """Table of (time s, kind, side, state_triggered), in time order.
 
@@ -120,9 +129,7 @@ class Run:
 
     def measured(self, name: str) -> Array:
         """A channel as its sensor measures it: theta_m, position, voltage or reference."""
-        if name == "theta_m":
-            return motor_readings(self.servo, self.readings, lambda a, b: self.theta_m[a:b], 0, self.samples)
-        return {"position": self.measured_position, "voltage": self.voltage, "reference": self.reference}[name]
+        return np.asarray(getattr(self, name if name in ("voltage", "reference") else f"measured_{name}"))
 
     def __repr__(self) -> str:
         """Length, rate, model and kind of loop in one line."""
@@ -158,6 +165,7 @@ class Run:
             f"measured_position_{position}": self.measured_position,
             f"reference_{position}": self.reference,
             "theta_m_rad": self.theta_m,
+            "measured_theta_m_rad": self.measured_theta_m,
             "theta_d_rad": self.theta_d,
             "voltage_v" if command == "command_v" else command: self.voltage,
             "gap_rad": self.gap,

@@ -130,10 +130,11 @@ class Simulation:
         return Readings.of(self.servo, rate, round(rate / self.inputs.sample_rate), noise, rng)
 
     def _made(self, theta_d0: float, noise: Noise | None, rng: np.random.Generator, delay: int) -> Engine:
-        servo, law, inputs, samples, keep = self.servo, self.controller, self.inputs, self.samples, self.keep
+        servo, law, inputs, samples, readings = self.servo, self.controller, self.inputs, self.samples, self.readings
+        # The oldest sample that can be asked for shows an older one.
+        keep = None if self.keep is None else self.keep + (0 if readings is None else readings.motor_late)
         if noise is not None and isinstance(law, LinearLaw) and not law.reads("y_load"):
             raise InvalidInput("noise is on the load's encoder, which the controller does not read: noise must be None")
-        readings = self.readings
         if law.sample_rate is None:
             source: NoiseSource | PositionErrors | None = None
             if readings is not None:
@@ -258,7 +259,7 @@ class Simulation:
             def angle(begin: int, end: int) -> Array:
                 return self.engine.channel("theta_m", begin, end)
 
-            return motor_readings(self.servo, self.readings, angle, first, last, oldest)
+            return motor_readings(self.servo, self.readings, angle, first, last)
         return self.engine.channel("measured_position" if name == "position" else name, first, last)
 
     def run(self) -> Run:

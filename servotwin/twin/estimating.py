@@ -19,6 +19,7 @@ from servotwin.estimation.controller import ControllerComparison, compare_contro
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.gap import default_method, estimate_gap, options_for
+from servotwin.estimation.late_window import prompt_plant, prompt_window
 from servotwin.estimation.learning.machine import nameplate
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
@@ -82,7 +83,8 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     The published estimator starts from the previous gap, as printed. The default one gets the trend's prediction, the
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
-    settings = settings.on(servo)
+    settings, version, read = settings.on(servo), servo.version, servo
+    servo = prompt_plant(servo)
     model = servo_for(servo)
     # A file without a table [estimator] gives the defaults of its method.
     stated = settings.estimator not in (None, whitened.WhitenedSettings()) or settings.method != whitened.METHOD
@@ -102,6 +104,7 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     fitted = _fits_of_axis(servo, own, settings) if model is None else _fits_of_servo(model, options, settings)
 
     def of_model(window: Window, expected: Expectation) -> GapEstimate:
+        window = prompt_window(window, read)
         if model is not None and not isinstance(options, whitened.WhitenedSettings):
             return estimate_gap(window, servo, settings.method, expected.previous, options)
         if new is None or expected.machine is None:
@@ -114,7 +117,7 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         return replace(made, machine=other.machine) if other.ok else made
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        return replace(of_model(window, expected), model_version=servo.version)
+        return replace(of_model(window, expected), model_version=version)
 
     return of_model if model is servo else estimate
 
@@ -157,7 +160,7 @@ def _fits_of_servo(model: Servo, options: object, settings: TwinSettings) -> _Fi
 
 
 def own_fit(window: Window, servo: Axis, settings: TwinSettings, expected: Expectation) -> Search:
-    """Fit a window as the estimator of an axis does that has no servo as its model; raises InvalidInput."""
+    """Fit a prompt window as the estimator of an axis does that has no servo as its model; raises InvalidInput."""
     settings = settings.on(servo)
     if servo.at_motor:
         motor = motor_side.MotorSideSettings(gap_rate=expected.gap_rate(settings.trend))
@@ -177,11 +180,11 @@ def _worn(
 
 
 def motor_learning_of(servo: Plant, settings: TwinSettings) -> MotorLearning | None:
-    """Make the learning of the motor's numbers; None where the settings, an elastic screw or another actuator than a DC
-    motor rule it out."""
+    """Make the learning of the motor's numbers; None where the settings, an elastic screw, a late encoder or another
+    actuator than a DC motor rule it out."""
     model = servo_for(servo)
     drives = isinstance(servo, Servo) or isinstance(servo.actuator, DcMotor)
-    if not settings.learning.learn or model is None or not (model.rigid and drives):
+    if not settings.learning.learn or model is None or not (model.rigid and drives) or servo.sensors.motor.delay:
         return None
     known = settings.uncertainty
     # Half-widths within which every value is as likely.

@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from servotwin.errors import InvalidInput
 from servotwin.estimation.disturbance import quick_bias
 from servotwin.estimation.estimate import GapEstimate, MachineReading
+from servotwin.estimation.late_window import prompt_window
 from servotwin.estimation.learning.trend import Trend
 from servotwin.estimation.learning.wear import Expectation
 from servotwin.estimation.whitened.free_model import FactorPrior
@@ -288,7 +289,9 @@ class Triage:
         """
         compared = replace(state, doubt="a request is open", vain=0) if requested else state
         try:
-            result = glance(message, window, self.servo, compared, _offset(trend), self.settings, machine)
+            result = glance(
+                message, prompt_window(window, self.servo), self.servo, compared, _offset(trend), self.settings, machine
+            )
         except InvalidInput:
             return state, None
         return (state if result.moved else state.glanced(result)), result
@@ -311,7 +314,7 @@ class Triage:
         if rejection or window is None:
             boot, version = message.boot, message.parameter_version
             return replace(state, doubt=rejection, glances=0, vain=state.vain + 1, boot=boot, version=version)
-        known = Known(estimate.gap, (), _offset(trend), machine)
+        window, known = prompt_window(window, self.servo), Known(estimate.gap, (), _offset(trend), machine)
         known = known._replace(unknowns=self.fits.unknowns_at(window, known))
         fit = self.fits.beside(window, known)
         if fit is None:

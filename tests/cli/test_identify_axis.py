@@ -25,7 +25,7 @@ def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("logs")
     run = st.simulate(DRIVE, 4.0, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=1000.0)
     write_log(SignalTable(run.columns, {"servo": DRIVE.dumps()}), folder / "own.npz")
-    names = {"time_s": "time_s", "position_deg": "measured_position_rad", "theta_m_deg": "theta_m_rad"}
+    names = {"time_s": "time_s", "position_deg": "measured_position_rad", "theta_m_deg": "measured_theta_m_rad"}
     names |= {"reference_deg": "reference_rad", "command_n_m": "command_n_m"}
     factors = {name: np.degrees(1.0) if name.endswith("deg") else 1.0 for name in names}
     foreign = {name: factors[name] * run.columns[own] for name, own in names.items()}

@@ -36,6 +36,7 @@ COLUMNS = [
         "measured_position_m",
         "reference_m",
         "theta_m_rad",
+        "measured_theta_m_rad",
         "theta_d_rad",
         "voltage_v",
         "gap_rad",

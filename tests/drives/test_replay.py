@@ -107,7 +107,7 @@ def test_a_log_of_an_axis_comes_in_its_own_units(tmp_path: Path, preset: str) ->
     with closing(Replay(tmp_path / "run.csv", speed=0.0)) as drive:
         drive.connect()
         seen = signals(read_all(drive))
-    written = np.array([run.reference, run.theta_m, run.measured_position, run.voltage])
+    written = np.array([run.reference, run.measured_theta_m, run.measured_position, run.voltage])
     assert seen == pytest.approx(written, rel=1e-9, abs=0.0)
 
 
@@ -141,7 +141,7 @@ def test_an_npz_is_converted_first(log: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("theta_m_rad", "theta"), "column theta_m_rad or theta_m_deg is missing; it has time_s, position_m"),
+        (("theta_m_rad", "theta"), "theta_m_rad or theta_m_deg is missing; it has time_s, position_m"),
         (("5.05,", "5.0512,"), r"time_s = 5\.0512 s at sample 50: must be increasing, uniformly spaced"),
         ((",302,", ",nan,"), "line 53 must hold finite numbers"),
         ((",302,", ",,"), "line 53 must hold finite numbers"),

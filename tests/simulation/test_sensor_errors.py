@@ -16,6 +16,9 @@ from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import linear_tick
 from servotwin.errors import InvalidInput
 from servotwin.plant.linear import zero_order_hold
+from servotwin.redesign.certified.margins import nominal_margins, plant_set
+from servotwin.redesign.certified.uncertainty import Uncertainty
+from servotwin.simulation.endless import FOREVER, OpenLoopPlant, UnboundedSimulation
 from servotwin.simulation.inputs import quantised
 from servotwin.simulation.simulate import Simulation
 
@@ -205,3 +208,41 @@ def test_counts_of_a_turn_stand_for_the_resolution() -> None:
     assert st.Sensors(encoder_counts=4096.0) == st.Sensors(encoder_resolution=2.0 * np.pi / 4096.0)
     run = st.simulate(drive(PID, encoder_counts=4000.0), 0.2, reference=1e-3, sample_rate=RATE)
     assert np.array_equal(run.measured("theta_m"), quantised(run.theta_m, 2.0 * np.pi / 4000.0))
+
+
+@pytest.mark.parametrize("controller", [PID, CASCADE])
+def test_margins_and_poles_know_the_delays(controller: str) -> None:
+    axis = drive(controller, **LATE)
+    margins, exact = axis.margins(), Uncertainty(k=0.0, c=0.0, m=0.0, k_T=0.0, k_B=0.0)
+    assert margins.stable
+    assert plant_set(axis, exact, RATE).margins(axis.controller).Ms[0] == pytest.approx(margins.Ms, rel=1e-6)
+    prompt = nominal_margins(drive(controller), axis.controller)
+    assert abs(margins.Ms / prompt.Ms - 1.0) > 1e-3
+    late = axis.replace(sensors=replace(axis.sensors, position_delay=0.2, encoder_delay=0.02))
+    with pytest.raises(InvalidInput, match="unstable"):
+        late.check_loop()
+    run = st.simulate(late, 3.0, reference=1e-3, sample_rate=RATE)
+    assert np.abs(run.position[-500:]).max() > 1.5 * np.abs(run.position[:500]).max()
+
+
+def test_a_late_sensor_takes_its_time_from_the_phase_margin() -> None:
+    (late,) = drive(PID, position_delay=3e-3).margins().gain_crossovers
+    (prompt,) = nominal_margins(drive(PID), drive(PID).controller).gain_crossovers
+    assert late.omega == pytest.approx(prompt.omega, rel=1e-6)
+    assert late.phase_margin == pytest.approx(prompt.phase_margin - 3e-3 * prompt.omega, abs=1e-6)
+
+
+def test_a_voltage_from_outside_meets_the_same_readings() -> None:
+    """As the drive that is simulated beside a deployed edge: sample by sample, the law outside."""
+    axis = drive(PID, **LATE, position_noise=2e-6, encoder_noise=1e-3, encoder_offset=0.1)
+    run = st.simulate(axis, 0.4, reference=1e-3, sample_rate=RATE, seed=5)
+    endless = Simulation(axis, FOREVER, reference=1e-3, sample_rate=RATE, seed=5, keep=64)
+    held, state = OpenLoopPlant(UnboundedSimulation(endless, 1e-3)), law.start(float(run.measured("position")[0]))
+    seen = []
+    while held.index < run.samples - 1:
+        reference, *readings = held.sample()
+        state = law.tick(axis.pidf.law(None), state, reference, readings[1])
+        seen.append((*readings, state.voltage))
+        held.hold(state.voltage)
+    for values, name in zip(np.array(seen).T, ("theta_m", "position", "voltage"), strict=True):
+        assert np.array_equal(values, run.measured(name)[:-1]), name

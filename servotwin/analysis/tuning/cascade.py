@@ -61,7 +61,7 @@ def tune_cascade(
     integral : bool
         False: no integral action.
     delay : float
-        s, in series with the plant: that of a sampled law, for one.
+        s, in series with the plant, beside those of its encoders: that of a sampled law, for one.
 
     Raises
     ------
@@ -112,8 +112,10 @@ def _responses(axis: Axis, law: Cascade, omega: float, delay: float) -> tuple[co
     bare = law.replace(sample_rate=None, rate_limit=None, on=LOAD)
     bare = bare.replace(velocity_feedforward=0.0, acceleration_feedforward=0.0)
     reference, motor, _ = law_response(bare.linear(), omega)
-    late = cmath.exp(-1j * omega * delay)
-    angle, position = (complex(plant.response(omega)) * late for plant in axis.plants())
+    angle, position = (
+        complex(plant.response(omega)) * cmath.exp(-1j * omega * (delay + encoder.delay))
+        for plant, encoder in zip(axis.plants(), (axis.sensors.motor, axis.sensors.load), strict=True)
+    )
     return complex(reference), complex(motor), angle, position
 
 

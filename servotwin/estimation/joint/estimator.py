@@ -46,6 +46,7 @@ from servotwin.estimation.joint.verdict import (
     mismatched,
     window_estimate,
 )
+from servotwin.estimation.late_window import prompt_window
 from servotwin.estimation.learning.trend import Prior
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.whitened.channels import faults, motor_angle
@@ -190,7 +191,7 @@ def estimate_jointly(
         axis whose angle cannot be computed from the command; several windows of a load with friction that the gap
         holds.
     """
-    windows = _windows(window)
+    windows = tuple(prompt_window(each, servo) for each in _windows(window))
     if isinstance(servo, Axis):
         return _of_axis(windows, servo, free, prior, settings)
     return _of_servo(windows, servo, free, prior, _checked_settings(settings, JointSettings) or JointSettings())

@@ -27,8 +27,8 @@ from servotwin.control.retuning import (
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.law_set import LawSet
-from servotwin.plant.loop_set import PlantSet
-from servotwin.plant.margins import GainCrossover, Margins, margins_of_response
+from servotwin.plant.loop_set import PlantSet, sampled_margins
+from servotwin.plant.margins import GainCrossover, Margins
 from servotwin.plant.plants import Plant
 from servotwin.redesign.certified.certificate import LoopMargins
 from servotwin.redesign.certified.demands import Demands
@@ -68,7 +68,7 @@ def plant_set(servo: Plant, uncertainty: Uncertainty, rate: float | None) -> Any
     """The model, the corners of the uncertainty and plants within, for a law like the servo's own with this rate."""
     servos = extreme_plants(servo, uncertainty, _WITHIN, seed=0)
     if isinstance(servo.controller, Controller):
-        return PlantSet.of([each.plant() for each in servos], rate)
+        return PlantSet.of([each.plant() for each in servos], rate, servo.sensors.fed_back(servo.p).late(rate))
     return LawSet.of([each for each in servos if isinstance(each, Axis)], rate)
 
 
@@ -111,7 +111,7 @@ def loop_margins(servo: Plant, uncertainty: Uncertainty, law: AnyController) -> 
 def nominal_margins(servo: Plant, law: AnyController) -> Margins:
     """Margins of a law on the model itself, at the law's own rate."""
     if isinstance(law, Controller) and law.sample_rate is not None:
-        return _sampled_margins(servo, law)
+        return sampled_margins(servo.plant(), law, servo.sensors.fed_back(servo.p).late(law.sample_rate))
     running = law_of(law)
     if isinstance(servo, Axis):
         if isinstance(running, LinearLaw) and running.sample_rate is not None:
@@ -119,15 +119,6 @@ def nominal_margins(servo: Plant, law: AnyController) -> Margins:
         return servo.margins(running)
     assert isinstance(running, Controller)
     return servo.margins(running)
-
-
-def _sampled_margins(servo: Plant, law: Controller) -> Margins:
-    plants = PlantSet.of([servo.plant()], law.sample_rate)
-    return margins_of_response(
-        lambda omega: plants.loop(law, 0, np.atleast_1d(omega)[None])[0],
-        np.unique(plants.omega[0]),
-        stable=bool(plants.margins(law).stable[0]),
-    )
 
 
 @lru_cache(maxsize=16)

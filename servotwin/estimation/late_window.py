@@ -1,0 +1,40 @@
+"""Windows of late encoders: their readings at the samples whose motion they show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TypeVar
+
+from servotwin.estimation.window import Window
+from servotwin.plant.axis import Axis
+from servotwin.plant.plants import Plant
+from servotwin.plant.signals import Array
+
+_Plant = TypeVar("_Plant", bound=Plant)
+
+
+def prompt_window(window: Window, plant: Plant) -> Window:
+    """The window with the readings of a plant's late encoders moved to when they were true, in whole samples.
+
+    What is left of a delay is less than half a sample. Commands and reference stay; the end is shorter by the longest
+    delay.
+    """
+    motor, load = plant.sensors.motor.late(window.sample_rate), plant.sensors.load.late(window.sample_rate)
+    if plant.at_motor and window.follows_motor(plant.p, within=plant.p * plant.encoder_resolution):
+        load = motor
+    if motor == load == 0:
+        return window
+    late: Mapping[str, int] = {"theta_m": motor, "position": load}
+    kept = window.samples - max(late.values())
+    channels: dict[str, Array] = {
+        name: values[late.get(name, 0) : late.get(name, 0) + kept] for name, values in window.channels.items()
+    }
+    return Window(**channels, sample_rate=window.sample_rate, start=window.start, source=window.source)
+
+
+def prompt_plant(plant: _Plant) -> _Plant:
+    """The plant with encoders that are not late, as its prompt windows show it."""
+    if not isinstance(plant, Axis) or plant.sensors.encoder_delay == plant.sensors.position_delay == 0.0:
+        return plant
+    return replace(plant, sensors=replace(plant.sensors, encoder_delay=0.0, position_delay=0.0))
