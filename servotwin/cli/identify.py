@@ -17,6 +17,7 @@ from rich.table import Table
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import is_motors_position
+from servotwin.estimation.late_window import samples_late
 from servotwin.estimation.learning.trend import Trend, TrendSettings
 from servotwin.estimation.learning.wear import Wear
 from servotwin.estimation.passage import Passage
@@ -176,7 +177,7 @@ def cut(log: Log, options: IdentifyOptions, servo: Plant) -> tuple[Window, ...]:
 def _usual_window(servo: Plant, rate: float) -> float:
     """Length of windows where neither command nor log states one, s; of an axis enough samples at a rate (Hz)."""
     usual = WINDOW * scales(servo).time * (_FREE if servo.backlash_kind is BacklashKind.FREE else 1.0)
-    return max(usual, SHORTEST / rate) if isinstance(servo, Axis) else usual
+    return max(usual, (SHORTEST + samples_late(servo, rate)) / rate) if isinstance(servo, Axis) else usual
 
 
 def window_starts(reference: Sequence[float] | np.ndarray[Any, Any], length: int, before: int) -> list[int]:

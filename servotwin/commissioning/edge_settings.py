@@ -20,6 +20,7 @@ from servotwin.edge.settings import AgentSettings, Supervision
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import servo_for
 from servotwin.estimation.gap import shortest_window
+from servotwin.estimation.late_window import samples_late
 from servotwin.estimation.output_error import too_slow
 from servotwin.estimation.whitened.estimator import SHORTEST
 from servotwin.messages import Setting
@@ -221,11 +222,14 @@ class Commissioning:
 
     @property
     def _shortest_window(self) -> tuple[float, str]:
-        twin = self.twin
+        twin, rate = self.twin, self.recording.sample_rate
         model = servo_for(self.servo)
         if model is None:
-            return SHORTEST / self.recording.sample_rate, f"an estimate, which needs {SHORTEST} samples"
-        return shortest_window(twin.method, model, self.recording.sample_rate, twin.estimator)
+            needed, why = SHORTEST / rate, f"an estimate, which needs {SHORTEST} samples"
+        else:
+            needed, why = shortest_window(twin.method, model, rate, twin.estimator)
+        late = samples_late(self.servo, rate)
+        return needed + late / rate, f"{why} beside {late} by which encoders are late" if late else why
 
     def check_window(self) -> None:
         """Refuse a window that does not fit into memory or is too short for the estimator, or has too few samples of a

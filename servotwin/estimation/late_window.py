@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
-from typing import TypeVar
 
 from servotwin.estimation.window import Window
-from servotwin.plant.axis import Axis
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
 
-_Plant = TypeVar("_Plant", bound=Plant)
+
+def samples_late(plant: Plant, rate: float) -> int:
+    """Samples at a rate (Hz) by which a window of late encoders gets shorter."""
+    return max(plant.sensors.motor.late(rate), plant.sensors.load.late(rate))
 
 
 def prompt_window(window: Window, plant: Plant) -> Window:
     """The window with the readings of a plant's late encoders moved to when they were true, in whole samples.
 
-    What is left of a delay is less than half a sample. Commands and reference stay; the end is shorter by the longest
+    What is left of a delay is at most half a sample. Commands and reference stay; the end is shorter by the longest
     delay.
     """
     motor, load = plant.sensors.motor.late(window.sample_rate), plant.sensors.load.late(window.sample_rate)
@@ -31,10 +31,3 @@ def prompt_window(window: Window, plant: Plant) -> Window:
         name: values[late.get(name, 0) : late.get(name, 0) + kept] for name, values in window.channels.items()
     }
     return Window(**channels, sample_rate=window.sample_rate, start=window.start, source=window.source)
-
-
-def prompt_plant(plant: _Plant) -> _Plant:
-    """The plant with encoders that are not late, as its prompt windows show it."""
-    if not isinstance(plant, Axis) or plant.sensors.encoder_delay == plant.sensors.position_delay == 0.0:
-        return plant
-    return replace(plant, sensors=replace(plant.sensors, encoder_delay=0.0, position_delay=0.0))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
+from dataclasses import replace
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from servotwin.plant.servo import PRESETS, Servo
 
 Plant: TypeAlias = Servo | Axis
 """A machine that can be simulated: the paper's servo, or an axis made of parts."""
+
+
+_Plant = TypeVar("_Plant", bound=Plant)
 
 
 def resolve_plant(name_or_path: str, folder: str | os.PathLike[str] = ".", tuned: bool = True) -> Plant:
@@ -122,3 +126,10 @@ PLANT_KEY = key(
     help="A preset, or the path of the TOML of a servo or of an axis, relative to this file.",
 )
 """Key of a machine in the files that name one."""
+
+
+def prompt_plant(plant: _Plant) -> _Plant:
+    """The plant with encoders that are not late."""
+    if not isinstance(plant, Axis) or plant.sensors.encoder_delay == plant.sensors.position_delay == 0.0:
+        return plant
+    return replace(plant, sensors=replace(plant.sensors, encoder_delay=0.0, position_delay=0.0))

@@ -13,7 +13,7 @@ from servotwin.hybrid.compiled import bare, inlined, verbatim
 from servotwin.hybrid.flow import Scratch
 from servotwin.hybrid.kernel import DONE, FULL, ZENO, RunRecord, step_once
 from servotwin.hybrid.tables import Tables
-from servotwin.simulation.ticks import Output, Port, TickInputs, in_turn, measured, write_sample
+from servotwin.simulation.ticks import Output, Port, TickInputs, in_turn, measured, note_motor, write_sample
 
 tick = verbatim(linear_tick.linear_tick)
 
@@ -22,7 +22,6 @@ class TwoSensors(NamedTuple):
     """Port of a law that reads motor and load."""
 
     port: Port
-    motor: int  # state of the motor's angle
     resolution: float  # rad per count of its encoder
     counted: int  # 1: it counts, 0: it is ideal
     late: Array  # (d,) readings of it that are not shown yet, tick i's at i % d
@@ -48,12 +47,13 @@ def take_law_tick(
     output: Output,
 ) -> LinearState:
     """Measure, tick, record both; the recorded measurement is the load's."""
+    note_motor(i, x, sensors.port, output)
     k, at = i - tick_inputs.first, np.uint64(i - output.first_tick)
     zone = np.uint64(k & tick_inputs.zone_mask)
     noise = tick_inputs.noise[np.uint64(k & tick_inputs.noise_mask)]
     y_load = in_turn(i, measured(x[sensors.port.position], noise, sensors.port), sensors.port.late)
     error = tick_inputs.motor[np.uint64(k & tick_inputs.motor_mask)]
-    y_motor = in_turn(i, motor_angle(x[sensors.motor] + error, sensors), sensors.late)
+    y_motor = in_turn(i, motor_angle(x[sensors.port.motor] + error, sensors), sensors.late)
     now = LinearParameters(
         parameters.advance,
         parameters.output,

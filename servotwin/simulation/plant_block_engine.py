@@ -37,7 +37,7 @@ def _responses_for(automaton: Automaton, step: float, searches: int, input_index
 def fits_plant_blocks(engine: SampledEngine) -> bool:
     """True for a run of many ticks, with ticks at every sample, that has not begun."""
     ticks = (engine.samples - 1) * engine.record_every
-    instant = engine.tick_every == 1 and engine.port.late.size == 0
+    instant = engine.tick_every == 1 and engine.port.late.size == 0 and engine.output.motor.size == 0
     return instant and engine.port.searches <= _MOST_SEARCHES and ticks >= _LEAST_TICKS
 
 

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.plant.noise import Noise, NoiseSource
 from servotwin.plant.plants import Plant
 from servotwin.plant.sensors import Encoder
 from servotwin.simulation.inputs import quantised
 
+TICKED_MOTOR = "theta_m at ticks"
+"""Channel of the motor's true angle, tick by tick."""
 _BLOCK, _REMEMBERED = 4096, 4
 
 
@@ -143,19 +144,8 @@ class Readings:
 
     @staticmethod
     def of(servo: Plant, rate: float, every: int, noise: Noise | None, rng: np.random.Generator) -> Readings | None:
-        """Errors at steps of a rate (Hz), of which a sample is `every` long; None: none but counts and `noise`.
-
-        Raises
-        ------
-        InvalidInput
-            The motor's encoder is late by a part of a sample, whose angle is not recorded.
-        """
+        """Errors at steps of a rate (Hz), of which a sample is `every` long; None: none but counts and `noise`."""
         motor, position = servo.sensors.motor, servo.sensors.fed_back(servo.p)
-        if motor.late(rate) % every:
-            raise InvalidInput(
-                f"sensors encoder_delay = {motor.delay!r} s: must be a whole number of the recorded samples of "
-                f"{every / rate:g} s too"
-            )
         if motor.true and position.true:
             return None
         keys = rng.integers(2**62, size=2).tolist()
@@ -171,8 +161,13 @@ class Readings:
 
     @property
     def motor_late(self) -> int:
-        """Samples by which the motor's readings are late."""
-        return self.motor.late // self.every
+        """Samples by which the motor's readings are late, or more."""
+        return -(-self.motor.late // self.every)
+
+    @property
+    def between_samples(self) -> bool:
+        """True where the motor's readings show its angle between two samples, at a tick of the law."""
+        return self.motor.late % self.every != 0
 
     def source(self, tick_rate: float, every: int, rng: np.random.Generator) -> PositionErrors:
         """Errors of the measured position at ticks, which are `every` steps apart."""
@@ -181,16 +176,14 @@ class Readings:
 
 
 def motor_readings(
-    servo: Plant,
-    readings: Readings | None,
-    theta_m: Callable[[int, int], Array],
-    first: int,
-    last: int,
+    servo: Plant, readings: Readings | None, channel: Callable[[str, int, int], Array], first: int, last: int
 ) -> Array:
-    """(last - first,) rad, the motor's encoder at samples first .. last - 1, whose true angles `theta_m` gives."""
+    """(last - first,) rad, the motor's encoder at samples first .. last - 1; `channel` gives what was simulated."""
     if readings is None or last == first:
-        return quantised(theta_m(first, last), servo.encoder_resolution)
-    seen = np.maximum(np.arange(first, last) - readings.motor_late, 0)
-    begin = int(seen[0])
-    angle = theta_m(begin, int(seen[-1]) + 1)[seen - begin]
-    return quantised(angle + readings.motor.at(seen * readings.every), servo.encoder_resolution)
+        return quantised(channel("theta_m", first, last), servo.encoder_resolution)
+    every = readings.every
+    steps = np.maximum(every * np.arange(first, last) - readings.motor.late, 0)
+    name, unit = (TICKED_MOTOR, 1) if readings.between_samples else ("theta_m", every)
+    begin, end = int(steps[0]) // unit, int(steps[-1]) // unit
+    angle = channel(name, begin, end + 1)[steps // unit - begin]
+    return quantised(angle + readings.motor.at(steps), servo.encoder_resolution)

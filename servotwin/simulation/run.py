@@ -107,10 +107,12 @@ class Run:
     def measured_theta_m(self) -> Array:
         """Output of the motor's encoder, rad."""
 
-        def angle(first: int, last: int) -> Array:
-            return self.theta_m[first:last]
+        def channel(name: str, first: int, last: int) -> Array:
+            return self.theta_m[first:last] if name == "theta_m" else self.channel(name, first, last)
 
-        return self._get("measured theta_m", lambda: motor_readings(self.servo, self.readings, angle, 0, self.samples))
+        return self._get(
+            "measured theta_m", lambda: motor_readings(self.servo, self.readings, channel, 0, self.samples)
+        )
 
     @property
     def events(self) -> np.recarray[tuple[int], np.dtype[np.void]]:

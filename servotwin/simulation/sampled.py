@@ -34,7 +34,7 @@ from servotwin.plant.sensors import Encoder
 from servotwin.plant.signals import PiecewiseCubic
 from servotwin.simulation.continuous import at_zero
 from servotwin.simulation.inputs import RunInputs, quantised, whole_ratio
-from servotwin.simulation.readings import NoiseBuffer, PositionErrors, Readings
+from servotwin.simulation.readings import TICKED_MOTOR, NoiseBuffer, PositionErrors, Readings
 from servotwin.simulation.start import plant_start, set_states, started
 from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
 
@@ -79,7 +79,8 @@ class SampledEngine:
         self.draws = NoiseBuffer(self._noise_source(), ahead=0 if self.keep is None else _CHUNK)
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
-        self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every)
+        between = self.readings is not None and self.readings.between_samples
+        self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every, between)
 
     def _started(self, command: float) -> tuple[Any, Any]:
         """State of the law at rest under a command that holds the load, and its parameters, of the kind that this
@@ -97,6 +98,7 @@ class SampledEngine:
         return Port(
             names.index("voltage"),
             int(np.argmax(self.plant.rows["sensed"][0])),
+            names.index("theta_m"),
             self.servo.position_resolution,
             1 if self.servo.position_resolution > 0.0 else 0,
             np.array(self._recorded()),
@@ -303,6 +305,8 @@ class SampledEngine:
         last."""
         if name == "measured_position":
             return self._measured(first, last)
+        if name == TICKED_MOTOR:
+            return self.output.motor[first - self.output.first_tick : last - self.output.first_tick]
         row = self.plant.rows[name][0]
         out = np.zeros(last - first)
         for j, state in enumerate(self.port.recorded):
@@ -384,10 +388,11 @@ def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
     return (1, whole) if tick_rate >= sample_rate else (whole, 1)
 
 
-def _new_output(rows: int, samples: int, tick_every: int, record_every: int) -> Output:
-    """Buffers for so many samples of `rows` states, and for their ticks."""
+def _new_output(rows: int, samples: int, tick_every: int, record_every: int, motor: bool) -> Output:
+    """Buffers for so many samples of `rows` states, and for their ticks, with the motor's angle at these or without."""
     ticks = -(-((samples - 1) * record_every + 1) // tick_every)
-    return Output(np.empty((rows, samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8), 0, 0)
+    angles = np.empty(ticks if motor else 0)
+    return Output(np.empty((rows, samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8), angles, 0, 0)
 
 
 def _shifted_output(output: Output, sample: int, tick_every: int, record_every: int) -> Output:
@@ -397,6 +402,7 @@ def _shifted_output(output: Output, sample: int, tick_every: int, record_every: 
         (output.states, sample - output.first_sample),
         (output.measured, tick - output.first_tick),
         (output.active, tick - output.first_tick),
+        (output.motor, tick - output.first_tick),
     ):
         # Source and destination overlap: the copy is needed.
         values[..., : values.shape[-1] - by] = values[..., by:].copy()

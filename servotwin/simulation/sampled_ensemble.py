@@ -10,11 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from servotwin.control.laws import law_of
+from servotwin.control.controller import Controller
+from servotwin.control.laws import Law, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
 from servotwin.hybrid.automaton import Array
 from servotwin.hybrid.members import Figures, figures_of
+from servotwin.plant.plants import Plant, prompt_plant
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_pieces
 from servotwin.simulation.ensemble import Cases, check_constants, samples_of
 from servotwin.simulation.inputs import RunInputs, with_forces
@@ -212,7 +214,23 @@ def sampled_members(servos: Any, controllers: Any, cases: SampledCases) -> Sampl
     for law in running.values():
         if law.sample_rate is None:
             raise InvalidInput("a sampled ensemble needs controllers with a sample_rate")
+    every_servo, constants["delay"] = _late_in_command(every_servo, every_law, delays)
     return SampledMembers(shape, every_servo, every_law, with_forces(constants, every_servo))
+
+
+def _late_in_command(servos: list[Plant], laws: list[Law], delays: Array) -> tuple[list[Plant], Array]:
+    """Servos and delays with the age of what a filtered PID reads added to that of its command.
+
+    From rest the loop then moves as it does with a late sensor, so many ticks later, and advances in blocks.
+    """
+    prompt = {id(servo): prompt_plant(servo) for servo in servos}
+    found, longer = list[Plant](), delays.copy()
+    for k, (servo, law) in enumerate(zip(servos, laws, strict=True)):
+        late = servo.sensors.fed_back(servo.p).late(law.sample_rate) if isinstance(law, Controller) else 0
+        moved = 0 < late <= LARGEST_DELAY - delays[k]
+        found.append(prompt[id(servo)] if moved else servo)
+        longer[k] += late if moved else 0
+    return found, longer
 
 
 def _span(duration: float, sample_rate: float, outputs: Sequence[str], last: float, shape: SignalLike) -> SampledSpan:

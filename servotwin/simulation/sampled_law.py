@@ -33,9 +33,8 @@ class SampledLawEngine(SampledEngine):
     @property
     def sensors(self) -> TwoSensors:
         """Port with the motor's encoder."""
-        angle = self.plant.automaton.names.index("theta_m")
         counted = 1 if self.servo.encoder_resolution > 0.0 else 0
-        return TwoSensors(self.port, angle, self.servo.encoder_resolution, counted, self.motor_late)
+        return TwoSensors(self.port, self.servo.encoder_resolution, counted, self.motor_late)
 
     def _make_port(self, searches: int) -> Port:
         late = self.servo.sensors.motor.late(self.tick_rate)

@@ -255,11 +255,7 @@ class Simulation:
         if name == "reference":
             return self.inputs.reference.on(self.inputs.times(first, last))
         if name == "theta_m":
-
-            def angle(begin: int, end: int) -> Array:
-                return self.engine.channel("theta_m", begin, end)
-
-            return motor_readings(self.servo, self.readings, angle, first, last)
+            return motor_readings(self.servo, self.readings, self.engine.channel, first, last)
         return self.engine.channel("measured_position" if name == "position" else name, first, last)
 
     def run(self) -> Run:

@@ -23,6 +23,7 @@ class Port(NamedTuple):
 
     voltage: int
     position: int
+    motor: int
     resolution: float
     counted: int  # 1: the sensor counts, 0: it is ideal
     recorded: NDArray[np.int64]  # states written at every recorded step
@@ -55,6 +56,7 @@ class Output(NamedTuple):
     states: Array  # (recorded, samples)
     measured: Array  # (ticks,)
     active: NDArray[np.int8]  # (ticks,)
+    motor: Array  # (ticks,) the motor's true angle, or empty
     first_sample: int
     first_tick: int
 
@@ -133,6 +135,13 @@ def take_tick(
 
 
 @inlined
+def note_motor(i: int, x: Array, port: Port, output: Output) -> None:
+    """Record the motor's true angle at tick i, where that is asked for."""
+    if output.motor.size > 0:
+        output.motor[i - output.first_tick] = x[port.motor]
+
+
+@inlined
 def write_sample(row: int, x: Array, port: Port, output: Output) -> None:
     """Record the states of one sample."""
     for j in range(len(port.recorded)):
@@ -146,6 +155,7 @@ def tick_and_record(
     """Tick and record where they are due at a base step, before the plant flows on."""
     if base % port.tick_every == 0:
         i, position = base // port.tick_every, x[port.position]
+        note_motor(i, x, port, output)
         state = take_tick(i, position, parameters, state, port, tick_inputs, output)
         x[port.voltage] = in_turn(i, state.voltage, port.delayed)
     if base % port.record_every == 0:
@@ -177,6 +187,7 @@ def run_ticks(
         if record.size[1] > port.room:
             return FULL, base, mode, state
         if to_tick == 0:
+            note_motor(i, x, port, output)
             state = take_tick(i, x[port.position], parameters, state, port, tick_inputs, output)
             x[port.voltage] = in_turn(i, state.voltage, port.delayed)
             to_tick = port.tick_every

@@ -19,7 +19,7 @@ from servotwin.estimation.controller import ControllerComparison, compare_contro
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
 from servotwin.estimation.gap import default_method, estimate_gap, options_for
-from servotwin.estimation.late_window import prompt_plant, prompt_window
+from servotwin.estimation.late_window import prompt_window
 from servotwin.estimation.learning.machine import nameplate
 from servotwin.estimation.learning.motor import MotorLearning
 from servotwin.estimation.learning.wear import Expectation
@@ -30,7 +30,7 @@ from servotwin.messages import Setting
 from servotwin.plant.actuator import DcMotor
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind
-from servotwin.plant.plants import Plant
+from servotwin.plant.plants import Plant, prompt_plant
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array, SignalLike, as_nonnegative
 from servotwin.redesign.policy import NOT_OBSERVED

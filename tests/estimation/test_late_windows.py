@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 import servotwin as st
-from servotwin.estimation.late_window import prompt_plant, prompt_window
+from servotwin.estimation.late_window import prompt_window
 from servotwin.estimation.learning.wear import Wear
+from servotwin.plant.plants import prompt_plant
 from servotwin.twin.estimating import estimator_of
 from servotwin.twin.settings import TwinSettings
 

@@ -20,6 +20,7 @@ from servotwin.redesign.certified.margins import nominal_margins, plant_set
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.simulation.endless import FOREVER, OpenLoopPlant, UnboundedSimulation
 from servotwin.simulation.inputs import quantised
+from servotwin.simulation.sampled_ensemble import SampledCases, simulate_sampled
 from servotwin.simulation.simulate import Simulation
 
 RATE, SAMPLES = 1000.0, 600
@@ -246,3 +247,30 @@ def test_a_voltage_from_outside_meets_the_same_readings() -> None:
         held.hold(state.voltage)
     for values, name in zip(np.array(seen).T, ("theta_m", "position", "voltage"), strict=True):
         assert np.array_equal(values, run.measured(name)[:-1]), name
+
+
+@pytest.mark.parametrize("controller", [PID, CASCADE])
+def test_coarser_samples_are_some_of_the_finer_ones(controller: str) -> None:
+    """Also where a reading is late by half a sample."""
+    axis = drive(controller, **LATE, position_noise=2e-6, encoder_noise=1e-3, encoder_resolution=1e-4)
+    fine = st.simulate(axis, 1.0, reference=1e-3, sample_rate=RATE, seed=5)
+    coarse = st.simulate(axis, 1.0, reference=1e-3, sample_rate=RATE / 2.0, seed=5)
+    for name in ("theta_m", "position", "voltage"):
+        assert np.array_equal(coarse.measured(name), fine.measured(name)[::2])
+    few = Simulation(axis, 1.0, reference=1e-3, sample_rate=RATE / 2.0, seed=5, keep=50)
+    for index in range(40, 501, 20):
+        few.advance(index)
+        first = max(0, index - 50)
+        assert np.array_equal(few.measured("theta_m", first, index), coarse.measured("theta_m")[first:index])
+
+
+def test_ensembles_of_late_sensors_are_their_runs() -> None:
+    """A filtered PID's, in blocks, so many samples later; a cascade's as it is."""
+    for controller, later in ((PID, 3), (CASCADE, 0)):
+        axis = drive(controller, **LATE, position_resolution=1e-7)
+        cases = SampledCases(reference=[1e-3, 2e-3], resolution=1e-7)
+        made = simulate_sampled(axis, None, 0.5, cases, outputs=("position",), sample_rate=RATE)["position"]
+        for size, positions in zip((1e-3, 2e-3), made, strict=True):
+            run = st.simulate(axis, 0.5, reference=size, sample_rate=RATE)
+            assert positions[later:] == pytest.approx(run.position[: 501 - later], abs=1e-9)
+            assert np.ptp(positions) > 0.5 * size
