@@ -85,7 +85,7 @@ class SampledEngine:
     def _started(self, command: float) -> tuple[Any, Any]:
         """State of the law at rest under a command that holds the load, and its parameters, of the kind that this
         engine's ticks take."""
-        measured = float(self.plant.rows["sensed"][0] @ self.state)
+        measured = float(self.plant.rows["sensed"][0] @ self.state) + self._encoder_error()
         return started(self.controller, measured, command), self.controller.law(None)
 
     @property
@@ -107,7 +107,7 @@ class SampledEngine:
             searches,
             len(self.record.event_step) - EVENTS_PER_STEP - CHANGES_AT_ONCE,
             np.full(self.delay, self._applied),
-            np.full(self._fed_back.late(self.tick_rate), self._reading()),
+            np.full(self._fed_back.late(self.tick_rate), self._reading(self._encoder_error())),
         )
 
     def _noise_source(self) -> NoiseSource | PositionErrors | None:
@@ -325,8 +325,11 @@ class SampledEngine:
 
     def _measured_now(self) -> float:
         """Measurement of the present state, without a noise that is still to be drawn."""
-        step = np.array([self.base])
-        return self._shown(0.0 if self.readings is None else float(np.ravel(self.readings.position.at(step))[0]))
+        return self._shown(self._encoder_error())
+
+    def _encoder_error(self) -> float:
+        """Error of the encoder of the position in the present state."""
+        return 0.0 if self.readings is None else float(np.ravel(self.readings.position.at(np.array([self.base])))[0])
 
     def _noise_ahead(self) -> float:
         """Noise of the tick that is due, which takes it again."""

@@ -23,7 +23,7 @@ class SampledLawEngine(SampledEngine):
     controller: LinearLaw  # type: ignore[assignment]
 
     def _started(self, command: float) -> tuple[LinearState, LinearParameters]:
-        start = linear_start(self.controller, self._motor_reading(0), self._reading(), command)
+        start = linear_start(self.controller, self._motor_reading(0), self._reading(self._encoder_error()), command)
         return start, _with_arrays(self.controller.parameters())
 
     @property

@@ -274,3 +274,14 @@ def test_ensembles_of_late_sensors_are_their_runs() -> None:
             run = st.simulate(axis, 0.5, reference=size, sample_rate=RATE)
             assert positions[later:] == pytest.approx(run.position[: 501 - later], abs=1e-9)
             assert np.ptp(positions) > 0.5 * size
+
+
+@pytest.mark.parametrize("controller", [PID, CASCADE])
+@pytest.mark.parametrize("late", [{}, LATE])
+def test_a_machine_that_stands_where_it_is_to_stand_is_not_moved_by_offsets(
+    controller: str, late: dict[str, float]
+) -> None:
+    axis = drive(controller, position_offset=2e-4, encoder_offset=0.3, **late)
+    run = st.simulate(axis, 0.2, reference=2e-4, sample_rate=RATE)
+    assert np.abs(run.voltage).max() < 1e-12
+    assert np.abs(run.position).max() < 1e-15
