@@ -21,7 +21,7 @@ from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.twin.settings import TwinSettings
 
 KNOWN = Uncertainty(gap=(0.0, 0.2), step=(0.035, 0.07), input_bias=(-0.08, 0.08))
-FEW = Demands(machines=40, settled=0.9, beyond=Beyond(machines=10), attempts=2)
+FEW = Demands(machines=16, settled=0.8, beyond=Beyond(machines=4), attempts=2)
 FEWER = Demands(machines=6, screened=2, conditions=4, settled=0.6, beyond=Beyond(machines=4), attempts=2)
 """The same candidates: the fallback set, which only bounds their dead zones, is verified on fewer machines."""
 
