@@ -1,17 +1,9 @@
 """Demands of a certified twin for tests that are not about how often a setting was tried."""
 
 from servotwin.cosim.scenario import Scenario
-from servotwin.redesign.certified.demands import Beyond, Demands
+from servotwin.redesign.certified.demands import Demands
 
-FEW = Demands(
-    machines=16,
-    screened=2,
-    scales=(0.5, 0.7),
-    settled=0.8,
-    beyond=Beyond(machines=4),
-    notch=False,
-    velocity_feedforward=False,
-)
+FEW = Demands(machines=16, screened=2, scales=(0.5, 0.7), settled=0.8, notch=False, velocity_feedforward=False)
 """Settings verified on fewer machines than usual, from fewer candidates."""
 
 

@@ -16,7 +16,7 @@ from servotwin.messages import Acknowledge, Gains, Setting, Update, pack_channel
 from servotwin.plant.servo import Servo
 from servotwin.redesign.certified import policy as policies
 from servotwin.redesign.certified.certificate import NotVerified
-from servotwin.redesign.certified.demands import Beyond, Demands
+from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.policy import band_of
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.certified.verification import verification_of
@@ -27,7 +27,7 @@ from servotwin.twin.state import decode_state, encode_state
 from servotwin.twin.twin import Twin
 
 PAPER = Servo.preset("paper")
-FEW = Demands(machines=16, screened=2, scales=(0.5, 0.7), settled=0.8, beyond=Beyond(machines=4))
+FEW = Demands(machines=16, screened=2, scales=(0.5, 0.7), settled=0.8)
 SETTINGS = TwinSettings(demands=FEW)
 
 
