@@ -119,12 +119,13 @@ def _elastic(m: Array, k: Array, c: Array, k_d: float | Array, c_d: float | Arra
 
 def tridiagonal(k: Array) -> Array:
     """(..., n, n) stiffness (or damping) matrix of Eq 9 for the elements k (..., n)."""
-    n = k.shape[-1]
-    result, every = np.zeros((*k.shape, n)), np.arange(n)
-    result[..., every, every] = k
-    result[..., every[:-1], every[:-1]] += k[..., 1:]
-    result[..., every[:-1], every[1:]] = result[..., every[1:], every[:-1]] = -k[..., 1:]
-    return result
+    n, ahead = k.shape[-1], k[..., 1:]
+    result = np.zeros((*k.shape[:-1], n * n))
+    # Every n + 1 elements on is the next one of a diagonal.
+    result[..., :: n + 1] = k
+    result[..., : n * (n - 1) : n + 1] += ahead
+    result[..., 1 : n * (n - 1) : n + 1] = result[..., n :: n + 1] = -ahead
+    return result.reshape((*k.shape, n))
 
 
 def _first_order(m: Array, stiffness: Array, damping: Array) -> Array:
@@ -132,7 +133,8 @@ def _first_order(m: Array, stiffness: Array, damping: Array) -> Array:
     n = m.shape[-1]
     result = np.zeros((*m.shape[:-1], 2 * n, 2 * n))
     result[..., :n, n:] = np.eye(n)
-    result[..., n:, :] = np.concatenate([-stiffness, -damping], axis=-1) / m[..., :, None]
+    masses = m[..., :, None]
+    result[..., n:, :n], result[..., n:, n:] = -stiffness / masses, -damping / masses
     return result
 
 

@@ -47,23 +47,16 @@ def test_a_log_of_a_rotary_axis_shows_its_gap(logs: Path, name: str, servo: str 
     assert estimate.gap == pytest.approx(GAP, rel=0.01)
 
 
-@pytest.fixture(scope="module")
-def two_steps(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = st.simulate(DRIVE, 4.0, reference=st.SquareWave(0.2, 4.0), gap=GAP, sample_rate=1000.0)
-    path = tmp_path_factory.mktemp("wear") / "log.npz"
-    write_log(SignalTable(run.columns, {"servo": DRIVE.dumps()}), path)
-    return path
-
-
 @pytest.mark.slow
-def test_the_wear_of_an_axis_is_that_of_its_gap_and_log(two_steps: Path) -> None:
+def test_the_wear_of_an_axis_is_that_of_its_gap_and_log(logs: Path) -> None:
     """The gap grows by itself within 40 windows, and not by the 0.4 deg/s that are stated."""
-    found = identify(IdentifyOptions(two_steps, window=1.9))
+    log = logs / "own.npz"
+    found = identify(IdentifyOptions(log, window=1.9))
     widest = max(estimate.interval[1] for estimate in found.estimates)
     assert len(found.estimates) == 2
     assert found.trend is not None
     assert found.trend.settings.rate_std_rad_per_s == pytest.approx(widest / (40.0 * 1.9), rel=0.5)
-    stated = identify(IdentifyOptions(two_steps, window=1.9, wear_deg=0.4, wear_over_s=1.0))
+    stated = identify(IdentifyOptions(log, window=1.9, wear_deg=0.4, wear_over_s=1.0))
     for own, fast in zip(found.estimates, stated.estimates, strict=True):
         assert own.ok
         assert own.interval[0] <= GAP <= own.interval[1]
@@ -177,8 +170,8 @@ def test_windows_of_one_flank_each_say_that_two_steps_show_both(tmp_path: Path) 
     assert "--window" not in both
 
 
-def test_the_estimates_of_a_log_are_reported_one_by_one(two_steps: Path) -> None:
+def test_the_estimates_of_a_log_are_reported_one_by_one(logs: Path) -> None:
     reported: list[tuple[int, int]] = []
-    options = IdentifyOptions(two_steps, window=1.9, wear_deg=0.1, wear_over_s=10.0)
+    options = IdentifyOptions(logs / "own.npz", window=1.9, wear_deg=0.1, wear_over_s=10.0)
     found = identify(options, lambda done, total: reported.append((done, total)))
     assert reported == [(done, len(found.estimates)) for done in range(len(found.estimates))]

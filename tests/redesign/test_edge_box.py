@@ -26,7 +26,7 @@ from servotwin.twin.settings import TwinSettings
 SERVOS = ("paper", "table1", "paper-gain2")
 # Its loop does not depend on the gap.
 AXES = [name for name in DUTIES if name != "emps"]
-FEW = Demands(machines=16, screened=2, settled=0.8)
+FEW = Demands(machines=6, screened=2, conditions=4, settled=0.6, beyond=Beyond(machines=4))
 """All candidates, but the fallback set that bounds their dead zones is verified on fewer machines than usual."""
 
 

@@ -14,7 +14,7 @@ from servotwin.plant.axis import Axis
 from servotwin.redesign.certified.assess import assess
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.certify import certify
-from servotwin.redesign.certified.demands import Demands
+from servotwin.redesign.certified.demands import Beyond, Demands
 from servotwin.redesign.certified.machines import draw_independently
 from servotwin.redesign.certified.policy import CertifiedPolicy
 from servotwin.redesign.certified.rest_in_gap import coasting_time
@@ -79,7 +79,7 @@ def test_a_load_that_nothing_stops_is_refused_under_any_law() -> None:
     policy_of(replace(bare, load=replace(bare.load, friction=1.5)), TwinSettings(uncertainty=RANGES))
 
 
-FEW = Demands(machines=40, conditions=4, screened=2, settled=0.9)
+FEW = Demands(machines=30, conditions=4, screened=2, settled=0.9, beyond=Beyond(machines=10))
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_a_dead_zone_leaves_a_motor_alone_that_would_drive_to_and_fro(block: str
     assert isinstance(found, Certificate)
     assert found.setting.tolerance == axis.tolerance_for(known.gap[1])
     assert not found.setting.controller.integral_only
-    machines = draw_independently(axis, known, 100, 3)
+    machines = draw_independently(axis, known, 60, 3)
     plain = Design(found.setting.controller.replace(enter=1.0, leave=1.0))
     opened, shut = assess([found.setting, plain], machines, trial_for(axis, known, FEW))
     assert opened.settled.mean() > 0.95

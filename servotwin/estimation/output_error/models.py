@@ -11,6 +11,7 @@ from typing import NamedTuple, Protocol, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.estimation.output_error.one_mass import run_one_mass
 from servotwin.estimation.output_error.shaft import run_shaft
 from servotwin.hybrid.exponential import expm1
 from servotwin.plant.axis import Axis
@@ -283,7 +284,8 @@ class ShaftModel:
         """
         made = self.prepared(drive, interval, values)
         out, sides = np.empty((3, made.drive.size)), np.empty(made.drive.size, dtype=np.int8)
-        run_shaft(
+        run = run_one_mass if self.axis.n == 1 else run_shaft
+        run(
             made.drive,
             made.parts,
             made.interval,

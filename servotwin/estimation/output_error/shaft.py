@@ -21,6 +21,8 @@ _TERMS = 14
 _CHANGES = 8  # within a sample; a load at rest on a flank could touch and leave it for ever
 _ROUNDS = 60
 _EXACT = 1e-13  # of an interval: a shorter step to an instant is the last
+AFTER = _TERMS
+"""Row of the scratch that has the state at the end of a part."""
 
 
 @subroutine
@@ -167,11 +169,11 @@ def through_changes(
 ) -> int:
     """Advance the state by one interval in which flanks are touched or left; return the flank at its end.
 
-    The state at the end is in `work[_TERMS]`, where that of a step without changes was. The other arguments are those
+    The state at the end is in `work[AFTER]`, where that of a step without changes was. The other arguments are those
     of `through_sample`.
     """
     kept, rate = state.size - 3, (end - begin) / interval
-    terms, after, polynomial = work[:_TERMS], work[_TERMS], work[_TERMS + 1 :].reshape(-1)
+    terms, after, polynomial = work[:_TERMS], work[AFTER], work[_TERMS + 1 :].reshape(-1)
     now, left = begin, interval
     for change in range(_CHANGES):
         series(flows[1 if side != 0 else 0], state, terms)
@@ -210,7 +212,7 @@ def through_sample(
 
     The other arguments are those of `run_shaft`.
     """
-    after = work[_TERMS]
+    after = work[AFTER]
     advance(steps[1 if side != 0 else 0], state, after)
     if guard(side, end, after, push, half) < 0.0:
         side = through_changes(side, begin, end, interval, half, flows, push, fading, work, state)
@@ -220,12 +222,27 @@ def through_sample(
 
 
 @inlined
+def unused_friction(speed: float, friction: float) -> float:
+    """What is left of Coulomb friction where it stops a mass."""
+    return max(0.0, friction - abs(speed))
+
+
+@inlined
+def rested(begin: float, end: float, speed: float, unused: float) -> float:
+    """Place at the end of a part of a mass that friction stopped in the half before, and had so much `unused`."""
+    if unused > 0.0:
+        share = 1.0 - 2.0 * unused / abs(speed) if abs(speed) > 2.0 * unused else 0.0
+        end = begin + share * (end - begin)
+    return end
+
+
+@inlined
 def slow_before(state: Array, friction: float) -> float:
     """Apply friction to the last mass before a part; return what is left of it where it stops the mass."""
     last = state.size - 4
     speed = state[last]
     state[last] = slowed(speed, friction)
-    return max(0.0, friction - abs(speed))
+    return unused_friction(speed, friction)
 
 
 @inlined
@@ -237,9 +254,7 @@ def slow_after(state: Array, place: float, unused: float, friction: float) -> No
     """
     n = (state.size - 3) // 2
     speed = state[2 * n - 1]
-    if unused > 0.0:
-        share = 1.0 - 2.0 * unused / abs(speed) if abs(speed) > 2.0 * unused else 0.0
-        state[n - 1] = place + share * (state[n - 1] - place)
+    state[n - 1] = rested(place, state[n - 1], speed, unused)
     state[2 * n - 1] = slowed(speed, friction + unused)
 
 
@@ -273,7 +288,7 @@ def run_shaft(
     motion: Array,
     sides: NDArray[np.int8],
 ) -> None:
-    """Simulate the load.
+    """Simulate the load; one of one mass by `run_one_mass`.
 
     Parameters
     ----------
