@@ -285,7 +285,11 @@ class TwinService:
         return not self.access.open and self.access.verifier(servo) is not None
 
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
-        return await self.executor.run(lambda: self.store.outgoing(servo, after))
+        messages, lost = await self.executor.run(lambda: self.watch.outgoing(servo, after))
+        if lost:
+            self.metrics.evidence.add("alarm")
+            self._announce("the store has lost messages", lost, servo)
+        return messages
 
     def _spawn(self, work: Coroutine[Any, Any, None], vital: bool = True) -> None:
         task = asyncio.create_task(work)
