@@ -10,9 +10,10 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version of the protocol between edge and twin: 1 had no claims and did not tell its number; 2 had no reason of its
-own for an update that meets a fallback; 3 none for one at an edge that was superseded."""
+own for an update that meets a fallback; 3 none for one at an edge that was superseded; the answers of 4 over HTTP did
+not tell which body had come."""
 
 
 class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
