@@ -152,6 +152,19 @@ def check_that_a_second_twin_is_refused(path, monkeypatch):
             service.run(path)
 
 
+def test_a_store_with_a_second_name_is_refused_until_it_has_one_again(tmp_path):
+    """As of a copy by hard links: a lock and a log of its own lie beside each name."""
+    file, other = tmp_path / "twin.db", tmp_path / "copy.db"
+    open_store(str(file)).close()
+    os.link(file, other)
+    for each in (file, other):
+        with pytest.raises(InvalidInput, match="has 2 names"), service._exclusive_store(str(each)):
+            pytest.fail("it is locked")
+    other.unlink()
+    with service._exclusive_store(str(file)):
+        pass
+
+
 @pytest.mark.slow
 def test_a_worker_that_dies_is_replaced_and_nothing_is_lost(tmp_path):
     with process(twin_file(tmp_path)) as (running, url), httpx.Client(base_url=url, timeout=PATIENCE) as client:
