@@ -30,6 +30,8 @@ class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
         nothing); 0: it only asks.
     protocol, software : int, str
         Version of the edge's protocol, and of servotwin there.
+    behind : bool
+        The edge's folder knows nothing of the run whose claim it takes over from: it is an older one, or a copy.
     """
 
     servo: Name
@@ -38,6 +40,7 @@ class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
     takes: Count = 0
     protocol: Count = 1
     software: Text = ""
+    behind: bool = False
 
 
 class ClaimStatus(Struct, frozen=True, omit_defaults=True, tag="standing/1"):

@@ -170,6 +170,10 @@ class Store:
         """Post a message to each of these edges, its serial above `above`; unknown servos are left out."""
         self._write(lambda connection: posting.post(connection, sent, now, above))
 
+    def skip_to_serial(self, servo: str, serial: int) -> None:
+        """Make the serial of the next message to the edge exceed `serial`."""
+        self._write(lambda connection: posting.skip_to_serial(connection, servo, serial))
+
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""
         return self._read(lambda connection: posting.newest_serials(connection, servos))

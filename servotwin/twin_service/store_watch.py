@@ -7,6 +7,7 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TypeVar
 
@@ -17,6 +18,7 @@ from servotwin.store.integrity import IntegrityReport, check_bodies, check_files
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.store import Store
+from servotwin.twin_service.limits import MAX_SERVOS
 from servotwin.twin_service.store_executor import StoreExecutor
 
 log = logging.getLogger(__name__)
@@ -33,6 +35,8 @@ _MARK_S = 5.0
 _TELL_S = 1.0
 _NEW_S = 10.0
 """s between two looks for servos that are new to a store that has lost messages."""
+_AHEAD_S = 3600.0
+"""s for which an edge that has had more than the store sent is not asked once more."""
 _MAX_SERIAL = 2**52
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
 _MARK = "newest"
@@ -75,7 +79,7 @@ class StoreWatch:
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
-        self._asked = set[str]()
+        self._asked, self._ahead = set[str](), dict[str, float]()
         self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
@@ -151,6 +155,12 @@ class StoreWatch:
         posted = self._store.posted([servo]).get(servo, 0)
         if not posted < after <= _MAX_SERIAL:
             return messages, ""
+        if self._monotonic() - self._ahead.get(servo, -inf) < _AHEAD_S:
+            self._store.skip_to_serial(servo, after)  # of two twins behind one address each finds it ahead in turns
+            return messages, ""
+        if len(self._ahead) >= MAX_SERVOS:
+            self._ahead.clear()
+        self._ahead[servo] = self._monotonic()
         log.error("the store has lost messages", extra={"servo": servo, "had": after, "has": posted})
         sentence = (
             f"the edge has had message {after}, and the newest one of the store is {posted}: the store was put back, "
