@@ -53,7 +53,6 @@ from servotwin.runtime.locks import locked
 _NICE = 10
 _PREDECESSOR_S, _LOCK_S = 30.0, 0.05  # how long a link process waits for the end of the one before, and how often
 STATUS_PERIOD_S = 1.0
-_BEHIND = "folder behind"
 _OLDER_FOLDER = (
     "this folder knows nothing of that run, which came before this one: it is an older one that was put back, or a copy"
 )
@@ -224,8 +223,8 @@ class LinkProcess:
             self._pipe.post(frames.encode(frames.SupersededFrame()))
         if self._transport is not None and self._transport.behind != self._behind:
             self._behind = self._transport.behind
-            self._faults[_BEHIND] += 1
-            log(_BEHIND, run=self._behind, why=_OLDER_FOLDER)
+            self._faults["folder behind"] += 1
+            log("folder behind", run=self._behind, why=_OLDER_FOLDER)
 
     def _send_pending(self) -> None:
         """Send the number of pending windows to the control process where it has changed."""
