@@ -16,6 +16,8 @@ from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
+_OF_THE_SENDER = (Refusal.BAD_TOKEN, Refusal.UNKNOWN_SERVO, Refusal.TOO_MANY, Refusal.UNAVAILABLE, Refusal.SUPERSEDED)
+"""Refusals of a claim that hold for every message of its sender."""
 _TRIES = 8
 """Claims in a row that others may win: each run of an edge claims once."""
 
@@ -210,5 +212,11 @@ class ExclusiveTransport:
     def _ask(self, takes: int) -> ClaimStatus | None:
         behind = bool(takes and self.behind) and not self._twin_is_older  # to which a later field is an error
         question = EdgeClaim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software, behind)
-        self.twin = self._transport.ask(question)
+        try:
+            self.twin = self._transport.ask(question)
+        except Refused as error:
+            if error.reason in _OF_THE_SENDER:
+                raise
+            # Of the claim, which may have been changed on its way: no reason to drop the message that waits for it.
+            raise Unreachable(f"the twin does not take this edge's claim: {error}") from None
         return self.twin

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -108,6 +109,16 @@ class _PersistentConnection:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
+
+    @contextmanager
+    def in_step(self) -> Iterator[None]:
+        """Drop the connection where the block finds that an answer is none: those of later requests may follow it."""
+        try:
+            yield
+        except Unreachable:
+            with self._busy:
+                self.drop()
+            raise
 
     def close(self) -> None:
         """Allow no more requests; the one under way fails at once."""
@@ -232,6 +243,10 @@ class HttpTransport:
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when the twin has the message safe; see `Transport`."""
+        with self._up.in_step():
+            self._deliver(parcel)
+
+    def _deliver(self, parcel: Parcel) -> None:
         headers = {"Content-Type": BODY, **_claimed(self.claim)}
         if parcel.encoding:
             headers["Content-Encoding"] = parcel.encoding
@@ -240,7 +255,6 @@ class HttpTransport:
             path = f"{self._base}/letters"
             response = _checked(self._up.request("POST", path, parcel.body, headers, _LONGEST_RESPONSE), (202,), mark)
             if mark is not None and _decode_list(response.body) != [mark.encode()]:
-                self._up.drop()  # an answer to an earlier request: others may follow it
                 raise Unreachable(_OTHER_BODY)
             return
         path = f"{self._base}/windows/{quote(parcel.boot, safe='')}/{parcel.sequence}"
@@ -253,12 +267,16 @@ class HttpTransport:
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
         path = f"{self._base}/outgoing?after={after}&wait={self._wait:g}"
-        return _decode_list(
-            _checked(self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES), (200,)).body
-        )
+        with self._down.in_step():
+            response = self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES)
+            return _decode_list(_checked(response, (200,)).body)
 
     def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         """Send a question or a claim; see `ClaimingTransport`."""
+        with self._up.in_step():
+            return self._ask(claim)
+
+    def _ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         headers = {"Content-Type": BODY}
         response = self._up.request("POST", f"{self._base}/claim", encode(claim), headers, _LONGEST_RESPONSE)
         if response.status == 404 and _refusal_of(response) is Refusal.NOT_UNDERSTOOD:

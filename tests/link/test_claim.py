@@ -89,6 +89,20 @@ def test_a_folder_that_does_not_know_the_run_before_is_behind(newest: ClaimStatu
     assert [claim.behind for claim in twin.claims] == [False, bool(behind) and newest.protocol == PROTOCOL]
 
 
+@pytest.mark.parametrize("reason", list(Refusal))
+def test_a_claim_that_is_refused_drops_no_message(reason: Refusal) -> None:
+    """As one that a proxy has changed on its way: the message itself has not been judged."""
+    twin, outbox = Twin(), MemoryOutbox()
+    outbox.put_letter(b"letter")
+
+    class Refusing(Line):
+        def ask(self, claim: EdgeClaim) -> ClaimStatus | None:  # noqa: ARG002
+            raise Refused(reason, "as told")
+
+    Sender(Session(outbox), ExclusiveTransport(Refusing(twin), "axis", HeldClaim("b1-aa"))).step(0.0)
+    assert len(outbox.letters()) == 1
+
+
 def test_an_edge_claims_before_its_first_message_and_once() -> None:
     twin = Twin()
     one, stored = edge(twin, "b1-aa")

@@ -5,22 +5,18 @@ import ssl
 import threading
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
-import msgspec
 import pytest
 from faketwin import FakeTwin, Handler
 
 from servotwin.errors import InvalidInput
-from servotwin.link.body_mark import body_mark
 from servotwin.link.claim import HeldClaim
 from servotwin.link.http import HttpTransport, LiveHttp
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import (
     Acknowledge,
-    ClaimStatus,
-    EdgeClaim,
     Hello,
     Refusal,
     Setting,
@@ -337,61 +333,3 @@ def test_a_live_view_says_what_it_is_asked_and_that_an_older_twin_has_none(twin:
             link.send(columns, HeldClaim("b1", 3))
     finally:
         link.close()
-
-
-CHANGED = "a proxy on the way changes it, or swaps answers"
-
-
-def marking(mark: str | None) -> Callable[[Handler, bytes], bool]:
-    """A fault: refuse each message for good, and tell that a body with `mark` came; None: the one that was sent."""
-
-    def refuse(handler: Handler, body: bytes) -> bool:
-        if handler.path.endswith("/claim"):
-            return False
-        told = body_mark(body, handler.headers.get("Content-Encoding", "")) if mark is None else mark
-        answer = {"code": Refusal.NOT_UNDERSTOOD.value, "detail": "As told.", "mark": told}
-        handler.answer(422, msgspec.json.encode(answer))
-        return True
-
-    return refuse
-
-
-@pytest.mark.parametrize("message", [parcel(0), LETTER])
-def test_only_a_refusal_of_the_body_as_it_was_sent_is_one(twin: FakeTwin, link: HttpTransport, message: Parcel) -> None:
-    twin.claim_status = ClaimStatus("axis-1", protocol=5)
-    link.ask(EdgeClaim("axis-1", "b0"))
-    for mark in ("", "00000000 deflate", "00000000 "):
-        twin.fault = marking(mark)
-        with pytest.raises(Unreachable, match=CHANGED):
-            link.deliver(message)
-    twin.fault = marking(None)
-    with pytest.raises(Refused, match="As told"):
-        link.deliver(message)
-
-
-@pytest.mark.parametrize(
-    ("status", "body"), [(200, b"login"), (202, b""), (202, msgspec.msgpack.encode([b"00000000 "])), (204, b"")]
-)
-def test_only_the_twin_s_answer_to_a_letter_delivers_it(
-    twin: FakeTwin, link: HttpTransport, status: int, body: bytes
-) -> None:
-    """As a proxy's own page, and the answer to an earlier letter, which a proxy has sent twice."""
-    twin.claim_status = ClaimStatus("axis-1", protocol=5)
-    link.ask(EdgeClaim("axis-1", "b0"))
-
-    def answer(handler: Handler, _body: bytes) -> bool:
-        handler.answer(status, body)
-        return True
-
-    twin.fault = answer
-    with pytest.raises(Unreachable):
-        link.deliver(LETTER)
-
-
-def test_a_twin_of_a_version_before_tells_no_body(twin: FakeTwin, link: HttpTransport) -> None:
-    twin.claim_status = ClaimStatus("axis-1", protocol=4)
-    link.ask(EdgeClaim("axis-1", "b0"))
-    link.deliver(LETTER)
-    twin.fault = marking("")
-    with pytest.raises(Refused):
-        link.deliver(LETTER)
