@@ -7,6 +7,7 @@ exit code 2, and an interrupt into 130.
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import sys
@@ -21,6 +22,8 @@ from servotwin.errors import InvalidInput, ResourceUnavailable
 from servotwin.runtime.extras import EXTRAS, missing_extra
 
 INVALID, INTERRUPTED = 2, 130
+_PATHS = (errno.ENAMETOOLONG, errno.ELOOP)
+"""Errors of a path that a test whether it exists raises too."""
 _INTERRUPT = "interrupted; no partly written file is left"
 
 # Before numpy is loaded: matrices are small here, and OpenBLAS's threads only wait for one another. On two busy cores
@@ -41,6 +44,10 @@ class _Commands(TyperGroup):
             return super().invoke(ctx)
         except (InvalidInput, ResourceUnavailable) as error:
             _end(f"error: {error}", INVALID)
+        except OSError as error:
+            if error.errno not in _PATHS or error.filename is None:
+                raise
+            _end(f"error: {str(error.filename)[:80]}: {error.strerror}", INVALID)
         except _UsageError as error:
             _end(_usage(error), INVALID)
         except ModuleNotFoundError as error:

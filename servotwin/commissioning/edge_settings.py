@@ -182,7 +182,12 @@ class Commissioning:
         # A fast machine needs short windows only, but the estimator needs some samples: of a slow law a long time.
         shortest = self._shortest_window[0]
         needed = shortest if isinstance(self.servo, Axis) else 0.0 if second >= 1.0 else min(usual, shortest)
-        return self._whole(max(usual * second, needed))
+        wanted, rate = max(usual * second, needed), self.recording.sample_rate
+        if wanted * rate < 1.0:
+            raise InvalidInput(
+                f"sample_rate_hz = {rate!r} Hz: a window of {wanted:g} s has no sample; give a higher rate"
+            )
+        return self._whole(wanted)
 
     def with_longest(self, window: float, pre_trigger: float, samples: int) -> Commissioning:
         """The same with the longest window and pre-trigger that the twin may request, in the servo's own seconds.
@@ -196,7 +201,7 @@ class Commissioning:
         """
         rate = self.recording.sample_rate
         if round(self.window * rate) > samples:
-            count = f"has {round(self.window * rate)} samples at {rate!r} Hz"
+            count = f"has {self.window * rate:.15g} samples at {rate!r} Hz"
             raise InvalidInput(
                 f"window = {self.window!r} s: {count}; the twin takes at most samples_per_window = {samples}"
             )

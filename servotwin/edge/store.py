@@ -71,5 +71,5 @@ class FileParameterStore:
             return None
         try:
             return msgspec.convert(upgrade(msgspec.json.decode(data)), StoredParameters).parameters()
-        except (msgspec.MsgspecError, ValueError) as error:
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
             raise InvalidInput(f"{self._path}: does not hold the edge's last parameters: {error}") from None

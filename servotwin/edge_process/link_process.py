@@ -53,6 +53,9 @@ from servotwin.runtime.locks import locked
 _NICE = 10
 _PREDECESSOR_S, _LOCK_S = 30.0, 0.05  # how long a link process waits for the end of the one before, and how often
 STATUS_PERIOD_S = 1.0
+_OLDER_FOLDER = (
+    "this folder knows nothing of that run, which came before this one: it is an older one that was put back, or a copy"
+)
 _SHORTEST_POLL_S = 0.1
 """Time between two empty polls: a twin that is about to end answers a poll at once."""
 
@@ -101,7 +104,7 @@ class LinkProcess:
         # Counts of earlier processes are in their logs; what a corrupt file has just cost is in none.
         self._troubles = TroubleLog({"to the twin": up, "from the twin": down})
         self._dropped = {} if self.outbox.salvages or self.outbox.missing else self._dropped_unintended()
-        self._conflict, self._status_trouble = False, ""
+        self._conflict, self._behind, self._status_trouble = False, "", ""
 
     def run(self) -> None:
         """Run until the control process is gone."""
@@ -214,10 +217,14 @@ class LinkProcess:
         return {why: number for why, number in self.outbox.dropped.items() if why != FILTERED}
 
     def _report_conflict(self) -> None:
-        """Tell the control process, once, that another edge of the servo has taken over."""
+        """Tell the control process, once, that another edge of the servo has taken over; log that one had before."""
         if self._transport is not None and self._transport.superseded and not self._conflict:
             self._conflict = True
             self._pipe.post(frames.encode(frames.SupersededFrame()))
+        if self._transport is not None and self._transport.behind != self._behind:
+            self._behind = self._transport.behind
+            self._faults["folder behind"] += 1
+            log("folder behind", run=self._behind, why=_OLDER_FOLDER)
 
     def _send_pending(self) -> None:
         """Send the number of pending windows to the control process where it has changed."""

@@ -113,7 +113,7 @@ def read_status(path: str | os.PathLike[str]) -> dict[str, Any] | None:
     """Read the last status; None: there is no file, or it does not hold a status."""
     try:
         status = msgspec.json.decode(Path(path).read_bytes())
-    except (OSError, msgspec.MsgspecError):
+    except (OSError, msgspec.MsgspecError, RecursionError):
         return None
     return status if isinstance(status, dict) and status.get("schema") == _STATUS_SCHEMA else None
 

@@ -50,6 +50,8 @@ def _check_files(config: EdgeConfig) -> None:
                 raise InvalidInput(f"{where}: there is no folder {path.parent}")
             if path.is_dir():
                 raise InvalidInput(f"{where}: is a folder; give the name of a file")
+            if path.exists() and not path.is_file():  # a pipe, for one, would be waited for without an end
+                raise InvalidInput(f"{where}: is no file; give the name of a file")
         except OSError as error:
             raise InvalidInput(f"{where}: cannot be used ({error.strerror})") from None
         if (other := taken.setdefault(path.resolve(), key)) != key:

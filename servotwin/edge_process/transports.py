@@ -8,14 +8,16 @@ from typing import TYPE_CHECKING
 from servotwin import __version__
 from servotwin.edge_process.config import EdgeConfig, TwinLink, password_of, token_of
 from servotwin.edge_process.live_view import LiveLink
-from servotwin.link.claim import ClaimingTransport, ExclusiveTransport, HeldClaim
+from servotwin.link.claim import ClaimingTransport, ExclusiveTransport, FormerRuns, HeldClaim
 from servotwin.link.sqlite_outbox import SqliteOutbox
 
 if TYPE_CHECKING:
     from servotwin.link.broker import Broker
 
 _CLAIM = "claim"
-"""Name under which the outbox keeps the claim of the last run."""
+"""Name under which the outbox keeps the newest claim of its edge."""
+_LAST_RUN = "run"
+"""Name under which it keeps the last run, whether that reached the twin or not."""
 
 
 def exclusive_transport(config: EdgeConfig, outbox: SqliteOutbox, run: str) -> ExclusiveTransport | None:
@@ -27,12 +29,15 @@ def exclusive_transport(config: EdgeConfig, outbox: SqliteOutbox, run: str) -> E
     # A link process that was restarted in the same run has the run's claim; one in a copied folder is another run.
     stored = HeldClaim.from_text((outbox.value(_CLAIM) or b"").decode())
     held = stored if stored is not None and stored.run == run else HeldClaim(run)
+    last = (outbox.value(_LAST_RUN) or b"").decode()
+    outbox.set_value(_LAST_RUN, run.encode())
     return ExclusiveTransport(
         make(config, twin, run),
         config.agent.servo,
         held,
         lambda new: outbox.set_value(_CLAIM, new.text.encode()),
         __version__,
+        None if stored is None else FormerRuns(stored, last),
     )
 
 

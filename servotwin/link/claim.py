@@ -16,6 +16,8 @@ from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
+_OF_THE_SENDER = (Refusal.BAD_TOKEN, Refusal.UNKNOWN_SERVO, Refusal.TOO_MANY, Refusal.UNAVAILABLE, Refusal.SUPERSEDED)
+"""Refusals of a claim that hold for every message of its sender."""
 _TRIES = 8
 """Claims in a row that others may win: each run of an edge claims once."""
 
@@ -70,6 +72,26 @@ class HeldClaim:
         return HeldClaim(run, int(number))
 
 
+@dataclass(frozen=True, slots=True)
+class FormerRuns:
+    """Earlier runs of an edge, as its folder knows them.
+
+    Parameters
+    ----------
+    claim : HeldClaim
+        The last one that was stored.
+    last : str
+        The last run, which may have ended before its claim was stored; empty: not known.
+    """
+
+    claim: HeldClaim
+    last: str
+
+    def knows(self, status: ClaimStatus) -> bool:
+        """True where the newest claim is of one of them, or older, as of a twin that was restored from a backup."""
+        return status.number <= self.claim.number or status.run in (self.claim.run, self.last)
+
+
 class ExclusiveTransport:
     """Transport that claims the servo before its first message, and sends nothing once another run has claimed it.
 
@@ -83,11 +105,16 @@ class ExclusiveTransport:
         Called with a new claim, to be stored before it is used.
     software : str
         Version of servotwin, for the twin.
+    former : FormerRuns, optional
+        What the edge's folder knows of earlier runs.
 
     Attributes
     ----------
     superseded : bool
         Another edge has taken over.
+    behind : str
+        Run that has claimed the servo since the edge's folder was written, as where an older copy of it was put back;
+        empty: there is none.
     twin : ClaimStatus or None
         The twin's last answer; None: there was none, or the twin is of a version without claims.
     """
@@ -99,10 +126,11 @@ class ExclusiveTransport:
         held: HeldClaim,
         store: Callable[[HeldClaim], None] = lambda _: None,
         software: str = "",
+        former: FormerRuns | None = None,
     ) -> None:
         self._transport, self._servo, self._store, self._software = transport, servo, store, software
-        self._held, self._confirmed, self._lock = held, False, Lock()
-        self.superseded = False
+        self._held, self._confirmed, self._lock, self._former = held, False, Lock(), former
+        self.superseded, self.behind = False, ""
         self.twin: ClaimStatus | None = None
 
     def deliver(self, parcel: Parcel) -> None:
@@ -170,6 +198,8 @@ class ExclusiveTransport:
                 # A number below ours: the twin was restored from a backup, and takes ours over from our next request.
                 self._hold(max(status.number, self._held.number))
                 return
+            if self._former is not None and not self._former.knows(status):
+                self.behind = status.run
             status = self._ask(status.number + 1)
         raise Unreachable("others claim this servo all the time")
 
@@ -180,6 +210,13 @@ class ExclusiveTransport:
         self._held = self._transport.claim = held
 
     def _ask(self, takes: int) -> ClaimStatus | None:
-        question = EdgeClaim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software)
-        self.twin = self._transport.ask(question)
+        behind = bool(takes and self.behind) and not self._twin_is_older  # to which a later field is an error
+        question = EdgeClaim(self._servo, self._held.run, self._held.number, takes, PROTOCOL, self._software, behind)
+        try:
+            self.twin = self._transport.ask(question)
+        except Refused as error:
+            if error.reason in _OF_THE_SENDER:
+                raise
+            # Of the claim, which may have been changed on its way: no reason to drop the message that waits for it.
+            raise Unreachable(f"the twin does not take this edge's claim: {error}") from None
         return self.twin

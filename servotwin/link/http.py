@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection
 from threading import Lock
 from typing import TYPE_CHECKING
@@ -12,6 +13,7 @@ from urllib.parse import quote, urlsplit
 
 import msgspec
 
+from servotwin.link.body_mark import body_mark
 from servotwin.link.claim import HeldClaim
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
@@ -29,6 +31,9 @@ _LONGEST_PAUSE_S = 300.0
 _PIECE = 65536
 _OUT_OF_DATE = 9, 10
 """OpenSSL's codes for a certificate that is not yet valid, and for one that has expired."""
+_MARKS = 5
+"""Protocol from which on a twin tells which body came."""
+_OTHER_BODY = "the answer is not to this message as it was sent: a proxy on the way changes it, or swaps answers"
 _LONGEST_RESPONSE, _LONGEST_ERROR = 64 * 1024, 8 * 1024
 """Bytes of a response to a message, and of an error, that are read."""
 
@@ -38,6 +43,7 @@ class _RefusalBody(msgspec.Struct, frozen=True):
 
     code: Refusal
     detail: str = ""
+    mark: str = ""
 
 
 class _Response(msgspec.Struct, frozen=True):
@@ -103,6 +109,16 @@ class _PersistentConnection:
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
+
+    @contextmanager
+    def in_step(self) -> Iterator[None]:
+        """Drop the connection where the block finds that an answer is none: those of later requests may follow it."""
+        try:
+            yield
+        except Unreachable:
+            with self._busy:
+                self.drop()
+            raise
 
     def close(self) -> None:
         """Allow no more requests; the one under way fails at once."""
@@ -221,20 +237,28 @@ class HttpTransport:
         context = tls_context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
         self.claim = HeldClaim()
+        self._twin_marks = False
         self._up = _PersistentConnection(url, token, timeout_s, context)
         self._down = _PersistentConnection(url, token, timeout_s + wait_s, context)
 
     def deliver(self, parcel: Parcel) -> None:
         """Return when the twin has the message safe; see `Transport`."""
+        with self._up.in_step():
+            self._deliver(parcel)
+
+    def _deliver(self, parcel: Parcel) -> None:
         headers = {"Content-Type": BODY, **_claimed(self.claim)}
         if parcel.encoding:
             headers["Content-Encoding"] = parcel.encoding
+        mark = body_mark(parcel.body, parcel.encoding) if self._twin_marks else None
         if not parcel.is_window:
             path = f"{self._base}/letters"
-            _checked(self._up.request("POST", path, parcel.body, headers, _LONGEST_RESPONSE), (200, 202))
+            response = _checked(self._up.request("POST", path, parcel.body, headers, _LONGEST_RESPONSE), (202,), mark)
+            if mark is not None and _decode_list(response.body) != [mark.encode()]:
+                raise Unreachable(_OTHER_BODY)
             return
         path = f"{self._base}/windows/{quote(parcel.boot, safe='')}/{parcel.sequence}"
-        response = _checked(self._up.request("PUT", path, parcel.body, headers, _LONGEST_RESPONSE), (200, 201))
+        response = _checked(self._up.request("PUT", path, parcel.body, headers, _LONGEST_RESPONSE), (200, 201), mark)
         expected = Acknowledge(parcel.servo, parcel.boot, parcel.sequence)
         # A proxy's login page has status 200 too: only the acknowledgement itself counts.
         if not any(_is(expected, data) for data in _decode_list(response.body)):
@@ -243,12 +267,16 @@ class HttpTransport:
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
         path = f"{self._base}/outgoing?after={after}&wait={self._wait:g}"
-        return _decode_list(
-            _checked(self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES), (200,)).body
-        )
+        with self._down.in_step():
+            response = self._down.request("GET", path, None, _claimed(self.claim), 4 * MAX_BYTES)
+            return _decode_list(_checked(response, (200,)).body)
 
     def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         """Send a question or a claim; see `ClaimingTransport`."""
+        with self._up.in_step():
+            return self._ask(claim)
+
+    def _ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         headers = {"Content-Type": BODY}
         response = self._up.request("POST", f"{self._base}/claim", encode(claim), headers, _LONGEST_RESPONSE)
         if response.status == 404 and _refusal_of(response) is Refusal.NOT_UNDERSTOOD:
@@ -259,6 +287,7 @@ class HttpTransport:
             status = None
         if not isinstance(status, ClaimStatus):
             raise Unreachable("the answer to a claim is none: whoever answers is not the twin")
+        self._twin_marks = status.protocol >= _MARKS
         return status
 
     def close(self) -> None:
@@ -287,17 +316,22 @@ def _shut(connection: HTTPConnection) -> None:
         return
 
 
-def _checked(response: _Response, good: tuple[int, ...]) -> _Response:
+def _checked(response: _Response, good: tuple[int, ...], mark: str | None = None) -> _Response:
     """Return a response whose status is good; raise `Refused` or `Unreachable` for any other.
 
     Only a reason code of the twin refuses a message; any other error, as of a proxy, means that the twin is out of
-    reach.
+    reach. So does a refusal for good of another body than the one with that `mark`; None: the twin is of a version that
+    does not tell.
     """
     if response.status in good:
         return response
     refusal = _refusal_body(response)
     if refusal is None:
         raise Unreachable(f"HTTP status {response.status}, without a reason code of the twin's")
+    # One that is too large is refused before it is read.
+    judged = refusal.code.temporary or refusal.code is Refusal.TOO_LARGE or mark in (None, refusal.mark)
+    if not judged:
+        raise Unreachable(f"{_OTHER_BODY} ({refusal.code.value}: {refusal.detail[:200]})")
     raise Refused(refusal.code, refusal.detail[:200], _retry_after_s(response.retry_after))
 
 

@@ -10,9 +10,10 @@ from msgspec import Meta, Struct
 
 from servotwin.messages.checks import Count, Name, Text
 
-PROTOCOL = 4
+PROTOCOL = 5
 """Version of the protocol between edge and twin: 1 had no claims and did not tell its number; 2 had no reason of its
-own for an update that meets a fallback; 3 none for one at an edge that was superseded."""
+own for an update that meets a fallback; 3 none for one at an edge that was superseded; the answers of 4 over HTTP did
+not tell which body had come."""
 
 
 class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
@@ -29,6 +30,8 @@ class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
         nothing); 0: it only asks.
     protocol, software : int, str
         Version of the edge's protocol, and of servotwin there.
+    behind : bool
+        The edge's folder knows nothing of the run whose claim it takes over from: it is an older one, or a copy.
     """
 
     servo: Name
@@ -37,6 +40,7 @@ class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
     takes: Count = 0
     protocol: Count = 1
     software: Text = ""
+    behind: bool = False
 
 
 class ClaimStatus(Struct, frozen=True, omit_defaults=True, tag="standing/1"):

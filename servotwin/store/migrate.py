@@ -55,7 +55,9 @@ def _revision(connection: sa.Connection) -> str | None:
 def _check(connection: sa.Connection, current: str | None, to: str) -> None:
     where = public_address(connection.engine.url)
     if current is None:
-        foreign = sorted(set(sa.inspect(connection).get_table_names()) & set(metadata.tables))
+        tables = set(sa.inspect(connection).get_table_names())
+        # A PostgreSQL may be shared with other programs; a file with tables is another program's, or an edge's outbox.
+        foreign = sorted(tables & set(metadata.tables) if connection.dialect.name == POSTGRESQL else tables)
         if foreign:
             raise InvalidInput(f"store {where}: holds a table {foreign[0]!r} that is not servotwin's; give another one")
     elif current > to:

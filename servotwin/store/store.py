@@ -43,8 +43,6 @@ WORK_KINDS = (MessageKind.WINDOW, MessageKind.LETTER, MessageKind.ACT)
 _FLEET = "fleet"
 """Key of the fleet's name among the contexts, whose other keys are digests."""
 _RACES = 8
-_MAX_SERIAL = 2**52
-"""Largest serial that an edge may report as received; messages carry serials up to twice that."""
 
 _Result = TypeVar("_Result")
 
@@ -165,23 +163,16 @@ class Store:
         self._write(lambda connection: leases.hold(connection, servo, until))
 
     def outgoing(self, servo: str, after: int, limit: int = 64) -> list[OutgoingMessage]:
-        """Messages to the edge with serials above `after`, lowest first.
-
-        An edge that reports a higher serial than any that was posted received it before the store was restored from a
-        backup: the next message gets a serial that the edge does not take for a duplicate.
-        """
-        with transaction(self.engines.reader) as connection:
-            messages = posting.after_serial(connection, servo, after, limit)
-            # Of an edge that received nothing no store is too old.
-            known = not after or bool(messages) or self.damaged
-            newest = after if known else posting.newest_serials(connection, [servo]).get(servo, after)
-        if newest < after <= _MAX_SERIAL:
-            self._write(lambda connection: posting.skip_to_serial(connection, servo, after))
-        return messages
+        """Messages to the edge with serials above `after`, lowest first."""
+        return self._read(lambda connection: posting.after_serial(connection, servo, after, limit))
 
     def post(self, sent: Mapping[str, bytes], now: float, above: int = 0) -> None:
         """Post a message to each of these edges, its serial above `above`; unknown servos are left out."""
         self._write(lambda connection: posting.post(connection, sent, now, above))
+
+    def skip_to_serial(self, servo: str, serial: int) -> None:
+        """Make the serial of the next message to the edge exceed `serial`."""
+        self._write(lambda connection: posting.skip_to_serial(connection, servo, serial))
 
     def posted(self, servos: Collection[str]) -> dict[str, int]:
         """Serials of the newest messages to the edges of these servos; unknown servos are left out."""

@@ -105,7 +105,9 @@ class EdgeClaims:
         if claim.takes and claim.run != newest.run:
             # Only the number after the newest: of two that claim at once one wins, and a repeated claim does nothing.
             if claim.takes == newest.number + 1:
-                newest = await self._take(servo, StoredClaim(claim.run, claim.takes), newest)
+                before, newest = newest, await self._take(servo, StoredClaim(claim.run, claim.takes), newest)
+                if claim.behind and newest.run == claim.run:
+                    await self._report_behind(servo, claim, before)
         elif claim.held and claim.run != newest.run and claim.held <= newest.number:
             await self._report(servo, claim, newest)
         limits = self._samples_per_window, self._bytes_per_day
@@ -131,6 +133,17 @@ class EdgeClaims:
         self._reported[servo, claim.run] = None
         if len(self._reported) > MAX_SERVOS:
             self._reported.popitem(last=False)
+
+    async def _report_behind(self, servo: str, claim: EdgeClaim, before: StoredClaim) -> None:
+        """Report an edge whose folder knows nothing of the run before."""
+        log.warning("folder behind", extra={"servo": servo, "run": claim.run, "before": before.run})
+        sentence = (
+            f"the edge's run {claim.run} began in a folder that knows nothing of the run {before.run} before it: an "
+            "older folder was put back, or a copy started; what waited for the twin in the other one is not in it"
+        )
+        self._announce("folder behind", sentence, servo)
+        await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
+        self._metrics.evidence.add(_KIND)
 
     async def _newest(self, servo: str) -> StoredClaim:
         known = self._known.get(servo)

@@ -142,4 +142,14 @@ def _exclusive_store(store: str) -> Iterator[None]:
                 ) from None
             except OSError as error:
                 raise InvalidInput(f"{lock_beside(file)}: cannot be made ({error.strerror})") from None
+            _check_one_name(file)
         yield
+
+
+def _check_one_name(file: Path) -> None:
+    """Refuse a file with several names: lock and log are beside each, so that two twins would damage it unnoticed."""
+    if file.is_file() and (names := file.stat().st_nlink) > 1:
+        raise InvalidInput(
+            f"store {file}: has {names} names (hard links), under each of which another twin could write it; "
+            f"copy it to a name of its own: cp {file.name} copy && mv copy {file.name}"
+        )

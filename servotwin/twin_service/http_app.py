@@ -18,6 +18,7 @@ from urllib.parse import parse_qsl
 
 import msgspec
 
+from servotwin.link.body_mark import body_mark
 from servotwin.messages import Refusal
 from servotwin.messages.codec import ENCODINGS
 from servotwin.twin_service.auth import bearer_token
@@ -118,6 +119,10 @@ class HttpRequest:
         """Content-Length as sent."""
         value = self.header(b"content-length")
         return None if value is None else value.decode("latin-1")
+
+    def mark_of(self, body: bytes) -> str:
+        """`body_mark` of its body."""
+        return body_mark(body, (self.header(b"content-encoding") or b"").decode("latin-1"))
 
     @property
     def content_encoding(self) -> str:
@@ -359,7 +364,8 @@ class HttpApp:
             headers["www-authenticate"] = "Bearer"
         if rejected.close:
             headers["connection"] = "close"
-        return json_response({"code": code, "detail": rejected.detail}, status, headers)
+        mark = {"mark": rejected.mark} if rejected.mark else {}
+        return json_response({"code": code, "detail": rejected.detail, **mark}, status, headers)
 
     async def _hold_back(self, request: HttpRequest) -> None:
         await self._refusals.hold_back(self._refusals.sender(request.token, request.address))

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import Counter
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
 from servotwin import __version__
 from servotwin.link.seal import TO_EDGE, key_of, seal
@@ -221,7 +222,7 @@ class EdgeApi:
         )
         post_letter = operation(
             "Commit a hello, receipt, fallback or answer",
-            {202: ("It is safe.", None)},
+            {202: ("It is safe: an array with CRC-32 and Content-Encoding of the body that came.", MSGPACK)},
             parameters=(SERVO, ENCODING, CLAIM),
             body="A hello/2, receipt/1, fallback/2 or answer/1, MessagePack; hello/1 and fallback/1 are read too.",
             errors=MESSAGE_ERRORS,
@@ -259,10 +260,11 @@ class EdgeApi:
         self._gate.admit(servo, request.token)
         await self._claims.check(servo, request.claim)
         body = await self._bodies.read(request.content_length, request.receive)
-        incoming, window = self._ingest.read_window(servo, body, request.content_encoding)
-        if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
-            raise RequestRejected(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
-        new = await self._ingest.commit(incoming, window) is PutResult.NEW
+        with _marked(request, body):
+            incoming, window = self._ingest.read_window(servo, body, request.content_encoding)
+            if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
+                raise RequestRejected(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
+            new = await self._ingest.commit(incoming, window) is PutResult.NEW
         if new:
             self._wake()
         return msgpack_response([acknowledgement(window)], 201 if new else 200)
@@ -273,10 +275,12 @@ class EdgeApi:
         self._gate.admit(servo, request.token)
         await self._claims.check(servo, request.claim)
         body = await self._bodies.read(request.content_length, request.receive)
-        incoming, letter = self._ingest.read_letter(servo, body, request.content_encoding)
-        if await self._ingest.commit(incoming, letter) is PutResult.NEW:
+        with _marked(request, body):
+            incoming, letter = self._ingest.read_letter(servo, body, request.content_encoding)
+            new = await self._ingest.commit(incoming, letter) is PutResult.NEW
+        if new:
             self._wake()
-        return HttpResponse(202)
+        return msgpack_response([request.mark_of(body).encode()], 202)
 
     async def _get_outgoing(self, request: HttpRequest) -> HttpResponse:
         """Sealed messages with serials above `after`, as soon as there are some; none after `wait` s."""
@@ -308,6 +312,16 @@ class EdgeApi:
         if not isinstance(claim, EdgeClaim):
             raise RequestRejected(Refusal.NOT_UNDERSTOOD, "a claim is expected here")
         return HttpResponse(200, encode(await self._claims.answer(servo, claim)), MSGPACK)
+
+
+@contextmanager
+def _marked(request: HttpRequest, body: bytes) -> Iterator[None]:
+    """Let a refusal tell which body it is of: the edge drops no message for what a proxy made of it."""
+    try:
+        yield
+    except RequestRejected as rejected:
+        rejected.mark = request.mark_of(body)
+        raise
 
 
 async def _get_version(_request: HttpRequest) -> HttpResponse:

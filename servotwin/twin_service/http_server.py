@@ -9,7 +9,7 @@ import socket
 import ssl
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any, cast
 
@@ -273,7 +273,8 @@ class HttpServer(uvicorn.Server):
         self._limit_handshakes()
         await super().startup(sockets)
         for each in sockets or ():
-            print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
+            with suppress(OSError):  # a full disk under its output is no reason to serve nobody
+                print(f"servotwin twin: listening on {_url(each, self.config.is_ssl)}", flush=True)
         if self.started:
             self._manager.ready()
 

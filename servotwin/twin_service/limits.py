@@ -45,11 +45,16 @@ class RequestRejected(Exception):
         Of HTTP; as in `STATUS` by default.
     close : bool
         Close the connection.
+
+    Attributes
+    ----------
+    mark : str
+        `body_mark` of the body that was refused; empty: it was not read.
     """
 
     def __init__(self, refusal: Refusal, detail: str, status: int | None = None, close: bool = False) -> None:
         super().__init__(detail)
-        self.refusal, self.detail, self.close = refusal, detail, close
+        self.refusal, self.detail, self.close, self.mark = refusal, detail, close, ""
         self.status = STATUS[refusal] if status is None else status
 
 

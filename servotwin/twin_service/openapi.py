@@ -35,6 +35,7 @@ _ERROR: Operation = {
     "properties": {
         "code": {"type": "string", "enum": [refusal.value for refusal in STATUS]},
         "detail": {"type": "string"},
+        "mark": {"type": "string", "description": "CRC-32 and Content-Encoding of the body that was refused."},
     },
 }
 MESSAGE_ERRORS = (400, 401, 403, 404, 409, 413, 422, 429, 503)

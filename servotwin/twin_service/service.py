@@ -60,6 +60,8 @@ _REFRESH_S, _WATCH_S, _RETENTION_S, _DAY = 1.0, 5.0, 600.0, 86400.0
 _LEAST_DELETED = 4096
 """Windows that one pass of retention may empty, beside twice those that came since the pass before: it keeps pace, and
 a mistake does not cost the past at once."""
+_ALARM = "alarm"
+"""Kind of the evidence that is stored with a sentence."""
 _SOLE_OWNER = "twin"
 """Owner of all leases where one process has the store to itself: after a crash it releases its own."""
 
@@ -285,7 +287,11 @@ class TwinService:
         return not self.access.open and self.access.verifier(servo) is not None
 
     async def _read_outgoing(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
-        return await self.executor.run(lambda: self.store.outgoing(servo, after))
+        messages, lost = await self.executor.run(lambda: self.watch.outgoing(servo, after))
+        if lost:
+            self.metrics.evidence.add(_ALARM)
+            self._announce("the store has lost messages", lost, servo)
+        return messages
 
     def _spawn(self, work: Coroutine[Any, Any, None], vital: bool = True) -> None:
         task = asyncio.create_task(work)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from functools import partial
+from math import inf
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,8 +16,9 @@ from servotwin.runtime.files import replace_file
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, sqlite_file
 from servotwin.store.integrity import IntegrityReport, check_bodies, check_files, check_pages, newest_message
 from servotwin.store.outgoing import fresh_serial
-from servotwin.store.records import Incoming, PutResult, WorkResult
+from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.store import Store
+from servotwin.twin_service.limits import MAX_SERVOS
 from servotwin.twin_service.store_executor import StoreExecutor
 
 log = logging.getLogger(__name__)
@@ -33,6 +35,10 @@ _MARK_S = 5.0
 _TELL_S = 1.0
 _NEW_S = 10.0
 """s between two looks for servos that are new to a store that has lost messages."""
+_AHEAD_S = 3600.0
+"""s for which an edge that has had more than the store sent is not asked once more."""
+_MAX_SERIAL = 2**52
+"""Largest serial that an edge may report as received; messages carry serials up to twice that."""
 _MARK = "newest"
 _LOST = "the twin's store has lost messages"
 
@@ -73,7 +79,7 @@ class StoreWatch:
         self._put, self._commit = put, commit
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
-        self._asked = set[str]()
+        self._asked, self._ahead = set[str](), dict[str, float]()
         self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
@@ -135,6 +141,35 @@ class StoreWatch:
                 announce("the store has lost messages", told)
             await asyncio.sleep(_TELL_S)
         announce("store damaged", f"it is not written any more: {self.fault}")
+
+    def outgoing(self, servo: str, after: int) -> tuple[Sequence[OutgoingMessage], str]:
+        """Messages to the edge with serials above `after`, and what the store lacks in a sentence; empty: nothing.
+
+        An edge that has had a higher serial than any that was posted had it from a store that was put back since, or
+        from another one: nothing beside the store need tell, where a whole folder was put back. It is asked for the
+        windows that it still keeps, with a serial that it does not take for a duplicate.
+        """
+        messages = self._store.outgoing(servo, after)
+        if messages or not after or self.fault:  # of an edge that received nothing no store is too old
+            return messages, ""
+        posted = self._store.posted([servo]).get(servo, 0)
+        if not posted < after <= _MAX_SERIAL:
+            return messages, ""
+        if self._monotonic() - self._ahead.get(servo, -inf) < _AHEAD_S:
+            self._store.skip_to_serial(servo, after)  # of two twins behind one address each finds it ahead in turns
+            return messages, ""
+        if len(self._ahead) >= MAX_SERVOS:
+            self._ahead.clear()
+        self._ahead[servo] = self._monotonic()
+        log.error("the store has lost messages", extra={"servo": servo, "had": after, "has": posted})
+        sentence = (
+            f"the edge has had message {after}, and the newest one of the store is {posted}: the store was put back, "
+            "or is another one; the edge is asked for the windows that it keeps"
+        )
+        now = self._wall()
+        self._store.add_alarm(servo, sentence, now)
+        self._store.post({servo: encode(Resend(servo, reason=_LOST))}, now, above=max(after, fresh_serial(now)))
+        return self._store.outgoing(servo, after), sentence
 
     def mark(self) -> None:
         """Note the newest message; where the store had a newer one, a database was put back while this ran."""

@@ -164,6 +164,9 @@ def _request(
     if len(row) != len(head):
         raise InvalidInput(f"has {len(row)} cells; line 1 names {len(head)} columns")
     cells = {name: cell.strip() for name, cell in zip(head, row, strict=True) if cell.strip()}
+    for name, cell in cells.items():
+        if "\0" in cell:  # no path may hold one
+            raise InvalidInput(f"{name} = {cell[:80]!r}: has a zero byte; the file is damaged, or no text")
     if "name" not in cells:
         raise InvalidInput("has no name")
     values = {columns[name][0]: columns[name][1](cell) for name, cell in cells.items()}

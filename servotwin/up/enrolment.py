@@ -279,10 +279,11 @@ def _url_of(service: ServiceConfig) -> str:
 
 
 def _write_configuration(certificates: Path | None, folder: Path, text: str) -> list[Path]:
-    written = [write_text(folder / CONFIG, text)]
+    """Write edge.toml last: an enrolment that finds one, after one that was interrupted, writes no certificates."""
+    written = []
     if certificates is not None:
         written.append(Path(shutil.copyfile(certificates, folder / CERTIFICATE)))
-    return written
+    return [*written, write_text(folder / CONFIG, text)]
 
 
 def _trusted_certificates(twin: TwinFile, request: Enrolment) -> Path | None:
@@ -318,6 +319,13 @@ def _check(request: Enrolment, known: Verifiers) -> None:
 def _check_folder(request: Enrolment) -> None:
     """Refuse a folder that belongs to another servo's edge, or that has a token already."""
     file, token = request.folder / CONFIG, request.folder / TOKEN
+    try:
+        request.folder.stat()
+    except FileNotFoundError:
+        return
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise InvalidInput(f"{request.folder}: cannot be the folder of an edge ({why})") from None
     owner = load(file).agent.servo if file.exists() else request.servo
     if owner != request.servo:
         raise InvalidInput(f"{file}: belongs to servo {owner!r}; give {request.servo!r} another folder")

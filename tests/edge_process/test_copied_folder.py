@@ -98,3 +98,11 @@ def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) 
         with edge(first, "b3-cc") as again:  # an operator starts the right one again: what waited is not lost
             until(lambda: ("b1-aa", 1) in stored())
             until(lambda: again.status.get("conflict") is not True)  # until then that of the edge before
+            # It knows nothing of the copy that ran after it, and what may wait there: both sides say so, once.
+            until(lambda: again.status["disk"]["faults"].get("folder behind") == 1)
+            [_, (behind,)] = asked(alarm)
+            assert "b3-cc began in a folder that knows nothing of the run b2-bb" in behind
+        with edge(first, "b4-dd") as last:
+            last.send()
+            until(lambda: ("b4-dd", 0) in stored())
+            assert len(asked(alarm)) == 2

@@ -1,6 +1,7 @@
 """A folder of an edge that was copied in part: what is missing is said and counted, and nothing is sent wrongly."""
 
 import json
+import os
 import shutil
 import socket
 import sqlite3
@@ -97,6 +98,22 @@ def test_an_outbox_and_a_status_that_are_both_lost_are_said_once(
             assert sum(faults.values()) == (run == "b2-bb")
     log = capfd.readouterr().err
     assert log.count('"event":"outbox incomplete"') + log.count('"event":"outbox broken"') == 1
+
+
+def test_a_status_of_any_bytes_tells_nothing_and_stops_nothing(folder: Path) -> None:
+    (folder / "status.json").write_text("[" * 100_000)
+    with link(folder) as process:
+        assert len(process.outbox.pending()) == WINDOWS
+
+
+@pytest.mark.parametrize("key", ["outbox", "parameters", "status", "boots"])
+def test_a_pipe_in_place_of_a_file_is_refused_in_one_sentence(folder: Path, key: str) -> None:
+    config = load(folder / "edge.toml")
+    path = config.path(getattr(config.files, key))
+    path.unlink(missing_ok=True)
+    os.mkfifo(path)
+    with pytest.raises(InvalidInput, match=f"{key} = '{path.name}': is no file"):
+        check(config)
 
 
 def test_a_new_edge_has_lost_no_outbox(folder: Path, capfd: pytest.CaptureFixture[str]) -> None:

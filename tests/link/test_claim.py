@@ -2,7 +2,7 @@
 
 import pytest
 
-from servotwin.link.claim import ExclusiveTransport, HeldClaim
+from servotwin.link.claim import ExclusiveTransport, FormerRuns, HeldClaim
 from servotwin.link.outbox import MemoryOutbox
 from servotwin.link.session import Sender, Session
 from servotwin.link.transport import Parcel, Refused, Unreachable
@@ -66,6 +66,41 @@ PARCEL = Parcel("axis", b"body")
 def edge(twin: Twin, run: str, number: int = 0) -> tuple[ExclusiveTransport, list[HeldClaim]]:
     stored: list[HeldClaim] = []
     return ExclusiveTransport(Line(twin), "axis", HeldClaim(run, number), stored.append, "1.2"), stored
+
+
+@pytest.mark.parametrize(
+    ("newest", "behind"),
+    [
+        (ClaimStatus("axis", "b3-cc", 3, PROTOCOL), ""),  # its last run was killed before it stored its claim
+        (ClaimStatus("axis", "b2-bb", 2, PROTOCOL), ""),
+        (ClaimStatus("axis", "b1-zz", 1, PROTOCOL), ""),  # a twin that was restored from a backup
+        (ClaimStatus("axis", "", 0, PROTOCOL), ""),
+        (ClaimStatus("axis", "b3-zz", 3, PROTOCOL), "b3-zz"),
+        (ClaimStatus("axis", "b3-zz", 3, PROTOCOL - 1), "b3-zz"),  # which would not understand it
+    ],
+)
+def test_a_folder_that_does_not_know_the_run_before_is_behind(newest: ClaimStatus, behind: str) -> None:
+    twin = Twin()
+    twin.newest = newest
+    former = FormerRuns(HeldClaim("b2-bb", 2), "b3-cc")
+    one = ExclusiveTransport(Line(twin), "axis", HeldClaim("b4-dd"), software="1.2", former=former)
+    one.deliver(PARCEL)
+    assert one.behind == behind
+    assert [claim.behind for claim in twin.claims] == [False, bool(behind) and newest.protocol == PROTOCOL]
+
+
+@pytest.mark.parametrize("reason", list(Refusal))
+def test_a_claim_that_is_refused_drops_no_message(reason: Refusal) -> None:
+    """As one that a proxy has changed on its way: the message itself has not been judged."""
+    twin, outbox = Twin(), MemoryOutbox()
+    outbox.put_letter(b"letter")
+
+    class Refusing(Line):
+        def ask(self, claim: EdgeClaim) -> ClaimStatus | None:  # noqa: ARG002
+            raise Refused(reason, "as told")
+
+    Sender(Session(outbox), ExclusiveTransport(Refusing(twin), "axis", HeldClaim("b1-aa"))).step(0.0)
+    assert len(outbox.letters()) == 1
 
 
 def test_an_edge_claims_before_its_first_message_and_once() -> None:

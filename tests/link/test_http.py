@@ -15,7 +15,16 @@ from servotwin.errors import InvalidInput
 from servotwin.link.claim import HeldClaim
 from servotwin.link.http import HttpTransport, LiveHttp
 from servotwin.link.transport import Parcel, Refused, Unreachable
-from servotwin.messages import Acknowledge, Hello, Refusal, Setting, WindowMessage, checksum, encode, pack_channel
+from servotwin.messages import (
+    Acknowledge,
+    Hello,
+    Refusal,
+    Setting,
+    WindowMessage,
+    checksum,
+    encode,
+    pack_channel,
+)
 from servotwin.messages.codec import deflated
 from servotwin.messages.live import LiveColumns, Watched, decode_columns, encode_live
 

@@ -18,6 +18,7 @@ from postgres import Server
 from store_cases import MORE, NEXT, NewAddress, filled, outcome, window
 
 from servotwin.errors import InvalidInput
+from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.store import migrate as migrations
 from servotwin.store.engine import (
     OpenConnections,
@@ -127,6 +128,14 @@ def test_a_database_of_another_program_is_refused(new_address: NewAddress) -> No
     engines.dispose()
     with pytest.raises(InvalidInput, match="holds a table 'messages' that is not servotwin's"):
         open_store(url)
+
+
+def test_an_edges_outbox_is_no_store(tmp_path: Path) -> None:
+    SqliteOutbox(tmp_path / "outbox.sqlite", "ax-1").close()
+    before = (tmp_path / "outbox.sqlite").read_bytes()
+    with pytest.raises(InvalidInput, match=r"holds a table '\w+' that is not servotwin"):
+        open_store(str(tmp_path / "outbox.sqlite"))
+    assert (tmp_path / "outbox.sqlite").read_bytes() == before
 
 
 def test_processes_that_open_a_new_database_at_once_make_it_once(new_address: NewAddress) -> None:

@@ -27,16 +27,6 @@ def test_serials_of_outgoing_messages_rise_per_servo(store: Store) -> None:
     assert store.outgoing("a", 4) == store.outgoing("nobody", 0) == []
 
 
-def test_an_edge_that_received_more_than_a_restored_store_posted_gets_the_next_message(store: Store) -> None:
-    for sequence, last_serial in ((1, 0), (2, 900), (3, 2**60)):
-        store.put([window(sequence=sequence), window("b", sequence)])
-        assert store.outgoing("a", last_serial) == []
-        store.commit([outcome(one, outgoing=(b"x%d" % sequence,)) for one in claim(store)], 201.0)
-    assert store.outgoing("a", 900) == [OutgoingMessage(901, b"x2"), OutgoingMessage(902, b"x3")]
-    assert [post.serial for post in store.outgoing("b", 0)] == [1, 2, 3]
-    assert store.outgoing("nobody", 7) == []
-
-
 def test_the_backlog_counts_messages_and_gives_the_age_of_the_oldest(store: Store) -> None:
     assert store.backlog(200.0) == Backlog(0, 0, 0.0)
     store.put([window(received=110.0), letter(received=120.0), window("b", received=150.0)])

@@ -36,6 +36,20 @@ async def listen(client: httpx.AsyncClient, held: HeldClaim, wait: float) -> int
     return (await client.get(f"/v1/servos/ax-1/outgoing?after=0&wait={wait}", headers=headers)).status_code
 
 
+def test_a_folder_that_was_put_back_is_an_alarm(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    async def run() -> None:
+        async with served(twin_file(tmp_path)) as (system, client):
+            await ask(client, EdgeClaim("ax-1", "one", 0, 1))
+            await ask(client, EdgeClaim("ax-1", "two", 0, 2))
+            for _ in range(2):  # once, although it is repeated
+                assert (await ask(client, EdgeClaim("ax-1", "three", 0, 3, PROTOCOL, behind=True))).run == "three"
+            [alarm] = system.store.events("ax-1")
+            assert alarm.status.startswith("the edge's run three began in a folder that knows nothing of the run two")
+
+    asyncio.run(run())
+    assert [line.message for line in caplog.records if line.levelno >= logging.WARNING] == ["folder behind"]
+
+
 def test_a_copied_folder_is_refused_and_an_alarm_is_stored(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     async def run() -> None:
         async with served(twin_file(tmp_path)) as (system, client):

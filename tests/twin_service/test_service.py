@@ -8,6 +8,7 @@ import pytest
 from service_requests import code, put
 from service_system import OPERATOR, OTHER, TOKEN, bearer, hello, place, unpacked, window
 
+from servotwin.link.body_mark import body_mark
 from servotwin.link.seal import TO_EDGE, key_of, opened, verifier_of
 from servotwin.messages import Acknowledge, Setting, Update, decode, encode
 from servotwin.messages.codec import compress
@@ -98,6 +99,22 @@ def test_a_message_must_be_what_its_address_says(serving):
         assert code(await put(client, hello(), to=place(window()))) == (400, "not_understood")
         acknowledge = encode(Acknowledge("ax-1", "b", 1))
         assert code(await client.post(letters, content=acknowledge, headers=bearer())) == (400, "not_understood")
+
+    serving(body)
+
+
+def test_an_answer_tells_which_body_came(serving):
+    """As a proxy may have changed it: only the edge knows what it sent."""
+
+    async def body(system, client):
+        letters, cut = "/v1/servos/ax-1/letters", encode(window())[:-5]
+        stored = await client.post(letters, content=hello(), headers=bearer())
+        assert (stored.status_code, unpacked(stored.content)) == (202, [body_mark(hello(), "").encode()])
+        refused = await put(client, cut, to=place(window()), content_encoding="deflate")
+        assert refused.json()["mark"] == body_mark(cut, "deflate")
+        other = await put(client, encode(window(4)), to=place(window(5)))
+        assert other.json()["mark"] == body_mark(encode(window(4)), "")
+        assert "mark" not in (await client.post(letters, content=hello())).json()
 
     serving(body)
 

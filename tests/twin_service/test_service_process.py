@@ -8,11 +8,12 @@ import ssl
 import subprocess
 import sys
 import threading
-from contextlib import closing, nullcontext
+from contextlib import closing, nullcontext, suppress
 from pathlib import Path
 
 import httpx
 import pytest
+from mosquitto import free_port
 from notify_socket import listening
 from selfsigned import self_made
 from service_system import (
@@ -150,6 +151,47 @@ def check_that_a_second_twin_is_refused(path, monkeypatch):
         patch.setattr(service, "HttpServer", lambda *_: pytest.fail("it serves"))
         with pytest.raises(InvalidInput, match="another twin works on it"):
             service.run(path)
+
+
+@pytest.mark.slow
+def test_a_service_whose_output_goes_to_a_full_disk_serves(tmp_path):
+    port = free_port()
+    path = twin_file(tmp_path)
+    path.write_text(path.read_text().replace("port = 0", f"port = {port}"))
+    command = [sys.executable, "-m", "servotwin", "twin", "--config", str(path)]
+    with Path("/dev/full").open("w") as full:
+        running = subprocess.Popen(command, stdout=full, stderr=full)
+    try:
+
+        def answers():
+            assert running.poll() is None
+            with suppress(httpx.TransportError):
+                return httpx.get(f"http://127.0.0.1:{port}/healthz").status_code == 200
+
+        until(answers)
+        assert send_to(f"http://127.0.0.1:{port}") == 201
+    finally:
+        running.terminate()
+    # One that ends by itself has 1; Python gives 120 where the last output cannot be written.
+    assert running.wait(PATIENCE) in (0, 120)
+
+
+def send_to(url):
+    with httpx.Client(base_url=url, timeout=PATIENCE) as client:
+        return send(client, 0).status_code
+
+
+def test_a_store_with_a_second_name_is_refused_until_it_has_one_again(tmp_path):
+    """As of a copy by hard links: a lock and a log of its own lie beside each name."""
+    file, other = tmp_path / "twin.db", tmp_path / "copy.db"
+    open_store(str(file)).close()
+    os.link(file, other)
+    for each in (file, other):
+        with pytest.raises(InvalidInput, match="has 2 names"), service._exclusive_store(str(each)):
+            pytest.fail("it is locked")
+    other.unlink()
+    with service._exclusive_store(str(file)):
+        pass
 
 
 @pytest.mark.slow

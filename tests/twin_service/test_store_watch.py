@@ -21,6 +21,7 @@ from servotwin.twin_service.twin_file import service_of
 pytest_plugins = ("store_fixtures",)
 
 PAGE = 8192
+_LOST = "the twin's store has lost messages"
 Body = Callable[..., Awaitable[None]]
 
 
@@ -207,6 +208,43 @@ def test_what_a_store_that_lost_messages_asks_has_a_serial_that_no_edge_has_yet(
             connection.exec_driver_sql("DELETE FROM outgoing")
         system.watch._ask_for_windows()
         assert len(system.store.outgoing("ax-1", before.serial)) == 1
+
+    serve(twin_file(tmp_path), body)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_an_edge_that_has_had_more_than_the_store_posted_is_asked_for_its_windows_and_it_is_said(
+    tmp_path, caplog, known
+):
+    """As where a whole folder was put back, the number of its newest message too, or an edge came from elsewhere."""
+
+    async def body(system, client):
+        if known:
+            assert await send(client, 0) == [201]
+        (message,) = await system.polls.messages("ax-1", 900, 0.0)
+        assert message.serial > 900
+        assert decode(message.body) == Resend("ax-1", reason=_LOST)
+        assert not await system.polls.messages("ax-1", message.serial, 0.0)
+        assert not await system.polls.messages("ax-2", 0, 0.0)
+        assert not await system.polls.messages("ax-2", 2**53, 0.0)  # no serial is left above that
+        (alarm,) = system.store.events("ax-1")
+        assert "has had message 900" in alarm.status
+        # In turns, as of two twins behind one address: said once in a while; the next message is above all the same.
+        ahead = message.serial + 7
+        assert not await system.polls.messages("ax-1", ahead, 0.0)
+        assert (len(system.store.events("ax-1")), system.store.posted(["ax-1"])) == (1, {"ax-1": ahead})
+
+    serve(twin_file(tmp_path), body)
+    (line,) = [one for one in caplog.records if one.message == "the store has lost messages"]
+    assert (line.servo, line.had, line.has) == ("ax-1", 900, 0)
+
+
+def test_a_damaged_store_asks_for_nothing(tmp_path):
+    async def body(system, client):
+        assert await send(client, 0) == [201]
+        system.watch.fault, system.store.damaged = "pages are gone", True
+        assert not await system.polls.messages("ax-1", 900, 0.0)
+        assert system.store.posted(["ax-1"]) == {"ax-1": 0}  # nor is the next serial raised
 
     serve(twin_file(tmp_path), body)
 

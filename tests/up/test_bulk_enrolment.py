@@ -81,6 +81,14 @@ def test_bad_rows_are_each_named_with_their_line_and_nothing_is_written(folder: 
         assert any(f"line {line}: " in each and fault in each for each in error.splitlines()), (line, error)
     assert "line 2:" not in error
     assert "4 rows" in error
+    code, said, error = enroll(folder, "name,edge\nax-1,a\0b\n", "--url", URL)
+    assert (code, said) == (2, "")
+    assert "line 2: edge = 'a\\x00b': has a zero byte" in error
+    rows = f"name,edge,sample_rate_hz\nax-2,{'x' * 300},\nax-3,twin.toml/x,\nax-4,,0.5\nax-5,,1e-300\n"
+    code, said, error = enroll(folder, rows, "--url", URL)
+    assert (code, said) == (2, "")
+    for line, each in enumerate(("name too long", "Not a directory", "has no sample", "has no sample"), 2):
+        assert any(f"line {line}: " in one and each in one for one in error.splitlines()), (line, error)
     assert (files(folder), (folder / "tokens.toml").read_bytes()) == (before, tokens)
 
 

@@ -259,6 +259,10 @@ def test_an_edge_gets_the_certificates_to_verify_the_twin(tmp_path):
     signers, _ = self_made(tmp_path / "signers")
     assert run(*options, tmp_path / "named", "--again", "--ca", signers).exit_code == 0
     assert (tmp_path / "named" / "ca.crt").read_bytes() == signers.read_bytes()
+    # An enrolment that was interrupted leaves no edge.toml without its certificates: no later one writes those.
+    (tmp_path / "cut" / "ca.crt").mkdir(parents=True)
+    assert run(*options, tmp_path / "cut", "--again", "--ca", signers).exit_code != 0
+    assert not (tmp_path / "cut" / "edge.toml").exists()
     refused = run(*options, tmp_path / "none", "--again", "--ca", twin)
     assert (refused.exit_code, "holds no certificates" in refused.stderr) == (2, True)
     assert not (tmp_path / "none").exists()

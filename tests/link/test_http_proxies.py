@@ -1,0 +1,125 @@
+"""Proxies between edge and twin: only the twin's answer to the very body that was sent counts."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+
+import msgspec
+import pytest
+from faketwin import FakeTwin, Handler
+
+from servotwin.link.body_mark import body_mark
+from servotwin.link.http import HttpTransport
+from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.messages import (
+    ClaimStatus,
+    EdgeClaim,
+    Hello,
+    Refusal,
+    Setting,
+    WindowMessage,
+    checksum,
+    encode,
+    pack_channel,
+)
+from servotwin.messages.codec import deflated
+
+CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
+WINDOW = WindowMessage("axis-1", "b0", 0, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
+PARCEL = Parcel("axis-1", *deflated(encode(WINDOW)), "b0", 0)
+LETTER = Parcel("axis-1", encode(Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")))
+
+
+@pytest.fixture
+def twin() -> Iterator[FakeTwin]:
+    with FakeTwin() as twin:
+        yield twin
+
+
+@pytest.fixture
+def link(twin: FakeTwin) -> Iterator[HttpTransport]:
+    transport = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
+    yield transport
+    transport.close()
+
+
+CHANGED = "a proxy on the way changes it, or swaps answers"
+
+
+def marking(mark: str | None) -> Callable[[Handler, bytes], bool]:
+    """A fault: refuse each message for good, and tell that a body with `mark` came; None: the one that was sent."""
+
+    def refuse(handler: Handler, body: bytes) -> bool:
+        if handler.path.endswith("/claim"):
+            return False
+        told = body_mark(body, handler.headers.get("Content-Encoding", "")) if mark is None else mark
+        answer = {"code": Refusal.NOT_UNDERSTOOD.value, "detail": "As told.", "mark": told}
+        handler.answer(422, msgspec.json.encode(answer))
+        return True
+
+    return refuse
+
+
+@pytest.mark.parametrize("message", [PARCEL, LETTER])
+def test_only_a_refusal_of_the_body_as_it_was_sent_is_one(twin: FakeTwin, link: HttpTransport, message: Parcel) -> None:
+    twin.claim_status = ClaimStatus("axis-1", protocol=5)
+    link.ask(EdgeClaim("axis-1", "b0"))
+    for mark in ("", "00000000 deflate", "00000000 "):
+        twin.fault = marking(mark)
+        with pytest.raises(Unreachable, match=CHANGED):
+            link.deliver(message)
+    twin.fault = marking(None)
+    with pytest.raises(Refused, match="As told"):
+        link.deliver(message)
+
+
+@pytest.mark.parametrize(
+    ("status", "body"), [(200, b"login"), (202, b""), (202, msgspec.msgpack.encode([b"00000000 "])), (204, b"")]
+)
+def test_only_the_twin_s_answer_to_a_letter_delivers_it(
+    twin: FakeTwin, link: HttpTransport, status: int, body: bytes
+) -> None:
+    """As a proxy's own page, and the answer to an earlier letter, which a proxy has sent twice."""
+    twin.claim_status = ClaimStatus("axis-1", protocol=5)
+    link.ask(EdgeClaim("axis-1", "b0"))
+
+    def answer(handler: Handler, _body: bytes) -> bool:
+        handler.answer(status, body)
+        return True
+
+    twin.fault = answer
+    with pytest.raises(Unreachable):
+        link.deliver(LETTER)
+
+
+def test_after_an_answer_that_came_twice_the_next_ones_belong_to_their_requests_again(
+    twin: FakeTwin, link: HttpTransport
+) -> None:
+    """On one connection each answer would else be taken for that to the request after its own."""
+    twin.claim_status = ClaimStatus("axis-1", protocol=5)
+    link.ask(EdgeClaim("axis-1", "b0"))
+
+    def twice(handler: Handler, _body: bytes) -> bool:
+        if twin.requests["POST"] == 2:
+            handler.answer(202, msgspec.msgpack.encode([b"00000000 "]))
+            handler.wfile.flush()
+            time.sleep(0.1)
+            handler.answer(202, msgspec.msgpack.encode([b"00000000 "]))
+        return twin.requests["POST"] == 2
+
+    twin.fault = twice
+    for _ in range(2):
+        with suppress(Unreachable):
+            link.deliver(LETTER)
+    link.deliver(PARCEL)
+    assert link.ask(EdgeClaim("axis-1", "b0")) == twin.claim_status
+    assert twin.windows.keys() == {("b0", 0)}
+
+
+def test_a_twin_of_a_version_before_tells_no_body(twin: FakeTwin, link: HttpTransport) -> None:
+    twin.claim_status = ClaimStatus("axis-1", protocol=4)
+    link.ask(EdgeClaim("axis-1", "b0"))
+    link.deliver(LETTER)
+    twin.fault = marking("")
+    with pytest.raises(Refused):
+        link.deliver(LETTER)
