@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from statistics import median
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,7 +27,7 @@ from servotwin.plant.plants import Plant
 from servotwin.report import style
 from servotwin.report.page import page
 from servotwin.reproduction.figures import wear_panels
-from servotwin.reproduction.measures import SETTLED, MeasuredStep, Settling
+from servotwin.reproduction.measures import BAND, SETTLED, MeasuredStep, Settling
 from servotwin.reproduction.runs import Trace
 from servotwin.reproduction.twin_runs import EstimateRecord, estimate_records
 from servotwin.runtime import files
@@ -225,29 +226,30 @@ def _at_load(axes: Axes, servo: Plant) -> None:
 
 def heads(comparison: Comparison) -> tuple[str, ...]:
     """Make the heads of the table of steps."""
-    unit = comparison.unit.name
-    swings = (f"{each.column.head}, {unit}" for each in comparison.runs)
-    return "step", "gap, deg", "estimate, deg", *swings, f"off by, {_small(comparison).name}"
+    unit, small, names = comparison.unit.name, _small(comparison).name, [each.column.head for each in comparison.runs]
+    if not comparison.case.paper:
+        return "step", "gap, deg", "estimate, deg", *(f"{name}, {small}" for name in names)
+    return "step", "gap, deg", "estimate, deg", *(f"{name}, {unit}" for name in names), f"off by, {small}"
 
 
 def cells(comparison: Comparison, row: DemoStep) -> tuple[str, ...]:
-    """Make the texts of a row, in the order of `heads`."""
-    scale, unit = comparison.settling.scale, comparison.unit
-    swings = (
-        f"{verdict(step)} {_fixed(step.amplitude * unit.factor, scale * unit.factor, _SWING)}" for step in row.steps
-    )
-    return (
-        str(row.number),
-        _degrees(comparison, row.gap),
-        _estimate(comparison, row.estimate),
-        *swings,
-        _off(comparison, row.steps[-1]),
-    )
+    """Make the texts of a row, in the order of `heads`: verdicts, with the swing in the paper's, or the error left."""
+    first = str(row.number), _degrees(comparison, row.gap), _estimate(comparison, row.estimate)
+    if not comparison.case.paper:
+        return *first, *(f"{verdict(step)} {_fine(comparison, left(step))}" for step in row.steps)
+    swings = (f"{verdict(step)} {_swing(comparison, step)}" for step in row.steps)
+    return *first, *swings, _fine(comparison, row.left)
 
 
-def _off(comparison: Comparison, step: MeasuredStep) -> str:
+def _swing(comparison: Comparison, step: MeasuredStep) -> str:
+    unit = comparison.unit
+    return _fixed(step.amplitude * unit.factor, comparison.settling.scale * unit.factor, _SWING)
+
+
+def _fine(comparison: Comparison, length: float) -> str:
+    """A small length or angle, in the thousandth of the unit."""
     small = _small(comparison)
-    return _fixed(left(step) * small.factor, comparison.settling.scale * small.factor, _LEFT)
+    return _fixed(length * small.factor, comparison.settling.scale * small.factor, _LEFT)
 
 
 def _small(comparison: Comparison) -> DisplayUnit:
@@ -275,13 +277,25 @@ def verdict(step: MeasuredStep) -> str:
     return "rests" if step.settled else "swings"
 
 
-def summary(comparison: Comparison, rows: Sequence[DemoStep]) -> tuple[str, str]:
-    """One sentence on the machine, one on the estimates."""
+def summary(comparison: Comparison, rows: Sequence[DemoStep]) -> tuple[str, ...]:
+    """Sentences on the machine and on the estimates."""
     first, *others = (sum(row.steps[place].settled for row in rows) for place in range(len(comparison.runs)))
     names = (each.column.name for each in comparison.runs[1:])
     more = ", ".join(f"with the {name} {count}" for name, count in zip(names, others, strict=True))
     machine = f"Without a twin {first} of {len(rows)} steps settle, {more}."
-    return machine, _accuracy(comparison.twinned.estimates)
+    accuracy = _accuracy(comparison.twinned.estimates)
+    return (machine, accuracy) if comparison.case.paper else (machine, _medians(comparison), accuracy)
+
+
+def _medians(comparison: Comparison) -> str:
+    """Error and time of a step in the median, with each controller."""
+    small, parts = _small(comparison), list[str]()
+    for each in comparison.runs:
+        time = median(step.settling_time for step in each.steps)
+        error = small.text(median(left(step) for step in each.steps), ".3g")
+        parts.append(f"{each.column.head} {error}, {f'{time:.3g} s' if math.isfinite(time) else 'never'}")
+    what = f"Median error at the end of a step, and time until {100 * BAND:g} % of the step remain to that end"
+    return f"{what}: {'; '.join(parts)}."
 
 
 def _accuracy(estimates: Sequence[EstimateRecord]) -> str:
@@ -298,9 +312,10 @@ def definition(comparison: Comparison) -> str:
     settling, unit = comparison.settling, comparison.unit
     share, length = f"{100 * SETTLED:g} % of {unit.text(settling.scale, '.4g')}", f"{settling.tail:.4g} s"
     counts = " and two counts of the sensor" if settling.floor else ""
+    beside = "" if comparison.case.paper else " Beside it stands the largest error within that time."
     return (
         f"A step settles, and rests, when its swing, half the peak-to-peak over the last {length}, is below "
-        f"{share}{counts}."
+        f"{share}{counts}.{beside}"
     )
 
 
@@ -345,6 +360,7 @@ def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes) -> 
         steps=[(*cells(comparison, row), *more) for row, more in zip(rows, others, strict=True)],
         published="" if published is None else f"The {published.column.name}: {_lower(_accuracy(published.estimates))}",
         twin=comparison.twinned.column.name,
+        paper=case.paper,
         remarks=_remarks(comparison),
         sent_heads=columns,
         sent=[sent_texts(update, columns, law, small) for update in updates],
@@ -353,14 +369,16 @@ def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes) -> 
 
 def _other_heads(comparison: Comparison) -> tuple[str, ...]:
     """Heads of the columns that the terminal has no room for."""
-    small = _small(comparison).name
-    errors = tuple(f"{each.column.head}: off by, {small}" for each in comparison.runs[:-1])
-    return errors if comparison.published is None else (*errors, f"{comparison.published.column.head}: estimate, deg")
+    published = comparison.published
+    more = () if published is None else (f"{published.column.head}: estimate, deg",)
+    if comparison.case.paper:
+        return more
+    return *(f"{each.column.head}: swing, {_small(comparison).name}" for each in comparison.runs), *more
 
 
 def _others(comparison: Comparison, row: DemoStep) -> tuple[str, ...]:
-    errors = tuple(_off(comparison, step) for step in row.steps[:-1])
-    return errors if comparison.published is None else (*errors, _estimate(comparison, row.published_estimate))
+    more = () if comparison.published is None else (_estimate(comparison, row.published_estimate),)
+    return more if comparison.case.paper else (*(_fine(comparison, step.amplitude) for step in row.steps), *more)
 
 
 def _caption(comparison: Comparison) -> str:

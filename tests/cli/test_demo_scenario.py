@@ -52,7 +52,7 @@ def test_the_terminal_compares_the_machine_alone_with_both_twins(shown: tuple[Pa
     assert [int(line.split()[0]) for line in rows] == [1, 2, 3]
     assert all(line.count("rests") + line.count("swings") == 3 for line in rows)
     heads = text[text.index("gap ") : text.index("\n1 ")].split()
-    assert " ".join(heads) == "gap estimate alone paper's hysteresis off by step deg deg deg deg deg mdeg"
+    assert " ".join(heads) == "gap estimate alone paper's hysteresis step deg deg mdeg mdeg mdeg"
     truths = [float(line.split()[1]) for line in rows]
     assert truths == sorted(truths)
     assert 0.5 < truths[0] < truths[-1] < 2.5
@@ -68,7 +68,7 @@ def test_the_report_has_every_run_and_what_was_sent_in_the_axis_own_units(shown:
     assert "0.5 deg at the motor (0.25 mdeg at the load) to 2.5 deg at the motor" in page
     assert "dead zone, mdeg" in page
     assert "feedforward, mrad/s" in page
-    assert "alone: off by, mdeg" in page
+    assert "alone: swing, mdeg" in page
     assert "mm" not in re.sub(r"data:image[^\"]*|<style.*?</style>", "", page, flags=re.S).replace("comm", "")
 
 
