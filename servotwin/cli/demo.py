@@ -7,10 +7,11 @@ import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from statistics import median
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -220,8 +221,8 @@ def _at_load(axes: Axes, servo: Plant) -> None:
     """Show the gap as the travel of the load that it is, on the right."""
     small = position_unit(servo).small
     per_degree = small.factor * math.radians(servo.p)
-    travel = axes.secondary_yaxis("right", (lambda gap: gap * per_degree, lambda travel: travel / per_degree))
-    travel.set_ylabel(f"at the load ({small.name})")
+    scales = partial(np.multiply, per_degree), partial(np.multiply, 1.0 / per_degree)
+    axes.secondary_yaxis("right", scales).set_ylabel(f"at the load ({small.name})")
 
 
 def heads(comparison: Comparison) -> tuple[str, ...]:
@@ -236,8 +237,8 @@ def cells(comparison: Comparison, row: DemoStep) -> tuple[str, ...]:
     """Make the texts of a row, in the order of `heads`: verdicts, with the swing in the paper's, or the error left."""
     first = str(row.number), _degrees(comparison, row.gap), _estimate(comparison, row.estimate)
     if not comparison.case.paper:
-        return *first, *(f"{verdict(step)} {_fine(comparison, left(step))}" for step in row.steps)
-    swings = (f"{verdict(step)} {_swing(comparison, step)}" for step in row.steps)
+        return *first, *(f"{_verdict(comparison, step)} {_fine(comparison, left(step))}" for step in row.steps)
+    swings = (f"{_verdict(comparison, step)} {_swing(comparison, step)}" for step in row.steps)
     return *first, *swings, _fine(comparison, row.left)
 
 
@@ -272,9 +273,9 @@ def _estimate(comparison: Comparison, one: EstimateRecord | None) -> str:
     return _degrees(comparison, one.gap) if one.ok else "refused"
 
 
-def verdict(step: MeasuredStep) -> str:
-    """Verdict on a step: it rests or it swings."""
-    return "rests" if step.settled else "swings"
+def _verdict(comparison: Comparison, step: MeasuredStep) -> str:
+    """Verdict on a step: it rests, or the paper's servo swings; another machine may be on its way still."""
+    return "rests" if step.settled else "swings" if comparison.case.paper else "moves"
 
 
 def summary(comparison: Comparison, rows: Sequence[DemoStep]) -> tuple[str, ...]:
@@ -312,7 +313,7 @@ def definition(comparison: Comparison) -> str:
     settling, unit = comparison.settling, comparison.unit
     share, length = f"{100 * SETTLED:g} % of {unit.text(settling.scale, '.4g')}", f"{settling.tail:.4g} s"
     counts = " and two counts of the sensor" if settling.floor else ""
-    beside = "" if comparison.case.paper else " Beside it stands the largest error within that time."
+    beside = "" if comparison.case.paper else " Otherwise it moves. Beside stands the largest error within that time."
     return (
         f"A step settles, and rests, when its swing, half the peak-to-peak over the last {length}, is below "
         f"{share}{counts}.{beside}"
@@ -339,7 +340,7 @@ def _remarks(comparison: Comparison) -> list[str]:
 
 
 def _colored(cell: str) -> str:
-    for start, color in (("rests", "green"), ("swings", "red")):
+    for start, color in (("rests", "green"), ("swings", "red"), ("moves", "red")):
         cell = cell.replace(start, f"[{color}]{start}[/]")
     return cell
 
@@ -357,7 +358,7 @@ def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes) -> 
         picture=vector,
         caption=_caption(comparison),
         heads=(*heads(comparison), *_other_heads(comparison)),
-        steps=[(*cells(comparison, row), *more) for row, more in zip(rows, others, strict=True)],
+        steps=[(*map(_unbroken, cells(comparison, row)), *more) for row, more in zip(rows, others, strict=True)],
         published="" if published is None else f"The {published.column.name}: {_lower(_accuracy(published.estimates))}",
         twin=comparison.twinned.column.name,
         paper=case.paper,
@@ -365,6 +366,10 @@ def _report(comparison: Comparison, rows: Sequence[DemoStep], vector: bytes) -> 
         sent_heads=columns,
         sent=[sent_texts(update, columns, law, small) for update in updates],
     )
+
+
+def _unbroken(cell: str) -> str:
+    return cell.replace(" ", "\N{NO-BREAK SPACE}")
 
 
 def _other_heads(comparison: Comparison) -> tuple[str, ...]:

@@ -147,7 +147,7 @@ def _gap(table: Table, servo: Plant) -> SignalLike:
     inner = table.table(GAP, required=True)
     check_gaps(inner, [name for name in inner.values if unit_of(name).si in ("m", "rad")], servo)
     maker = gap_maker(inner)
-    ratio = {"ratio": servo.p} if maker in (constant_gap_at_load, growing_gap_at_load) else {}
+    ratio: dict[str, Any] = {"ratio": servo.p} if maker in (constant_gap_at_load, growing_gap_at_load) else {}
     gap: SignalLike = part(table, GAP, maker, **ratio)
     return gap
 

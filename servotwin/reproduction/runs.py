@@ -89,7 +89,8 @@ class Trace:
     @classmethod
     def _every(cls, run: Run, samples: int) -> Trace:
         names = (name for name in cls.__dataclass_fields__ if name != "settling")
-        return cls(**{name: np.ascontiguousarray(getattr(run, name)[::samples]) for name in names})
+        signals = {name: np.ascontiguousarray(getattr(run, name)[::samples]) for name in names}
+        return cls(**signals, settling=_SETTLING)
 
     @cached_property
     def steps(self) -> tuple[MeasuredStep, ...]:

@@ -48,9 +48,9 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
 @pytest.mark.slow
 def test_the_terminal_compares_the_machine_alone_with_both_twins(shown: tuple[Path, str]) -> None:
     text = shown[1]
-    rows = [line for line in text.splitlines() if "rests 0" in line or "swings 0" in line]
+    rows = [line for line in text.splitlines() if "rests 0" in line or "moves 0" in line]
     assert [int(line.split()[0]) for line in rows] == [1, 2, 3]
-    assert all(line.count("rests") + line.count("swings") == 3 for line in rows)
+    assert all(line.count("rests") + line.count("moves") == 3 for line in rows)
     heads = text[text.index("gap ") : text.index("\n1 ")].split()
     assert " ".join(heads) == "gap estimate alone paper's hysteresis step deg deg mdeg mdeg mdeg"
     truths = [float(line.split()[1]) for line in rows]
