@@ -19,10 +19,11 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
 import servotwin as st
-from servotwin.cli.demo_case import Case, Column, paper_case, scenario_case
+from servotwin.cli.demo_case import PAPER, Case, Column, paper_case, scenario_case
 from servotwin.cli.demo_sent import sent_heads, sent_texts
 from servotwin.cli.loop_report import of_settings, refusals
 from servotwin.cosim import Loop
+from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import DisplayUnit, command_unit, position_unit
 from servotwin.plant.plants import Plant
 from servotwin.report import style
@@ -135,6 +136,10 @@ def demo(out: Path, preset: str = "paper", console: Console | None = None, scena
     InvalidInput
         An unknown preset, a scenario without steps, wear or twin, a directory that cannot be written.
     """
+    if scenario is not None and preset != PAPER:
+        raise InvalidInput(
+            f"--preset {preset!r}: is of the paper's servo, and {scenario} has its own machine; leave it out"
+        )
     console = console or Console()
     case = paper_case(preset) if scenario is None else _read(scenario, console)
     files.make_directory(out)

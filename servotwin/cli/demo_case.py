@@ -130,7 +130,7 @@ def scenario_case(path: Path) -> Case:
     recording = replace(scenario.recording, window=commissioning.window, pre_trigger=commissioning.pre_trigger)
     own = scenario.twin.replace(policy=PAPER, k_dz=0.0, smoothing=None, k_noise=None, table=None)
     alone = scenario.replace(twin=own.replace(enabled=False), recording=recording, supervision=None)
-    published, why = None, "the twin's policy is the paper's"
+    published, why = None, "it is this twin's policy"
     if policy != PAPER:
         try:
             ruled = scenario.replace(twin=own.replace(k_dz=1.0), recording=recording)
@@ -144,7 +144,7 @@ def scenario_case(path: Path) -> Case:
         Column("alone", "without a twin", _ALONE, alone),
         Column(policy, f"{policy} twin", _POLICIES[policy], scenario),
         published,
-        f"There is no run with the paper's dead zone: {why}." if why else "",
+        f"The paper's dead zone has no run of its own: {why}." if why else "",
     )
 
 

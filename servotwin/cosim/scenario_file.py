@@ -138,7 +138,8 @@ def gap_maker(table: Table) -> Maker:
     # In whatever unit: keys of another one are refused by name.
     first = {name.split("_", 1)[0] for name in table.values}
     grows = bool(first & {"from", "to", "over", "begin"}) and "total" not in first
-    at_load = any(AT_LOAD in name for name in table.values)
+    # A length, or arc minutes, can be meant at the load only: the error names the key there.
+    at_load = any(AT_LOAD in name or unit_of(name).si == "m" or name.endswith("_arcmin") for name in table.values)
     return GAPS[f"{'growing' if grows else 'constant'}{' at the load' * at_load}"]
 
 

@@ -1,6 +1,8 @@
 """`servotwin demo SCENARIO.toml`: any axis that wears, alone and with its twin, in its own units."""
 
+import dataclasses
 import io
+import math
 import re
 from pathlib import Path
 
@@ -15,6 +17,8 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Setting, Update
 from servotwin.plant.axis import Axis
 from servotwin.plant.display_units import DEGREES, MILLIMETRES
+from servotwin.reproduction.figures import wear_panels
+from servotwin.reproduction.twin_runs import EstimateRecord
 
 SCOPE = """servo = "telescope"
 name = "scope"
@@ -92,7 +96,7 @@ def test_the_runs_differ_by_their_twin_only(tmp_path: Path) -> None:
 def test_a_run_that_tells_nothing_is_left_out_in_one_sentence(tmp_path: Path) -> None:
     case = case_of(tmp_path, PAPER_RULE)
     assert [each.head for each in case.columns] == ["alone", "paper"]
-    assert case.left_out == "There is no run with the paper's dead zone: the twin's policy is the paper's."
+    assert case.left_out == "The paper's dead zone has no run of its own: it is this twin's policy."
 
 
 def test_a_stepper_has_no_run_with_a_dead_zone_that_moves_it(tmp_path: Path) -> None:
@@ -107,7 +111,9 @@ twin = {uncertainty = {gap_deg = [0.0, 2.0], step_mm = [0.05, 0.4]}}
 """
     case = case_of(tmp_path, text)
     assert [each.head for each in case.columns] == ["alone", "certified"]
-    assert re.search("paper's dead zone: policy 'paper': .*stepper would go to the angle zero", case.left_out)
+    assert re.search(
+        "paper's dead zone has no run of its own: policy 'paper': .*stepper would go to the angle zero", case.left_out
+    )
     assert [each.head for each in case_of(tmp_path, text.replace("false", "true")).columns][1] == "paper's"
 
 
@@ -137,6 +143,11 @@ def test_an_axis_whose_gap_cannot_be_seen_is_refused_in_its_own_words(tmp_path: 
     text = text.replace('"hysteresis"', '"paper"\nk_dz = 0.0')
     with pytest.raises(InvalidInput, match=r"scope.toml: .*do not show the gap"):
         demo.demo(tmp_path / "out", scenario=written(tmp_path, text))
+
+
+def test_a_preset_beside_a_scenario_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match=r"--preset 'table1': is of the paper's servo, and .*scope.toml has its own"):
+        demo.demo(tmp_path / "out", "table1", scenario=written(tmp_path, SCOPE))
 
 
 def test_an_unstable_loop_is_refused(tmp_path: Path) -> None:
@@ -170,3 +181,12 @@ def test_an_integral_that_the_own_controller_lacks_is_shown_as_it_is() -> None:
     sent = update(Setting.of(0.0, gains_of(law.replace(Ki=250.0))))
     heads = sent_heads([sent], law, "N m", MILLIMETRES.small)
     assert dict(zip(heads, sent_texts(sent, heads, law, MILLIMETRES.small), strict=True))["Ki"] == "250"
+
+
+def test_windows_that_were_all_refused_are_drawn_too() -> None:
+    refused = EstimateRecord(3.0, math.nan, math.nan, (0.0, math.nan), "unidentifiable", (), 0.02, 0.1)
+    known = dataclasses.replace(refused, gap=0.01)
+    for given, drawn in (([], 0), ([refused], 0), ([refused, known], 1)):
+        _, (axes,) = wear_panels.sheet(1, 120.0)
+        wear_panels.estimates(axes, given)
+        assert len(axes.lines) == drawn

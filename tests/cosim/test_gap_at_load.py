@@ -65,6 +65,11 @@ def test_the_papers_servo_may_state_the_travel_of_its_screw(tmp_path: Path) -> N
         (SCREW, "total_deg = 1.0, total_at_load_um = 3.0", r"unknown key 'gap.total_deg'.*allows total_at_load"),
         (SCREW, "from_at_load_um = 3.0, to_deg = 1.0, over_s = 1.0", r"unknown key 'gap.to_deg'|gap.to_at_load_um"),
         (SCREW, "from_at_load_um = 3.0, over_s = 1.0", r"key 'gap.to_at_load_um' or .* is missing"),
+        (
+            JOINT,
+            "total_arcmin = 3.0",
+            r"'gap.total_at_load_mdeg' or .* is missing",
+        ),
         (SCREW, "total_at_load_um = -3.0", r"gap.total_at_load_um = -3.0 is not allowed; give a number, at least 0"),
         (SCREW, "total_at_load_mm = 50.0", r"total_at_load_mm = 50.0 is not allowed; give .* at most 5 mm, one turn"),
         (
