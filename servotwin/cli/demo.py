@@ -299,7 +299,7 @@ def _medians(comparison: Comparison) -> str:
     for each in comparison.runs:
         time = median(step.settling_time for step in each.steps)
         error = small.text(median(left(step) for step in each.steps), ".3g")
-        parts.append(f"{each.column.head} {error}, {f'{time:.3g} s' if math.isfinite(time) else 'never'}")
+        parts.append(f"{each.column.head} {error}, {f'{time:.3g} s' if math.isfinite(time) else 'not by then'}")
     what = f"Median error at the end of a step, and time until {100 * BAND:g} % of the step remain to that end"
     return f"{what}: {'; '.join(parts)}."
 

@@ -68,7 +68,8 @@ def estimates(axes: Axes, given: Sequence[EstimateRecord]) -> None:
     """Draw the twin's estimates with their spread; refused ones as crosses at the prior, where there is one."""
     accepted = _columns((e.time, e.gap * style.DEG, e.std * style.DEG) for e in given if e.ok)
     if accepted:
-        axes.errorbar(*accepted, fmt="o", color=style.BLUE, markersize=4.0, capsize=2.0, label="estimates")
+        time, value, spread = accepted
+        axes.errorbar(time, value, spread, fmt="o", color=style.BLUE, markersize=4.0, capsize=2.0, label="estimates")
     refused = _columns((e.time, e.gap * style.DEG) for e in given if not e.ok and np.isfinite(e.gap))
     if refused:
         axes.plot(*refused, "x", color=style.GREY, markersize=6.0, label="refused, prior")
