@@ -6,8 +6,7 @@ import math
 import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from statistics import median
 
@@ -20,96 +19,23 @@ from rich.table import Table
 
 import servotwin as st
 from servotwin.cli.demo_case import PAPER, Case, Column, paper_case, scenario_case
+from servotwin.cli.demo_runs import Comparison, DemoRun, DemoStep, left
 from servotwin.cli.demo_sent import sent_heads, sent_texts
 from servotwin.cli.loop_report import of_settings, refusals
-from servotwin.cosim import Loop
 from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import DisplayUnit, command_unit, position_unit
 from servotwin.plant.plants import Plant
 from servotwin.report import style
 from servotwin.report.page import page
 from servotwin.reproduction.figures import wear_panels
-from servotwin.reproduction.measures import BAND, SETTLED, MeasuredStep, Settling
-from servotwin.reproduction.runs import Trace
-from servotwin.reproduction.twin_runs import EstimateRecord, estimate_records
+from servotwin.reproduction.measures import BAND, SETTLED, MeasuredStep
+from servotwin.reproduction.twin_runs import EstimateRecord
 from servotwin.runtime import files
 
 NAME = "demo"
 _MOST_ROWS = 24  # of the terminal's table
 # Digits below the leading one of the reference's amplitude, or of the last gap.
 _SWING, _LEFT, _GAP = 3, 4, 3
-
-
-@dataclass(frozen=True, eq=False)
-class DemoRun:
-    """One run of a demo's machine."""
-
-    column: Column
-    loop: Loop
-    trace: Trace
-
-    @cached_property
-    def estimates(self) -> tuple[EstimateRecord, ...]:
-        """The twin's estimates beside the true gap."""
-        return estimate_records(self.loop)
-
-    @cached_property
-    def steps(self) -> tuple[MeasuredStep, ...]:
-        """Steps of the reference; where it begins at the position of rest, without that first stretch."""
-        first = self.trace.steps[:1]
-        rests = bool(first) and first[0].reference == self.trace.position[0]
-        return self.trace.steps[1 if rests else 0 :]
-
-    def estimate(self, step: MeasuredStep) -> EstimateRecord | None:
-        """Last estimate of a step, one that was accepted where there is one; None: no window has its middle there."""
-        here = [each for each in self.estimates if step.begin <= each.time < step.end]
-        return next((each for each in reversed(here) if each.ok), here[-1] if here else None)
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Results without a twin, with the paper's rule where there is such a run, and with the twin."""
-
-    case: Case
-    alone: DemoRun
-    published: DemoRun | None
-    twinned: DemoRun
-
-    @property
-    def runs(self) -> tuple[DemoRun, ...]:
-        """The runs in the order of the report."""
-        return tuple(each for each in (self.alone, self.published, self.twinned) if each is not None)
-
-    @property
-    def settling(self) -> Settling:
-        """Definition of settled, with the reference's amplitude."""
-        return self.twinned.trace.settling
-
-    @property
-    def unit(self) -> DisplayUnit:
-        """Unit of positions."""
-        return self.case.unit(self.settling.scale)
-
-
-@dataclass(frozen=True)
-class DemoStep:
-    """Results of one step: of each run in the order of the report, with the twin's estimate of the gap."""
-
-    number: int
-    steps: tuple[MeasuredStep, ...]
-    estimate: EstimateRecord | None
-    published_estimate: EstimateRecord | None
-
-    @property
-    def gap(self) -> float:
-        """True gap at the estimate, or in the middle of the step, rad."""
-        last = self.steps[-1]
-        return 0.5 * (last.gap_begin + last.gap_end) if self.estimate is None else self.estimate.truth
-
-    @property
-    def left(self) -> float:
-        """Largest error that remains with the twin, m or rad."""
-        return left(self.steps[-1])
 
 
 def demo(out: Path, preset: str = "paper", console: Console | None = None, scenario: Path | None = None) -> Path:
@@ -200,11 +126,6 @@ def demo_steps(comparison: Comparison) -> list[DemoStep]:
         DemoStep(number, each, twinned.estimate(each[-1]), None if published is None else published.estimate(each[-1]))
         for number, each in enumerate(zip(*(one.steps for one in comparison.runs), strict=True), start=1)
     ]
-
-
-def left(step: MeasuredStep) -> float:
-    """Largest error that remains at the end of a step, m or rad."""
-    return abs(step.bias) + step.amplitude
 
 
 def plot(comparison: Comparison) -> Figure:
