@@ -20,7 +20,7 @@ from servotwin.simulation import Run
 _ENDS, _RESTS, _COUNTS = 0.1, 0.01, 2.0
 """Last part of a step in which it must rest; largest error there, of the step; and counts of the sensor beside it."""
 _NUMBER = re.compile(r"[-+]?\d[\d.e+-]*")
-_CHANGES = 0.02
+CHANGES = 0.02
 """Of the samples: a reference that changes in more of them does not step."""
 
 
@@ -45,7 +45,7 @@ class StepEnd(NamedTuple):
 def step_ends(run: Run) -> list[StepEnd]:
     """Ends of the steps of the reference, but for one that the run cuts short; empty where it does not step."""
     changes = np.flatnonzero(np.diff(run.reference)) + 1
-    if changes.size > _CHANGES * run.reference.size:
+    if changes.size > CHANGES * run.reference.size:
         return []
     counts = _COUNTS * run.servo.position_resolution
     edges = np.array([0, *changes, run.reference.size])
@@ -68,10 +68,7 @@ def summary(loop: Loop) -> Iterator[str]:
     yield f"{scenario.name}: {scenario.duration:g} s, {windows}"
     if loop.estimates:
         yield from _of_estimates(loop)
-    if loop.updates or loop.fallbacks:
-        yield from _of_settings(loop)
-    elif loop.windows:
-        yield f"settings: none sent; {_most(each.reason for each in loop.redesigns)}"
+    yield from of_settings(loop)
     yield from _of_steps(loop.run)
 
 
@@ -84,11 +81,18 @@ def _of_estimates(loop: Loop) -> Iterator[str]:
         words = gap_in_words(loop.scenario.servo, off, ".3g")
         line += f", off by at most {words}; the gap lies in {inside} of {len(accepted)} intervals"
     yield line
+    yield from refusals(loop)
+
+
+def refusals(loop: Loop) -> Iterator[str]:
+    """Sentences on the windows that the twin refused, by their status, and on what would help."""
     others = [each for each in loop.estimates if not each.ok]
     for status, count in Counter(each.status for each in others).items():
         reasons = (reason for each in others if each.status is status for reason in each.reasons[:1])
         yield f"  {count} {status}: {_most(reasons)}"
-    if all(each.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND) for each in loop.estimates):
+    if loop.estimates and all(
+        each.status in (GapStatus.UNIDENTIFIABLE, GapStatus.LOWER_BOUND) for each in loop.estimates
+    ):
         length = loop.scenario.commissioning.window
         yield (
             f"  no window of {length:.3g} s tells both flanks: record longer ones, best with a move each way "
@@ -96,7 +100,12 @@ def _of_estimates(loop: Loop) -> Iterator[str]:
         )
 
 
-def _of_settings(loop: Loop) -> Iterator[str]:
+def of_settings(loop: Loop) -> Iterator[str]:
+    """Sentences on what became of the settings of a loop; none without windows."""
+    if not (loop.updates or loop.fallbacks):
+        if loop.windows:
+            yield f"settings: none sent; {_most(each.reason for each in loop.redesigns)}"
+        return
     yield f"settings: {len(loop.updates)} sent, {len(loop.applied)} applied"
     refused = [each.reason for each in {r.version: r for r in loop.receipts if not r.applied}.values() if each.reason]
     for reason, count in Counter(map(str, refused)).items():

@@ -131,7 +131,8 @@ def recording(loop: Loop, scenario_text: str) -> SignalTable:
     return SignalTable(run.columns, metadata)
 
 
-def _read(path: Path) -> tuple[str, st.Scenario]:
+def read_scenario(path: Path) -> tuple[str, st.Scenario]:
+    """Read a scenario and its text: a file, or the name of a packaged one."""
     if str(path) in PRESETS and not path.exists():
         return preset_text(str(path)), st.Scenario.preset(str(path))
     scenario = st.Scenario.load(path)
@@ -146,6 +147,6 @@ def _run(scenario: Path) -> tuple[str, Loop]:
         *columns, TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal
     ) as progress:
         bar = progress.add_task("looking for a verified fallback set", total=None)
-        text, described = _read(scenario)
+        text, described = read_scenario(scenario)
         progress.update(bar, description="simulating", total=1.0)
         return text, st.cosimulate(described, lambda share: progress.update(bar, completed=share))

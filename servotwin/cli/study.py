@@ -31,13 +31,19 @@ _LOGS = "Recordings: .csv, .txt, .npz, .parquet, .mat, .h5, .mf4, .tdms, .mcap .
 
 
 def demo(
+    scenario: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Scenario of another machine, of any axis; the paper's servo where absent.", show_default=False
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the report.")] = Path("servotwin-demo"),
-    preset: Annotated[str, typer.Option(help="paper, table1 or paper-gain2.")] = "paper",
+    preset: Annotated[str, typer.Option(help="Of the paper's servo: paper, table1 or paper-gain2.")] = "paper",
 ) -> None:
-    """Simulate a servo that wears out: alone, with the published twin and with the certified twin."""
+    """Simulate a machine that wears out: alone, with the paper's dead zone and with its twin."""
     from servotwin.cli.demo import demo as run
 
-    run(out, preset)
+    run(out, preset, scenario=scenario)
 
 
 def reproduce(

@@ -40,6 +40,7 @@ _SCALED = {
     "deg_per_s": Unit("deg/s", "rad/s", _DEGREE),
     "deg": Unit("deg", "rad", _DEGREE),
     "mdeg": Unit("mdeg", "rad", 1e-3 * _DEGREE),
+    "arcmin": Unit("arcmin", "rad", _DEGREE, 60.0),
     "mv": Unit("mV", "V", 1e-3),
     "mn_m": Unit("mN m", "N m", 1e-3),
     "mrad_per_s": Unit("mrad/s", "rad/s", 1e-3),

@@ -47,6 +47,23 @@ class MeasuredStep:
 
 
 @dataclass(frozen=True, slots=True)
+class Settling:
+    """Definition of settled: the amplitude over the last `tail` s of a step is below `limit`.
+
+    That is `SETTLED` of `scale`, the reference's amplitude, and `floor` more (all m or rad).
+    """
+
+    scale: float
+    tail: float = TAIL
+    floor: float = 0.0
+
+    @property
+    def limit(self) -> float:
+        """Amplitude below which a step has settled."""
+        return SETTLED * self.scale + self.floor
+
+
+@dataclass(frozen=True, slots=True)
 class MeasuredCycle:
     """A periodic oscillation: frequency in Hz (NaN without one), amplitude in the signal's unit."""
 
@@ -121,18 +138,18 @@ def reference_changes(time: Array, reference: Array) -> Array:
     return time[np.concatenate([[0], np.flatnonzero(np.diff(reference)) + 1])]
 
 
-def steps(time: Array, position: Array, reference: Array, gap: Array, scale: float) -> tuple[MeasuredStep, ...]:
-    """Measure every stretch of constant reference; `scale` is the reference amplitude (m)."""
+def steps(time: Array, position: Array, reference: Array, gap: Array, settling: Settling) -> tuple[MeasuredStep, ...]:
+    """Measure every stretch of constant reference that is longer than the tail."""
     begins = reference_changes(time, reference)
     ends = [*begins[1:], time[-1]]
-    pairs = [(float(b), float(e)) for b, e in zip(begins, ends, strict=True) if e - b > TAIL]
-    return tuple(_step(time, position, reference, gap, scale, begin, end) for begin, end in pairs)
+    pairs = [(float(b), float(e)) for b, e in zip(begins, ends, strict=True) if e - b > settling.tail]
+    return tuple(_step(time, position, reference, gap, settling, begin, end) for begin, end in pairs)
 
 
 def _step(
-    time: Array, position: Array, reference: Array, gap: Array, scale: float, begin: float, end: float
+    time: Array, position: Array, reference: Array, gap: Array, settling: Settling, begin: float, end: float
 ) -> MeasuredStep:
-    whole, last = between(time, begin, end), tail(time, end)
+    whole, last = between(time, begin, end), tail(time, end, settling.tail)
     values = position[last]
     final, goal = float(values.mean()), float(reference[whole][0])
     size = abs(goal - float(position[whole][0]))
@@ -143,7 +160,7 @@ def _step(
         amplitude=amplitude(values),
         deviation=float(values.std()),
         bias=goal - final,
-        settled=has_settled(values, scale),
+        settled=amplitude(values) < settling.limit,
         settling_time=settling_time(time[whole], position[whole], final, BAND * size),
         gap_begin=float(gap[whole][0]),
         gap_end=float(gap[whole][-1]),

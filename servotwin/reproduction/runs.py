@@ -13,7 +13,7 @@ import numpy as np
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve, SquareWave
 from servotwin.reproduction import measures
-from servotwin.reproduction.measures import Array, MeasuredStep
+from servotwin.reproduction.measures import Array, MeasuredStep, Settling
 from servotwin.simulation import Run, simulate
 
 AMPLITUDE = 1e-3  # m, section 3.2
@@ -22,6 +22,8 @@ _STEP_DURATION = 60.0  # s, of the runs with one step
 _END_DEG, STRESS_DEG = 20.0, 30.0  # where the gap's S-curve ends (erratum E15)
 ESTIMATE_DEG = 10.0  # the fixed estimate of Figs 11 and 12
 RATE, _TRACE_RATE = 5000.0, 500.0  # Hz: simulated and recorded; stored for plots and measures
+_SETTLING = Settling(AMPLITUDE)
+_COUNTS = 2.0  # of the position's sensor: a load that swings by so many has settled
 
 _R = TypeVar("_R", covariant=True)
 
@@ -55,7 +57,7 @@ UNIPOLAR = Square("0/1 mm", AMPLITUDE / 2.0, AMPLITUDE / 2.0)
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """The signals of a run at `_TRACE_RATE` Hz, each (N,), SI units."""
+    """The signals of a run at `_TRACE_RATE` Hz, or whole, each (N,), SI units."""
 
     time: Array
     position: Array
@@ -65,18 +67,35 @@ class Trace:
     voltage: Array
     gap: Array
     tolerance: Array
+    settling: Settling = _SETTLING
 
     @classmethod
     def of(cls, run: Run) -> Trace:
         """Decimate a run: every tenth sample at 5 kHz."""
-        every = round(run.sample_rate / _TRACE_RATE)
-        names = cls.__dataclass_fields__
-        return cls(**{name: np.ascontiguousarray(getattr(run, name)[::every]) for name in names})
+        return cls._every(run, round(run.sample_rate / _TRACE_RATE))
+
+    @classmethod
+    def whole(cls, run: Run) -> Trace:
+        """Every sample of a run of any machine, whose steps count as those of the paper do.
+
+        The tail is a quarter of the time between two steps, and the scale half of the reference's span.
+        """
+        every = cls._every(run, 1)
+        between = np.median(np.diff([*measures.reference_changes(every.time, every.reference), every.time[-1]]))
+        amplitude = 0.5 * float(np.ptp(every.reference)) or float(np.max(np.abs(every.reference)))
+        floor = _COUNTS * run.servo.position_resolution
+        return replace(every, settling=Settling(amplitude, 0.25 * float(between), floor))
+
+    @classmethod
+    def _every(cls, run: Run, samples: int) -> Trace:
+        names = (name for name in cls.__dataclass_fields__ if name != "settling")
+        signals = {name: np.ascontiguousarray(getattr(run, name)[::samples]) for name in names}
+        return cls(**signals, settling=_SETTLING)
 
     @cached_property
     def steps(self) -> tuple[MeasuredStep, ...]:
         """Every stretch of constant reference, measured."""
-        return measures.steps(self.time, self.position, self.reference, self.gap, AMPLITUDE)
+        return measures.steps(self.time, self.position, self.reference, self.gap, self.settling)
 
 
 class RunJob(Hashable, Protocol[_R]):
@@ -125,7 +144,7 @@ class StepMeasureJob:
         run = self.step.simulate()
         still = np.zeros_like(run.time)
         size = abs(self.step.amplitude)
-        return measures.steps(run.time, run.position, run.reference, still, size)[0]
+        return measures.steps(run.time, run.position, run.reference, still, Settling(size))[0]
 
 
 @dataclass(frozen=True, slots=True)

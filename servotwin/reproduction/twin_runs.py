@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -161,7 +161,7 @@ def run_twin(scenario: st.Scenario, exact: bool = False, progress: Progress | No
     loop = st.cosimulate(scenario, progress, _timed(scenario, seconds, exact))
     return TwinRun(
         trace=Trace.of(loop.run),
-        estimates=_estimates(loop, seconds),
+        estimates=estimate_records(loop, seconds),
         applied=_applied(loop),
         channel_samples=tuple(sum(c.samples for c in _channels(w)) for w in loop.windows),
         channel_bytes=tuple(sum(len(c.data) for c in _channels(w)) for w in loop.windows),
@@ -186,7 +186,9 @@ def _timed(scenario: st.Scenario, seconds: list[float], exact: bool) -> Estimato
     return estimate
 
 
-def _estimates(loop: Loop, seconds: list[float]) -> tuple[EstimateRecord, ...]:
+def estimate_records(loop: Loop, seconds: Sequence[float] | None = None) -> tuple[EstimateRecord, ...]:
+    """Estimates of a co-simulation beside the true gap; `seconds` that each took, where they were measured."""
+    seconds = [math.nan] * len(loop.estimates) if seconds is None else seconds
     times = [one.time for one in loop.estimates]
     truths = as_pieces(loop.scenario.gap, loop.scenario.duration).value(times)
     return tuple(

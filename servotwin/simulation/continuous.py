@@ -91,6 +91,11 @@ class ContinuousEngine:
         return PiecewiseCubic.constant(0.0) if pieces is None else pieces
 
     @property
+    def state(self) -> Array:
+        """States of plant and law at the sample reached."""
+        return self.trajectory.state
+
+    @property
     def index(self) -> int:
         """Sample reached."""
         return self.trajectory.samples - 1

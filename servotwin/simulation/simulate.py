@@ -17,6 +17,7 @@ from servotwin.plant.plants import Plant
 from servotwin.plant.sensors import check_encoders
 from servotwin.plant.signals import PiecewiseCubic, SignalLike, as_gap, as_nonnegative, as_pieces
 from servotwin.simulation.continuous import ContinuousEngine
+from servotwin.simulation.growth import advance_bounded
 from servotwin.simulation.inputs import RunInputs, raised, spliced, whole_ratio
 from servotwin.simulation.lifted_engine import LiftedEngine, advances_in_blocks
 from servotwin.simulation.plant_block_engine import fits_plant_blocks, in_plant_blocks
@@ -29,12 +30,17 @@ from servotwin.simulation.sampled_law import SampledLawEngine
 _RECORDED = 5000.0
 
 
-class Engine(Protocol):
+class _Advancing(Protocol):
+    @property
+    def state(self) -> Array: ...
+    def advance(self, index: int) -> None: ...
+
+
+class Engine(_Advancing, Protocol):
     """One way to run the loop; times are sample indices."""
 
     @property
     def index(self) -> int: ...
-    def advance(self, index: int) -> None: ...
     def set_tolerance(self, tolerance: float) -> None: ...
     def set_reference(self, reference: PiecewiseCubic) -> None: ...
     def set_controller(self, controller: Any, tolerance: float | None) -> None: ...
@@ -163,7 +169,7 @@ class Simulation:
                 f"sample {index} is outside {self.index} .. {self.samples - 1}, where this simulation can go"
             )
         if index > self.index:
-            self.engine.advance(index)
+            _advance(self, self.engine, index)
 
     def set_tolerance(self, tolerance: float) -> None:
         """Set the dead-zone half-width (m) from the present sample on; replaces the planned tolerance."""
@@ -329,7 +335,8 @@ def simulate(
     Raises
     ------
     InvalidInput
-        A gap above one turn, a negative gap, tolerance or friction, or rates that do not divide one another.
+        A gap above one turn, a negative gap, tolerance or friction, or rates that do not divide one another; a loop
+        that is unstable, and whose motion grows beyond what can be computed.
     """
     simulation = Simulation(
         servo, duration, controller, reference, gap, tolerance, theta_d0, sample_rate, noise, seed, input_bias, friction
@@ -337,6 +344,11 @@ def simulate(
     exact = noise is None and simulation.readings is None
     run = _run_in_blocks(simulation, theta_d0) if exact else None
     return run or _run_plant_in_blocks(simulation) or _run_by_steps(simulation)
+
+
+def _advance(simulation: Simulation, engine: _Advancing, index: int) -> None:
+    """Advance an engine of a simulation; raises UnstableLoop where its motion grows beyond every number."""
+    advance_bounded(simulation.servo, simulation.controller, lambda: engine.advance(index), lambda: engine.state)
 
 
 def _run_by_steps(simulation: Simulation) -> Run:
@@ -352,7 +364,7 @@ def _run_plant_in_blocks(simulation: Simulation) -> Run | None:
     if not fits_plant_blocks(simulation.engine):
         return None
     engine = in_plant_blocks(simulation.engine)
-    engine.advance(engine.samples - 1)
+    _advance(simulation, engine, engine.samples - 1)
     return Run(
         simulation.servo, simulation.inputs, simulation.samples, engine.channel, engine.events, simulation.readings
     )
@@ -364,7 +376,7 @@ def _run_in_blocks(simulation: Simulation, theta_d0: float) -> Run | None:
     if not isinstance(law, Controller) or not advances_in_blocks(servo, law, inputs, samples):
         return None
     engine = LiftedEngine(servo, law, inputs, theta_d0, samples)
-    engine.advance(samples - 1)
+    _advance(simulation, engine, samples - 1)
     return Run(servo, inputs, samples, engine.channel, engine.events)
 
 

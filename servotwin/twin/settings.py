@@ -11,6 +11,7 @@ from typing import Annotated, Any
 from servotwin.config.keys import check, key, settings
 from servotwin.config.table import Table
 from servotwin.config.toml import attribute, part, read
+from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation import whitened
 from servotwin.estimation.gap import METHODS, settings_of
@@ -32,6 +33,8 @@ _NEWS, _TOLD, _MOST = 0.01, 0.05, math.radians(0.1)
 # Of the command that the model's friction holds: rests from either side are twice as far apart, on a machine whose
 # friction is up to a quarter larger.
 _RESTS = 2.5
+AT_LOAD = "_at_load_"
+"""Before the unit, in keys of gaps that count at the load: elsewhere they count at the motor."""
 _LARGEST_BIAS = 0.01  # of a command's limit: no larger offset of a drive is assumed where its file states none
 
 
@@ -303,19 +306,21 @@ class TwinSettings:
 
 
 def check_gaps(table: Table, names: Sequence[str], plant: Plant) -> None:
-    """Refuse gaps of a table, numbers or ranges in degrees, that are larger than those of the machine can be.
+    """Refuse gaps of a table, numbers or ranges, that are larger than those of the machine can be.
+
+    They count at the motor or, where the name says so, at the load.
 
     Raises
     ------
     InvalidInput
     """
-    most = math.degrees(plant.largest_gap)
     for name in names:
-        given = table.values.get(name)
-        angles = given if isinstance(given, list) else [given]
-        if any(isinstance(angle, int | float) and angle > most * (1.0 + 1e-12) for angle in angles):
+        given, unit = table.values.get(name), unit_of(name)
+        most = unit.from_si(plant.largest_gap * (plant.p if AT_LOAD in name else 1.0))
+        sizes = given if isinstance(given, list) else [given]
+        if any(isinstance(size, int | float) and size > most * (1.0 + 1e-12) for size in sizes):
             numbers = "two numbers" if isinstance(given, list) else "a number"
-            allowed = f"{numbers}, at least 0, at most {most:g} deg, {turn_in_words(plant.largest_gap)}"
+            allowed = f"{numbers}, at least 0, at most {most:g} {unit.name}, {turn_in_words(plant.largest_gap)}"
             raise table.invalid(name, allowed)
 
 

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from servotwin.config.units import unit_of
 from servotwin.plant.display_units import DEGREES, MILLIMETRES
 from servotwin.up.speed import CORES, LIMIT, SLOWEST
 from servotwin.up.status import OK, ServoStatus, TwinStatus
@@ -200,11 +201,9 @@ def _setting(servo: ServoStatus) -> dict[str, str]:
     if len(pid) == len(_PID):
         scale, per = (1e-3, "mm") if units.position == "m" else (1.0, "rad")
         rows[f"Kp Ki Kd, {units.command}/{per}"] = " ".join(f"{scale * gain:.3g}" for gain in pid)
-    cascade = {name: edge.get(units.key(key), 0.0) for name, key in _CASCADE.items()}
-    if not cascade["Kp"]:  # the drive closes the velocity loop
-        cascade = {name: gain for name, gain in cascade.items() if name == "Kv"}
-    if any(cascade.values()):
-        rows[" ".join(cascade)] = " ".join(f"{gain:.3g}" for gain in cascade.values())
+    for name, key in _CASCADE.items():
+        if gain := edge.get(units.key(key)):  # 0: the drive closes the velocity loop, or there is no integral action
+            rows[f"{name}, {unit_of(units.key(key)).name}"] = f"{gain:.3g}"
     if (feedforward := edge.get(units.key("feedforward_v"))) is not None:
         rows[f"feedforward, m{units.command}"] = f"{1e3 * feedforward:.1f}"
     return rows
@@ -232,7 +231,7 @@ def _link(servo: ServoStatus) -> str:
 
 _PID = ("kp_v_per_m", "ki_v_per_m_s", "kd_v_s_per_m")
 _CASCADE = {"Kv": "position_gain_per_s", "Kp": "velocity_gain_v_s_per_rad", "Ti": "integral_time_s"}
-_SETTINGS = ("dead zone", "K", "feedforward")
+_SETTINGS = ("dead zone", "K", "Ti", "feedforward")
 """Beginnings of the names of rows, in their order."""
 _ROWS: Sequence[tuple[str, _Cell]] = (
     ("", lambda servo: f"[dim]{servo.plan.trait}[/]"),

@@ -20,10 +20,8 @@ def shown(tmp_path_factory):
     return path, console.file.getvalue(), compared[0]
 
 
-def test_another_machine_is_sent_to_the_command_that_shows_it(tmp_path):
-    with pytest.raises(
-        InvalidInput, match=r"--preset 'gantry': the demo is of the paper's servo: .*servotwin simulate"
-    ):
+def test_another_machine_is_sent_to_the_argument_that_shows_it(tmp_path):
+    with pytest.raises(InvalidInput, match=r"--preset 'gantry': is none of the paper's servos: .*demo SCENARIO.toml"):
         demo.demo(tmp_path / "out", "gantry")
     assert not (tmp_path / "out").exists()
 
@@ -51,16 +49,16 @@ def test_the_report_stands_alone(shown):
 def test_the_certified_twin_settles_what_neither_the_servo_alone_nor_the_published_twin_does(shown):
     result = shown[2]
     rows = demo.demo_steps(result)
-    assert [row.twinned.settled for row in rows] == [True] * 10
+    assert [row.steps[-1].settled for row in rows] == [True] * 10
     assert max(row.left for row in rows) < 5e-6
     # Wear from 2 deg on: alone every step oscillates, and more the larger the gap; the published dead zone hunts too.
-    for name in ("alone", "published"):
-        assert [getattr(row, name).settled for row in rows[2:]] == [False] * 8
-    swings = [row.alone.amplitude for row in rows[2:]]
+    for place in (0, 1):
+        assert [row.steps[place].settled for row in rows[2:]] == [False] * 8
+    swings = [row.steps[0].amplitude for row in rows[2:]]
     assert swings == sorted(swings)
-    assert not result.alone.applied
-    assert len(result.published.applied) == 10
-    assert len(result.twinned.applied) == len(result.twinned.updates) >= 1
+    assert not result.alone.loop.applied
+    assert len(result.published.loop.applied) == 10
+    assert len(result.twinned.loop.applied) == len(result.twinned.loop.updates) >= 1
     # The estimates are at least ten times nearer to the truth than the published ones, which the report says as well.
     worst = [max(abs(one.error) for one in each.estimates if one.ok) for each in (result.twinned, result.published)]
     assert 10.0 * worst[0] < worst[1]

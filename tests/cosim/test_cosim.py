@@ -43,7 +43,7 @@ def fig15() -> Loop:
 
 def steps_of(loop: Loop):
     run = loop.run
-    return measures.steps(run.time, run.position, run.reference, run.gap, 1e-3)
+    return measures.steps(run.time, run.position, run.reference, run.gap, measures.Settling(1e-3))
 
 
 @pytest.mark.parametrize("controller", [None, SAMPLED], ids=["continuous", "sampled"])

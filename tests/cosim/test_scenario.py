@@ -169,7 +169,11 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ('kind = "step"', 'kind = "stp"', "did you mean 'step'"),
         ("size_mm = 1.0", "size_m = 1.0", "'reference.size_mm' is missing (found 'reference.size_m' instead)"),
         ("size_mm = 1.0", "size_mm = nan", "reference.size_mm = nan is not allowed"),
-        ("total_deg = 10.0", "total_mm = 0.1", "'gap.total_deg' is missing (found 'gap.total_mm' instead)"),
+        (
+            "total_deg = 10.0",
+            "total_mm = 0.1",
+            "'gap.total_at_load_um' or 'gap.total_at_load_mm' is missing",
+        ),
         ("[gap]", "[gab]", "table [gap] is missing (found 'gab' instead)"),
         (
             "total_deg = 10.0",

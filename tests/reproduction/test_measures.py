@@ -75,7 +75,7 @@ def test_steps_of_a_square_wave():
     first = 0.98e-3 * (1.0 - np.exp(-time))
     second = -1e-3 + 0.2e-3 * np.sin(2 * np.pi * 1.6 * time)
     gap = time / 40.0
-    one, two = measures.steps(time, np.where(time < 20.0, first, second), reference, gap, 1e-3)
+    one, two = measures.steps(time, np.where(time < 20.0, first, second), reference, gap, measures.Settling(1e-3))
     assert (one.begin, one.end, two.begin, two.end) == pytest.approx((0.0, 20.0, 20.0, 40.0))
     assert (one.reference, two.reference) == (1e-3, -1e-3)
     assert one.settled
@@ -90,4 +90,4 @@ def test_steps_of_a_square_wave():
 
 def test_the_last_sample_is_not_a_step():
     time = grid(20.0)
-    assert len(measures.steps(time, time, np.where(time < 20.0, 1.0, 2.0), time, 1.0)) == 1
+    assert len(measures.steps(time, time, np.where(time < 20.0, 1.0, 2.0), time, measures.Settling(1.0))) == 1

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
+from servotwin.plant.display_units import MILLIMETRES, DisplayUnit
 from servotwin.report import style
 from servotwin.reproduction.measures import Array
 from servotwin.reproduction.runs import DURATION, Trace
@@ -16,28 +18,28 @@ from servotwin.reproduction.twin_runs import EstimateRecord, TwinRun
 FAINTEST = 1e-4  # deg; smaller errors are drawn at this value
 
 
-def sheet(rows: int) -> tuple[Figure, list[Axes]]:
-    """Make a figure of panels over 200 s; the last one is labelled for the gap."""
+def sheet(rows: int, duration: float = DURATION) -> tuple[Figure, list[Axes]]:
+    """Make a figure of panels over so many s; the last one is labelled for the gap."""
     figure, axes = style.panels(rows, 1, height=1.9)
     panels = list(axes[:, 0])
-    panels[-1].set(xlabel="Time (s)", xlim=(0.0, DURATION), ylabel="Total gap (deg)")
-    panels[-1].set_xticks(range(0, round(DURATION) + 1, 20))
+    panels[-1].set(xlabel="Time (s)", xlim=(0.0, duration), ylabel="Total gap (deg)")
+    panels[-1].xaxis.set_major_locator(MaxNLocator(10))
     style.label_panels(panels)
     figure.align_ylabels(panels)
     return figure, panels
 
 
-def position(axes: Axes, trace: Trace, what: str = "position $q_3$") -> None:
+def position(axes: Axes, trace: Trace, what: str = "position $q_3$", unit: DisplayUnit = MILLIMETRES) -> None:
     """Draw reference and position; shade the steps that did not settle."""
     for step in trace.steps:
         if not step.settled:
             axes.axvspan(step.begin, step.end, color=style.ORANGE, alpha=0.22, linewidth=0.0)
-    style.trace(axes, trace.time, trace.position * style.MM, style.BLUE, what, linewidth=0.9)
-    reference = corners(trace.time[:-1], trace.reference[:-1] * style.MM)
+    style.trace(axes, trace.time, trace.position * unit.factor, style.BLUE, what, linewidth=0.9)
+    reference = corners(trace.time[:-1], trace.reference[:-1] * unit.factor)
     axes.plot(*reference, color=style.BLACK, linewidth=1.0, label="reference $r$")
     if not all(step.settled for step in trace.steps):
         axes.fill_between([], [], color=style.ORANGE, alpha=0.22, linewidth=0.0, label="not settled")
-    axes.set_ylabel("Position (mm)")
+    axes.set_ylabel(f"Position ({unit.name})")
     style.legend(axes)
 
 
@@ -59,14 +61,16 @@ def gaps(axes: Axes, run: TwinRun, pitch: float) -> None:
     """Draw the gap, the twin's estimates with their spread, and the gap for which the dead zone in force is made."""
     true_gap(axes, run.trace)
     gap_in_force(axes, run.trace, pitch, "dead zone in force")
-    estimates(axes, run)
+    estimates(axes, run.estimates)
 
 
-def estimates(axes: Axes, run: TwinRun) -> None:
-    """Draw the twin's estimates with their spread; refused ones as crosses at the prior."""
-    time, value, spread = _columns((e.time, e.gap * style.DEG, e.std * style.DEG) for e in run.estimates if e.ok)
-    axes.errorbar(time, value, spread, fmt="o", color=style.BLUE, markersize=4.0, capsize=2.0, label="estimates")
-    refused = _columns((e.time, e.gap * style.DEG) for e in run.estimates if not e.ok)
+def estimates(axes: Axes, given: Sequence[EstimateRecord]) -> None:
+    """Draw the twin's estimates with their spread; refused ones as crosses at the prior, where there is one."""
+    accepted = _columns((e.time, e.gap * style.DEG, e.std * style.DEG) for e in given if e.ok)
+    if accepted:
+        time, value, spread = accepted
+        axes.errorbar(time, value, spread, fmt="o", color=style.BLUE, markersize=4.0, capsize=2.0, label="estimates")
+    refused = _columns((e.time, e.gap * style.DEG) for e in given if not e.ok and np.isfinite(e.gap))
     if refused:
         axes.plot(*refused, "x", color=style.GREY, markersize=6.0, label="refused, prior")
     axes.set_ylabel("Total gap (deg)")
