@@ -141,8 +141,8 @@ class LongPolls:
     async def _read_newer(self, servo: str, after: int) -> Sequence[OutgoingMessage]:
         """Read the store, unless it is known to hold nothing newer."""
         notifications = self._notifications[servo]
-        # Where other processes post too, only the store knows.
-        if not self._shared and after >= self._empty_after.get(servo, _NEVER):
+        # Where other processes post too, only the store knows. An edge that has had more than it holds is news.
+        if not self._shared and after == self._empty_after.get(servo):
             return ()
         try:
             messages = await self._read(servo, after)

@@ -142,8 +142,8 @@ def test_a_csv_of_the_version_before_is_read_the_same(written, tmp_path):
 
 def test_a_packaged_scenario_is_named_without_a_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text, scenario = record._read(Path("fig15"))
+    text, scenario = record.read_scenario(Path("fig15"))
     assert (text, scenario.duration) == (preset_text("fig15"), 200.0)
     (tmp_path / "fig15").write_text("servo = 3")
     with pytest.raises(InvalidInput, match="servo"):
-        record._read(Path("fig15"))
+        record.read_scenario(Path("fig15"))
