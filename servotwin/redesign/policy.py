@@ -49,8 +49,6 @@ class Evidence:
         m, sizes of the steps in the last windows, this one included.
     search : LastSearch or None
         The last search for a verified setting.
-    underway : bool
-        True while an update has no receipt: what is in force when it arrives is another setting.
     """
 
     estimate: GapEstimate
@@ -64,7 +62,6 @@ class Evidence:
     rests: tuple[float, ...] = ()
     steps: tuple[float, ...] = ()
     search: LastSearch | None = None
-    underway: bool = False
 
     @property
     def gains(self) -> AnyGains | None:
@@ -157,12 +154,9 @@ class PaperPolicy:
             raise InvalidInput(f"policy smoothing = {self.smoothing!r}: must be at least 0 and below 1")
 
     def redesign(self, evidence: Evidence) -> Redesign:
-        """Set the tolerance for an estimate, unless it is in force; smoothed where an earlier redesign had a gap."""
+        """Set the tolerance for an estimate; smoothed only where an earlier redesign had a gap."""
         if evidence.unusable:
             return Redesign(None, math.nan, evidence.unusable)
         share = self.smoothing if evidence.tuned_for is not None else 0.0
         gap = (1.0 - share) * evidence.estimate.gap + share * (evidence.tuned_for or 0.0)
-        setting = Setting(self.k_dz * self.servo.p * gap)
-        if not evidence.underway and evidence.setting is not None and evidence.setting.tolerance == setting.tolerance:
-            return Redesign(None, gap, "the dead zone of the estimate is in force already")
-        return Redesign(setting, gap, "")
+        return Redesign(Setting(self.k_dz * self.servo.p * gap), gap, "")

@@ -309,7 +309,6 @@ def _evidence(model: TwinModel, state: TwinState, learnt: _Learnt, arrived: floa
         state.rests,
         state.usual_steps,
         state.search,
-        state.versions.pending is not None,
     )
 
 

@@ -17,7 +17,6 @@ from servotwin.cli.simulate import record
 from servotwin.cosim import Loop
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapStatus
-from servotwin.messages import Setting
 from servotwin.redesign.policy import Redesign
 
 SCENARIO = """
@@ -94,22 +93,16 @@ def test_where_no_window_tells_both_flanks_longer_ones_are_named(loop: Loop) -> 
     )
 
 
-def test_a_policy_that_changes_nothing_sends_nothing_and_says_why(loop: Loop) -> None:
-    assert any(each.ok for each in loop.estimates)
-    assert "settings: none sent; the dead zone of the estimate is in force already" in told(loop)
-
-
 def test_a_window_takes_one_line_of_a_terminal(loop: Loop) -> None:
     worst = [replace(each, status=GapStatus.MODEL_MISMATCH, interval=(0.01234, 0.12345)) for each in loop.estimates]
-    sent = [replace(each, reason="the fallback set is sent", setting=Setting(0.0)) for each in loop.redesigns]
+    sent = [replace(each, reason="the fallback set is sent", setting=loop.updates[0]) for each in loop.redesigns]
     console = Console(record=True, width=80)
     console.print(window_table(replace(loop, estimates=tuple(worst), redesigns=tuple(sent))))
     assert len(console.export_text().splitlines()) == 1 + len(worst)
 
 
 def test_every_window_without_a_setting_has_a_reason(loop: Loop) -> None:
-    sent = [replace(each, setting=Setting(0.0), reason="") for each in loop.redesigns]
-    assert list(reasons(replace(loop, redesigns=tuple(sent)))) == []
+    assert list(reasons(loop)) == []
     first, *others = loop.redesigns
     kept = [Redesign(None, math.nan, "in force already")] * len(others)
     found = list(reasons(replace(loop, redesigns=(replace(first, reason="the fallback set is sent"), *kept))))
@@ -152,7 +145,7 @@ def test_progress_names_the_search_and_goes_to_the_standard_error(file: Path, mo
         return "", st.Scenario.load(path)
 
     monkeypatch.setattr(simulate, "Progress", Shown)
-    monkeypatch.setattr(simulate, "read_scenario", read)
+    monkeypatch.setattr(simulate, "_read", read)
     record(file)
     assert shown[-1] == ("simulating", True)
 

@@ -7,7 +7,6 @@ import pytest
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
-from servotwin.messages import Setting
 from servotwin.plant.servo import Servo
 from servotwin.redesign.policy import Evidence, PaperPolicy
 
@@ -25,18 +24,6 @@ def test_smoothing_keeps_a_share_of_the_previous_gap():
     policy = PaperPolicy(SERVO, smoothing=0.1)
     assert policy.redesign(Evidence(GOOD, tuned_for=0.1)).gap == pytest.approx(0.19, rel=1e-15)
     assert policy.redesign(Evidence(GOOD)).gap == pytest.approx(0.2, rel=1e-15)
-
-
-def test_a_tolerance_that_is_in_force_already_is_not_sent_again():
-    nothing, in_force = PaperPolicy(SERVO, k_dz=0.0), Evidence(GOOD, setting=Setting(0.0))
-    made = nothing.redesign(in_force)
-    assert made.setting is None
-    assert (made.gap, made.reason) == (0.2, "the dead zone of the estimate is in force already")
-    # An update that is under way sets another one; of an edge that has not reported nothing is known.
-    assert nothing.redesign(replace(in_force, underway=True)).setting == Setting(0.0)
-    assert nothing.redesign(replace(in_force, setting=None)).setting == Setting(0.0)
-    assert nothing.redesign(replace(in_force, setting=Setting(1e-4))).setting == Setting(0.0)
-    assert PaperPolicy(SERVO).redesign(in_force).setting.tolerance > 0.0
 
 
 @pytest.mark.parametrize("status", [status for status in GapStatus if status is not GapStatus.OK])

@@ -42,18 +42,6 @@ def test_the_policy_smooths_from_the_gap_it_last_tuned_for():
     assert [update.gap for update in updates] == pytest.approx([0.1, 0.2, 0.3])
 
 
-def test_a_version_is_sent_only_when_the_dead_zone_changes():
-    servo, start = Servo.preset("paper"), Setting(1e-4, gains_of(OWN))
-    twin = twin_of(known_gap, PaperPolicy(servo, k_dz=0.0), start=start)
-    _, update = twin.receive(window_message(1, 10.0), 0.0)
-    assert update.setting.tolerance == 0.0
-    # Until its receipt what will be in force is not known.
-    assert [type(each).__name__ for each in twin.receive(window_message(2, 20.0), 1.0)] == ["Acknowledge", "Update"]
-    twin.receive(receipt(twin.log.updates[-1]), 2.0)
-    assert [type(each).__name__ for each in twin.receive(window_message(3, 30.0, version=2), 3.0)] == ["Acknowledge"]
-    assert len(twin.log.updates) == 2
-
-
 def test_a_policy_may_leave_the_controller_alone():
     twin = twin_of(known_gap, Rule(lambda _: Redesign(None, math.nan, "quiet")))
     assert len(twin.receive(window_message(1, 10.0), 0.0)) == 1
