@@ -39,7 +39,6 @@ MAX_WAIT_S = 30.0
 """s that an edge may wait."""
 REFUSED_POLL_S = 1.0
 """s that the refusal of a poll takes."""
-_NEVER = 2**63
 
 
 class LongPolls:

@@ -145,7 +145,7 @@ def test_progress_names_the_search_and_goes_to_the_standard_error(file: Path, mo
         return "", st.Scenario.load(path)
 
     monkeypatch.setattr(simulate, "Progress", Shown)
-    monkeypatch.setattr(simulate, "_read", read)
+    monkeypatch.setattr(simulate, "read_scenario", read)
     record(file)
     assert shown[-1] == ("simulating", True)
 
