@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 import sys
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servotwin.control import law
 from servotwin.control.cascade import Cascade
@@ -20,6 +20,7 @@ from servotwin.control.controller import Controller
 from servotwin.control.law import LawParameters, LawState
 from servotwin.control.laws import AnyController
 from servotwin.control.linear_law import LinearLaw
+from servotwin.estimation.first_states import command_from_best_states, least_squares, rms
 from servotwin.estimation.linear_controller import (
     at_rate,
     at_ticks,
@@ -41,10 +42,8 @@ _ROUNDING, _NOISE = 4.0, 10.0  # standard deviations of rounding and of noise, a
 _NOISES = 2.0  # the same of noise as a linear law shows it in the means, from what it read and from what was recorded
 _LARGEST = 0.5  # share of the voltage's swing: a window whose noise needs more tolerance shows nothing
 _FILTERED = 5.0  # time constants of the loop filter after which the measurement before the window is forgotten
-_AT_LIMIT, _FEWEST = 0.999, 20  # of the limit; samples before the first one at the limit that show the initial state
 _VAST = 1e-20 * math.sqrt(sys.float_info.max)  # V: sums of squares of such integrals are beyond the range of floats
 _DELAYS = 4  # samples, from none on, by which the voltage may be recorded later than it was computed
-_ROUNDS = 3  # fits of the initial state: a limit of the voltage makes it nonlinear
 
 
 @dataclass(frozen=True)
@@ -137,16 +136,16 @@ def _compared_linear(window: Window, law: Cascade | LinearLaw, tolerance: float)
     for delay in range(_DELAYS):
         voltage, rest = window.voltage[delay:], inputs[: len(inputs) - delay]
         means = _means(voltage, 0)
-        swing = _rms(means - means.mean())
-        noise = _rms(_means(noise_in_command(running, tolerance, rest, spreads), 0))
+        swing = rms(means - means.mean())
+        noise = rms(_means(noise_in_command(running, tolerance, rest, spreads), 0))
         tolerated = _TOLERATED * swing + _ROUNDING * _rounding(voltage) + _NOISES * noise
         if tolerated >= _LARGEST * swing:
             return None
-        unexplained = _rms(_means(voltage - command_from_best_start(running, tolerance, voltage, rest), 0))
+        unexplained = rms(_means(voltage - command_from_best_start(running, tolerance, voltage, rest), 0))
         factors: dict[str, float] = {}
         if unexplained > tolerated and (made is None or not made.factors):
             fitting, left = other_gains(law, tolerance, voltage, rest, window.sample_rate)
-            factors = fitting if _rms(_means(left, 0)) <= tolerated else {}
+            factors = fitting if rms(_means(left, 0)) <= tolerated else {}
         later = ControllerComparison(unexplained, swing, tolerated, factors)
         if later.agrees:
             return later
@@ -172,71 +171,52 @@ def _compared(
     first = _forgotten(parameters)
     if position.size - first < 2 * _FEWEST_BLOCKS:
         return None
-    given = _voltage_from_best_start(parameters, fading, voltage, reference, position)
-    means = _means(voltage, first)
-    swing, unexplained = _rms(means - means.mean()), _rms(_means(voltage - given, first))
-    stiff = _stiffness(parameters)
-    rounding = _rounding(voltage) + stiff * _rounding(position)
+    means, stiff = _means(voltage, first), _stiffness(parameters)
+    swing, rounding = rms(means - means.mean()), _rounding(voltage) + stiff * _rounding(position)
     tolerated = _TOLERATED * swing + _ROUNDING * rounding + _NOISE * stiff * _noise(position)
     if tolerated >= _LARGEST * swing:
         return None
+    unexplained = rms(_means(voltage - _voltage_from_best_start(parameters, voltage, reference, position), first))
     factors: dict[str, float] = {}
     if asked and not unexplained <= tolerated:
         factors = _factors(parameters, fading, voltage, reference, position, first, tolerated)
     return ControllerComparison(unexplained, swing, tolerated, factors)
 
 
-def _voltage_from_best_start(
-    parameters: LawParameters, fading: Array, voltage: Array, reference: Array, position: Array
-) -> Array:
+def _voltage_from_best_start(parameters: LawParameters, voltage: Array, reference: Array, position: Array) -> Array:
     """Voltage (n,) of the law from the initial state that fits the recorded one best."""
     start = law.start(float(position[0]))._replace(reference=float(reference[0]), voltage=float(voltage[0]))
-    best, least = np.zeros(0), math.inf
+    states, best, least = _hidden(parameters), np.zeros(0), math.inf
+    units = np.array([*states.values()])
     for active in (1.0, 0.0) if parameters.enter < parameters.leave else (1.0,):
-        state = start._replace(active=active)
-        for _ in range(_ROUNDS):
-            given, acting = run_law(parameters, state, reference, position)
-            limited = np.abs(voltage) >= _AT_LIMIT * parameters.voltage_limit
-            # A voltage at its limit corrects the integral: what is left of its first value shows before that.
-            first = int(np.argmax(limited)) if limited.any() else limited.size
-            free = np.arange(limited.size) < first if first >= _FEWEST else ~limited
-            state = _corrected(parameters, fading, state, voltage - given, acting, free, reference)
-        given, _ = run_law(parameters, state, reference, position)
-        if (error := _rms(voltage - given)) < least:
+        first = start._replace(active=active)
+
+        def run(values: Array, parameters: LawParameters = parameters, first: LawState = first) -> Array:
+            moved = {name: getattr(first, name) + float(value) for name, value in zip(states, values, strict=True)}
+            return run_law(parameters, first._replace(**moved), reference, position)[0]
+
+        free = partial(run, parameters=parameters._replace(voltage_limit=math.inf, rate_step=math.inf))
+        given = command_from_best_states(run, free, units, voltage, parameters.voltage_limit)
+        if (error := rms(voltage - given)) < least:
             best, least = given, error
     return best
 
 
-def _corrected(
-    parameters: LawParameters,
-    fading: Array,
-    state: LawState,
-    left: Array,
-    acting: Array,
-    free: NDArray[np.bool_],
-    reference: Array,
-) -> LawState:
-    """Correct the initial state by what it would have to be for the voltage left (n,) to vanish where it is free."""
-    size = left.size
-    columns = {"offset": fading[0, :size]}
+def _hidden(parameters: LawParameters) -> dict[str, float]:
+    """Parts of the law's state that a window does not show, of each what moves the voltage by about 1 V."""
+    units = {"offset": 1.0}
     if parameters.integral_step != 0.0:
-        columns["integral"] = acting
+        units["integral"] = 1.0
     if parameters.derivative_gain != 0.0:
-        columns["derivative"] = -parameters.derivative_gain * acting * fading[1, :size]
+        units["derivative"] = 1.0 / parameters.derivative_gain
     if parameters.velocity_gain != 0.0:
-        columns["ahead"] = parameters.velocity_gain * fading[2, 1 : size + 1]
+        units["ahead"] = 1.0 / parameters.velocity_gain
     if parameters.friction != 0.0:
         # Which way the reference moved before the window holds until it moves in it.
-        columns["direction"] = parameters.friction * (np.cumsum(reference != reference[0]) == 0)
+        units["direction"] = 1.0 / parameters.friction
     if parameters.notch_gain != 0.0:
-        for name in columns.keys() & {"integral", "derivative"}:
-            columns[name] = behind_notch(parameters, np.asarray(columns[name], dtype=float), 0.0, 0.0)
-        columns |= _notch_columns(parameters, size)
-    matrix = np.stack([column[free] for column in columns.values()], axis=1)
-    values = _least_squares(matrix, left[free])
-    return state._replace(
-        **{name: getattr(state, name) + float(value) for name, value in zip(columns, values, strict=True)}
-    )
+        units |= {"notch_band": 1.0 / parameters.notch_gain, "notch_low": 1.0 / parameters.notch_gain}
+    return units
 
 
 def _factors(
@@ -261,8 +241,8 @@ def _factors(
         initial += [np.where(np.cumsum(reference != reference[0]) == 0, 1.0, 0.0)]
     columns = np.stack([_means(term, first) for term in (*stated.values(), *initial)], axis=1)
     measured = _means(voltage - parameters.feedforward, first)
-    values = _least_squares(columns, measured)
-    if _rms(measured - columns @ values) > tolerated:
+    values = least_squares(columns, measured)
+    if rms(measured - columns @ values) > tolerated:
         return {}
     return {name: float(value) for name, value in zip(stated, values, strict=False)}
 
@@ -344,13 +324,6 @@ def _largest(parameters: LawParameters, voltage: Array, reference: Array, positi
     return max(float(np.max(np.abs(voltage))), _stiffness(parameters) * moved)
 
 
-def _least_squares(columns: Array, target: Array) -> Array:
-    """Coefficients (k,) of the columns (n, k), whose units differ by orders of magnitude."""
-    size = np.linalg.norm(columns, axis=0)
-    size[size == 0.0] = 1.0
-    return np.asarray(np.linalg.lstsq(columns / size, target, rcond=1e-9)[0] / size)
-
-
 def _forgotten(parameters: LawParameters) -> int:
     """Samples after which the loop filter has forgotten its state before the window."""
     if parameters.loop_step >= 1.0:
@@ -372,8 +345,4 @@ def _rounding(values: Array) -> float:
 
 def _noise(values: Array) -> float:
     """Standard deviation of white noise, from second differences, which a slow motion hardly has."""
-    return _rms(np.diff(values, 2)) / math.sqrt(6.0)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return rms(np.diff(values, 2)) / math.sqrt(6.0)

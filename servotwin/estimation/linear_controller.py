@@ -8,23 +8,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servotwin.control import linear_tick
 from servotwin.control.cascade import Cascade
 from servotwin.control.linear_law import LinearLaw
 from servotwin.control.linear_tick import LinearParameters, LinearState
+from servotwin.estimation.first_states import command_from_best_states, least_squares, rms
 from servotwin.estimation.window import MINIMUM_SAMPLES, Window
 from servotwin.hybrid.compiled import compiled, verbatim
 from servotwin.plant.signals import Array
 
 tick = verbatim(linear_tick.linear_tick)
 
-AT_LIMIT = 0.999  # of the limit
-_ROUNDS = 3  # fits of the first states: limits make the command nonlinear in them
 _TWICE, _NEAR = 2, 1e-3  # samples in a tick: fewest that count; of a whole number of them
 _DRAWS = 7  # seed of the noise whose effect on the command is computed
 
@@ -90,12 +89,16 @@ def command_from_best_start(law: LinearLaw, tolerance: float, command: Array, in
     best, least = np.zeros(0), math.inf
     for active in (1.0, 0.0) if parameters.enter < parameters.leave else (1.0,):
         state = first._replace(command=float(command[0]), active=active)
-        columns = first_states(law, parameters, state, inputs)
-        for _ in range(_ROUNDS):
-            left = command - run_linear(parameters, state, inputs)
-            state = _moved(law, state, _fitted(columns, left, np.abs(command) < AT_LIMIT * parameters.limit))
-        given = run_linear(parameters, state, inputs)
-        if (error := float(np.std(command - given))) < least:
+        outside = parameters._replace(enter=-1.0, leave=-1.0)
+        effect = np.abs(first_states(law, outside, state, inputs)).max(axis=0)
+        units = np.divide(1.0, effect, out=np.zeros(effect.size), where=effect > 0.0)
+
+        def run(by: Array, parameters: LinearParameters = parameters, state: LinearState = state) -> Array:
+            return run_linear(parameters, _moved(law, state, by), inputs)
+
+        free = partial(run, parameters=parameters._replace(limit=math.inf, rate_step=math.inf))
+        given = command_from_best_states(run, free, units, command, parameters.limit)
+        if (error := rms(command - given)) < least:
             best, least = given, error
     return best
 
@@ -121,7 +124,7 @@ def other_gains(
     columns = parts or [_unlimited(running, tolerance, inputs)]
     states = first_states(running, _flat(running.parameters(tolerance)), _start(running, inputs), inputs)
     target, matrix = command - law.feedforward, np.column_stack([*columns, states])
-    values = _fitted(matrix, target, np.ones(command.size, dtype=bool))
+    values = least_squares(matrix, target)
     left = target - matrix @ values
     if parts is None:
         return {"gain": float(values[0])}, left
@@ -177,13 +180,6 @@ def _moved(law: LinearLaw, state: LinearState, by: Array) -> LinearState:
     spare = (0.0,) * (len(state.states) - law.n)
     states = tuple(a + float(b) for a, b in zip(state.states, (*by[1:], *spare), strict=True))
     return state._replace(states=states, offset=state.offset + float(by[0]))
-
-
-def _fitted(columns: Array, target: Array, free: NDArray[np.bool_]) -> Array:
-    """Coefficients (k,) of columns (n, k), whose units differ by orders of magnitude, over the free samples."""
-    size = np.linalg.norm(columns[free], axis=0)
-    size[size == 0.0] = 1.0
-    return np.asarray(np.linalg.lstsq(columns[free] / size, target[free], rcond=1e-9)[0] / size)
 
 
 def inputs_of(window: Window) -> Array | None:

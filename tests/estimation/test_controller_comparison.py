@@ -34,6 +34,22 @@ def by_hand(controller, tolerance, state=None, count=4000, scale=1.0, rate=2000.
     time = np.arange(count) / rate
     position = scale * (1e-3 * np.sin(9.0 * time) + 3e-4 * np.sin(40.0 * time + 1.0))
     reference = scale * 1e-3 * np.sign(np.sin(4.0 * time + 0.4))
+    return under(controller, tolerance, state, reference, position, rate)
+
+
+def from_the_zone(controller, integral=0.0):
+    """A window that begins at rest in the dead zone, where the law hides its integral until a step."""
+    time = np.arange(4000) / 2000.0
+    after = np.maximum(time - 0.1, 0.0)
+    position = 5e-5 + 1e-3 * (1.0 - np.exp(-6.0 * after) * np.cos(20.0 * after))
+    reference = np.where(time < 0.1, 0.0, 1e-3)
+    state = start(float(position[0]))._replace(integral=integral, reference=0.0, active=0.0)
+    return under(controller, 1e-4, state, reference, position)
+
+
+def under(controller, tolerance, state, reference, position, rate=2000.0):
+    """A window whose voltage is the law's for a reference and a position."""
+    count = position.size
     law = controller.replace(sample_rate=rate).law(tolerance)
     state, voltage = state or start(float(position[0])), np.empty(count)
     for k in range(count):
@@ -65,6 +81,30 @@ def test_a_law_explains_its_own_voltage_whatever_its_state_was_at_the_beginning(
     assert made.agrees
     assert made.sentence == ""
     assert made.unexplained < 1e-9 * made.swing
+
+
+@pytest.mark.parametrize("integral", [-1.4, 1.4])
+@pytest.mark.parametrize("tracking", [None, 0.05], ids=["usual", "fast"])
+def test_an_integral_that_the_dead_zone_hides_until_a_limit_is_found(integral, tracking):
+    """Each window of robot-joint under the paper's dead zone begins so: the limit leaves a part of the integral."""
+    law = LAW.replace(Tf=0.1 * LAW.Tf, voltage_limit=2.8, tracking_time=tracking)
+    window = from_the_zone(law, integral)
+    limited = np.flatnonzero(np.abs(window.voltage) == 2.8)
+    assert limited.size > 0
+    assert not np.any(window.voltage[: limited[0]])
+    made = compare_controller(window, law, 1e-4)
+    assert made.agrees
+    assert made.unexplained < 1e-6 * made.swing
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_no_vast_state_that_fades_in_the_dead_zone_explains_another_controller(factor):
+    law = Controller(Kp=1000.0, Ki=100.0, Kd=100.0, Tf=0.01)
+    other = law.replace(Kp=factor * law.Kp, Ki=factor * law.Ki, Kd=factor * law.Kd)
+    assert compare_controller(from_the_zone(law), law, 1e-4).agrees
+    made = compare_controller(from_the_zone(other), law, 1e-4)
+    assert not made.agrees
+    assert made.unexplained / made.swing == pytest.approx(abs(1.0 - 1.0 / factor), rel=0.02)
 
 
 @pytest.mark.parametrize("factors", [(0.5, 0.3, 1.0), (1.0, 1.0, 0.4), (1.4, 0.6, 1.2), (-1.0, -1.0, -1.0)])

@@ -8,6 +8,7 @@ from twin_messages import message_of
 
 from servotwin.control.gains import gains_of
 from servotwin.estimation.controller import compare_controller
+from servotwin.estimation.linear_controller import run_linear
 from servotwin.estimation.window import Window
 from servotwin.messages import Setting
 from servotwin.plant.axis import Axis
@@ -38,6 +39,20 @@ def loop(law, tolerance=None):
     return Window.from_run(run, BEGIN, LENGTH)
 
 
+def from_the_zone(law, integral):
+    """A window of a cascade that begins at rest in a dead zone of 0.01 rad, which hides its integral until a step."""
+    time = np.arange(6000) / RATE
+    after = np.maximum(time - 0.2, 0.0)
+    position = 0.005 + 0.2 * (1.0 - np.exp(-4.0 * after) * np.cos(8.0 * after))
+    reference = np.where(time < 0.2, 0.0, 0.2)
+    inputs, linear = np.column_stack([reference, position / law.ratio, position]), law.linear()
+    first = linear.start(*inputs[0, 1:])
+    states = tuple(x + integral * (name in linear.holds) for name, x in zip(linear.names, first.states, strict=False))
+    start = first._replace(states=linear.padded(states), active=0.0)
+    voltage = run_linear(linear.parameters(0.01), start, inputs)
+    return Window(position, inputs[:, 1], voltage, reference, sample_rate=RATE)
+
+
 @pytest.mark.parametrize(
     ("law", "tolerance"),
     [
@@ -57,6 +72,14 @@ def test_a_cascade_explains_its_own_command_whatever_its_states_were_before(law,
     assert made.agrees
     assert made.unexplained < 0.01 * made.swing
     assert made.sentence == ""
+
+
+@pytest.mark.parametrize("integral", [-4.0, 4.0])
+def test_an_integral_of_a_cascade_that_the_dead_zone_hides_until_a_limit_is_found(integral):
+    law = LAW.replace(integral_only=False, voltage_limit=6.0, sample_rate=RATE)
+    made = compare_controller(from_the_zone(law, integral), law, 0.01)
+    assert made.agrees
+    assert made.unexplained < 1e-6 * made.swing
 
 
 @pytest.mark.parametrize("name", list(OTHER))
