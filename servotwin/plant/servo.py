@@ -8,7 +8,7 @@ import math
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, Unpack
@@ -260,7 +260,7 @@ class Servo:
     @property
     def sensors(self) -> Sensors:
         """Encoders, whose readings are off by nothing but their counts."""
-        return Sensors(self.encoder_resolution, self.position_resolution)
+        return _sensors(self.encoder_resolution, self.position_resolution)
 
     def with_position_resolution(self, resolution: float) -> Servo:
         """A copy whose position sensor has another resolution, m."""
@@ -393,6 +393,12 @@ class Servo:
             loop=self.loop().to_control(),
             closed_loop=self.closed_loop().to_control(),
         )
+
+
+@lru_cache(maxsize=64)
+def _sensors(encoder_resolution: float, position_resolution: float) -> Sensors:
+    """Encoders with counts, made once: machines are drawn by the hundred."""
+    return Sensors(encoder_resolution, position_resolution)
 
 
 @cache

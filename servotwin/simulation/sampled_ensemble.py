@@ -224,6 +224,8 @@ def _late_in_command(servos: list[Plant], laws: list[Law], delays: Array) -> tup
     From rest the loop then moves as it does with a late sensor, so many ticks later, and advances in blocks.
     """
     prompt = {id(servo): prompt_plant(servo) for servo in servos}
+    if all(prompt[id(servo)] is servo for servo in servos):
+        return servos, delays
     found, longer = list[Plant](), delays.copy()
     for k, (servo, law) in enumerate(zip(servos, laws, strict=True)):
         late = servo.sensors.fed_back(servo.p).late(law.sample_rate) if isinstance(law, Controller) else 0
