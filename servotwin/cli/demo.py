@@ -313,7 +313,7 @@ def _others(comparison: Comparison, row: DemoStep) -> tuple[str, ...]:
 
 
 def _caption(comparison: Comparison) -> str:
-    """What the panels show."""
+    """Description of the panels."""
     words = [each.column.explained for each in comparison.runs]
     words.append(
         f"the gap and the {comparison.twinned.column.name}'s estimates, and as a cross what it knew before a "

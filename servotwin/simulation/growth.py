@@ -53,7 +53,7 @@ def _sentence(why: str) -> str:
 
 
 def _instability(servo: Plant, law: Law) -> str:
-    """Why the loop is unstable without a gap; empty where it is not."""
+    """Reason for which the loop is unstable without a gap; empty where it is not."""
     try:
         servo.check_loop(law)
     except InvalidInput as error:

@@ -44,7 +44,7 @@ class WhiteNoise:
 
 @dataclass
 class EncoderErrors:
-    """What the readings of one encoder are off by at each step, before counts and delay.
+    """Errors of the readings of one encoder at each step, before counts and delay.
 
     Attributes
     ----------

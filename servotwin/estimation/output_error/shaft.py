@@ -223,7 +223,7 @@ def through_sample(
 
 @inlined
 def unused_friction(speed: float, friction: float) -> float:
-    """What is left of Coulomb friction where it stops a mass."""
+    """Part of Coulomb friction that is left where it stops a mass."""
     return max(0.0, friction - abs(speed))
 
 
