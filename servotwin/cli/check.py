@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from servotwin.errors import InvalidInput
 from servotwin.store.engine import POSTGRESQL, SQLITE
-from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message
+from servotwin.store.integrity import IntegrityReport, check_bodies, check_pages, newest_message, read_error
 from servotwin.store.store import Store
 from servotwin.twin_service.command import open_existing_store
 from servotwin.twin_service.store_watch import lost_messages
@@ -54,6 +54,11 @@ def _check_bodies(store: Store) -> int:
 
 def _require_sound(store: Store, result: IntegrityReport) -> None:
     if result.faults:
+        if error := read_error(store):
+            raise InvalidInput(
+                f"store {store.name}: the disk does not give it ({error}); it need not be damaged: see to the disk, "
+                "its cables and the system's log, and check again"
+            )
         raise InvalidInput(
             f"store {store.name}: is damaged ({'; '.join(result.faults)}); {_REMEDY[store.engines.writer.dialect.name]}"
             " and restore a backup: edges send again what they still keep"

@@ -143,7 +143,7 @@ class Engines:
         return (self.writer,) if self.writer is self.reader else (self.writer, self.reader)
 
     def dispose(self) -> None:
-        """Close every connection."""
+        """Close every connection that is not in use; one that is closes after its use."""
         for engine in self.distinct:
             engine.dispose()
 

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import logging
 import sqlite3
+import subprocess
+import sys
 import time
+from collections.abc import Callable
 from contextlib import closing
+from functools import partial
 from hashlib import blake2b
 from itertools import pairwise
 from pathlib import Path
@@ -33,6 +37,20 @@ _CHUNK = 2047
 """Bytes; see `message_digest`."""
 _DIGEST_BYTES = 16
 _MOST_FAULTS = 3
+_READ_FILES = """
+import sys
+for name in sys.argv[1:]:
+    try:
+        with open(name, "rb", 0) as opened:
+            while opened.read(1 << 20):
+                pass
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        sys.exit(print(f"{error.strerror}, in {name}"))
+"""
+_READ_S = 600.0
+_BODIES_AT_ONCE = 256
 
 
 class IntegrityReport(NamedTuple):
@@ -74,10 +92,20 @@ def check_files(store: Store) -> IntegrityReport:
         return IntegrityReport((str(error),), False)
 
 
-def check_pages(store: Store, seconds: float) -> IntegrityReport:
+def check_pages(
+    store: Store, seconds: float, deep: bool = False, ended: Callable[[], bool] = lambda: False
+) -> IntegrityReport:
     """Check the pages of a store, table by table, for a bounded time.
 
     Reading happens on a connection of its own and delays nobody; the log of SQLite cannot be shortened meanwhile.
+
+    Parameters
+    ----------
+    seconds : float
+    deep : bool
+        Of SQLite: compare tables with their indexes too, as PostgreSQL's are in every case.
+    ended : callable
+        True: stop.
 
     Raises
     ------
@@ -89,11 +117,11 @@ def check_pages(store: Store, seconds: float) -> IntegrityReport:
     file = sqlite_file(store.engines.writer.url)
     if file is None:
         return IntegrityReport()
-    checked, until = 0, time.monotonic() + seconds
+    checked, until, check = 0, time.monotonic() + seconds, "integrity_check" if deep else "quick_check"
     try:
-        with closing(_opened(file, until)) as connection:
+        with closing(_opened(file, lambda: time.monotonic() > until or ended())) as connection:
             for table in _TABLES:
-                rows = connection.execute(f"PRAGMA quick_check('{table}')").fetchmany(_MOST_FAULTS)
+                rows = connection.execute(f"PRAGMA {check}('{table}')").fetchmany(_MOST_FAULTS)
                 faults = tuple(f"table {table}: {row[0].splitlines()[-1]}" for row in rows if row[0] != "ok")
                 if faults:
                     return IntegrityReport(faults, False, checked)
@@ -126,6 +154,53 @@ def check_bodies(store: Store, after: int, most: int) -> tuple[IntegrityReport, 
     return result, rows[-1].id if rows else after
 
 
+def check_all(store: Store, seconds: float, ended: Callable[[], bool] = lambda: False) -> IntegrityReport:
+    """Check files, pages and bodies of a store that was found damaged; `complete` where all of it is sound.
+
+    Parameters
+    ----------
+    seconds : float
+        Time limit of the check of pages, s.
+    ended : callable
+        True: stop.
+
+    Raises
+    ------
+    StoreUnavailable
+        The store does not answer.
+    """
+    for check in (partial(check_files, store), partial(check_pages, store, seconds, True, ended)):
+        report = check()
+        if report.faults or not report.complete:
+            return report
+    store.engines.reader.dispose()  # its connections may hold pages as they were read when the store was damaged
+    after, checked = 0, 0
+    while not ended():
+        report, after = check_bodies(store, after, _BODIES_AT_ONCE)
+        checked += report.checked
+        if report.faults or report.complete:
+            return report._replace(checked=checked)
+    return IntegrityReport((), False, checked)
+
+
+def read_error(store: Store) -> str:
+    """Error with which the system does not give all of an SQLite store's files; empty: it gives all.
+
+    SQLite reports a page that the disk does not give in the words and with the code of a damaged one.
+    """
+    file = sqlite_file(store.engines.writer.url)
+    if file is None:
+        return ""
+    places = [str(file.with_name(f"{file.name}{end}").absolute()) for end in ("", "-wal")]
+    # In a process of its own: a process that closes a file gives up all locks that its SQLite has on that file.
+    command = [sys.executable, "-I", "-c", _READ_FILES, *places]
+    try:
+        result = subprocess.run(command, capture_output=True, text=True, timeout=_READ_S, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""  # not known
+    return result.stdout.strip()
+
+
 def missing_windows(store: Store, servo: str, boot: str, newest: int = 256) -> list[tuple[int, int]]:
     """Ranges of sequences, both included, that are missing among the newest windows of a boot."""
     with transaction(store.engines.reader) as connection:
@@ -151,9 +226,9 @@ def newest_message(store: Store) -> int:
         return int(connection.execute(sa.select(sa.func.coalesce(sa.func.max(messages.c.id), 0))).scalar_one())
 
 
-def _opened(file: Path, until: float) -> sqlite3.Connection:
+def _opened(file: Path, over: Callable[[], bool]) -> sqlite3.Connection:
     connection = sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro", uri=True, isolation_level=None)
-    connection.set_progress_handler(lambda: time.monotonic() > until, _STEPS)
+    connection.set_progress_handler(over, _STEPS)
     return connection
 
 

@@ -228,6 +228,7 @@ class TwinService:
             self._spawn(self._watch_lag())
             self._spawn(self._missing.run())
             self._spawn(self.watch.run())
+            self._spawn(self.watch.run_recheck(), vital=False)
             self._spawn(self.watch.run_mark())
             self._spawn(self.watch.run_lost(self.polls.notify), vital=False)
         if not math.isinf(self.config.retention_days):
@@ -274,7 +275,6 @@ class TwinService:
     @property
     def dispatching(self) -> bool:
         """False where a task without which no machine is served has failed; only a restart begins it again."""
-        # A task that ended without an error did so because of the damage.
         return not any(task.done() and not task.cancelled() and task.exception() for task in self._vital)
 
     def _lagging(self, backlog: Backlog | None) -> list[str]:

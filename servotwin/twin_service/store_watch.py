@@ -9,12 +9,21 @@ from contextlib import suppress
 from functools import partial
 from math import inf
 from pathlib import Path
+from threading import Event
 from typing import TypeVar
 
 from servotwin.messages import Resend, encode
 from servotwin.runtime.files import replace_file
 from servotwin.store.engine import POSTGRESQL, StoreDamaged, StoreUnavailable, sqlite_file
-from servotwin.store.integrity import IntegrityReport, check_bodies, check_files, check_pages, newest_message
+from servotwin.store.integrity import (
+    IntegrityReport,
+    check_all,
+    check_bodies,
+    check_files,
+    check_pages,
+    newest_message,
+    read_error,
+)
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
 from servotwin.store.store import Store
@@ -30,6 +39,8 @@ _START_S, _PAGES_S = 5.0, 60.0
 """s for which pages are checked at the start, and once per round in the background."""
 _BODIES, _SHARE = 32, 0.02
 """Bodies that are compared at once, and the share of the time for that."""
+_RECHECK_S, _LONGEST_RECHECK_S, _RECHECK_SHARE = 5.0, 600.0, 0.1
+"""s between two checks of a store that was found damaged: the first ones, and at most; and their share of the time."""
 _MARK_S = 5.0
 """s between two notes of the newest message: as many acknowledged messages may go unnoticed if the log is lost."""
 _TELL_S = 1.0
@@ -59,7 +70,8 @@ class StoreWatch:
     Attributes
     ----------
     fault, lost : str
-        Damage that was found; messages that the store had and has no more; empty: none.
+        Damage that was found, until a check of everything passes; messages that the store had and has no more; empty:
+        none.
     rounds : int
         Number of times that everything was checked.
     """
@@ -80,6 +92,7 @@ class StoreWatch:
         self._wall, self._monotonic = wall, monotonic
         self._marked, self._not_marked = 0, ""
         self._asked, self._ahead = set[str](), dict[str, float]()
+        self._why, self._read_error = "", ""
         self.fault, self.lost, self.rounds = "", "", 0
 
     async def put(self, item: Incoming) -> PutResult:
@@ -107,40 +120,92 @@ class StoreWatch:
     async def run(self) -> None:
         """Check everything, again and again, at a small share of the time."""
         after = 0
-        while not self.fault:
+        while True:
+            begun = self._monotonic()
+            if not self.fault:
+                with suppress(StoreUnavailable):
+                    after = await self._executor.run(partial(self._check_some, after), slow=True)
+            await asyncio.sleep(max(1.0, (self._monotonic() - begun) * (1.0 / _SHARE - 1.0)))
+
+    async def run_recheck(self) -> None:
+        """Check a store that was found damaged again and again, ever more rarely; one that is sound is written again.
+
+        A disk that does not give a page for a while is over some day, and to SQLite that is damage.
+        """
+        pause = _RECHECK_S
+        while True:
+            await asyncio.sleep(_TELL_S)
+            if not self.fault:
+                pause = _RECHECK_S
+                continue
             begun = self._monotonic()
             with suppress(StoreUnavailable):
-                after = await self._executor.run(partial(self._check_some, after), slow=True)
-            await asyncio.sleep(max(1.0, (self._monotonic() - begun) * (1.0 / _SHARE - 1.0)))
+                await self.recheck(max(pause, _PAGES_S))
+            if self.fault:
+                await asyncio.sleep(max(pause, (self._monotonic() - begun) * (1.0 / _RECHECK_SHARE - 1.0)))
+                pause = min(2.0 * pause, _LONGEST_RECHECK_S)
+
+    async def recheck(self, seconds: float) -> None:
+        """Check everything of a damaged store, its pages for that time at most, s; where it is sound, go on.
+
+        Raises
+        ------
+        StoreUnavailable
+        """
+        ended = Event()
+        try:
+            error = await self._executor.run(partial(read_error, self._store), slow=True)
+            if error and error != self._read_error:
+                log.error("the disk does not give the store", extra={"why": error})
+            self._read_error = error
+            if error:
+                self.fault = f"the disk does not give it: {error}"
+                return
+            report = await self._executor.run(partial(check_all, self._store, seconds, ended.is_set), slow=True)
+            if report.complete and not report.faults:
+                await self._executor.run(self._resume)
+        finally:
+            ended.set()  # where this task was cancelled, its thread still checks
+
+    def _resume(self) -> None:
+        """Write the store again, over connections that have read none of what was damaged."""
+        self._store.engines.dispose()
+        self.fault, self._store.damaged = "", False
+        log.warning("store sound again: it is written", extra={"after": self._why})
+        self._compare_mark()
 
     async def run_mark(self) -> None:
         """Note the newest message beside the store every few seconds."""
-        while not self.fault:
+        while True:
             await asyncio.sleep(_MARK_S)
-            with suppress(StoreUnavailable):
-                await self._executor.run(self.mark)
+            if not self.fault:
+                with suppress(StoreUnavailable):
+                    await self._executor.run(self.mark)
 
     async def run_lost(self, notify: Callable[[str], None]) -> None:
         """Ask edges that are new to a store which has lost messages: it may have lost their servos too.
 
         `notify` is called with each that was asked, so that its poll ends.
         """
-        while not self.fault:
+        while True:
             await asyncio.sleep(_NEW_S)
-            if self.lost:
+            if self.lost and not self.fault:
                 with suppress(StoreUnavailable):
                     for servo in await self._executor.run(self._ask_for_windows):
                         notify(servo)
 
     async def tell(self, announce: Callable[[str, str], None]) -> None:
         """Announce that the store has lost messages, once it has, and that it is damaged, once it is."""
-        told = ""
-        while not self.fault:
+        told, damage = "", ""
+        while True:
             if self.lost != told:
                 told = self.lost
                 announce("the store has lost messages", told)
+            if self.fault != damage:
+                damage = self.fault
+                if damage:
+                    announce("store damaged", f"it is not written any more: {damage}")
             await asyncio.sleep(_TELL_S)
-        announce("store damaged", f"it is not written any more: {self.fault}")
 
     def outgoing(self, servo: str, after: int) -> tuple[Sequence[OutgoingMessage], str]:
         """Messages to the edge with serials above `after`, and what the store lacks in a sentence; empty: nothing.
@@ -227,7 +292,8 @@ class StoreWatch:
     def _found(self, result: IntegrityReport) -> None:
         if result.faults and not self.fault:
             self.fault, self._store.damaged = result.faults[0], True
-            log.error("store damaged: it is not written any more", extra={"why": "; ".join(result.faults)})
+            self._why, self._read_error = "; ".join(result.faults), ""
+            log.error("store damaged: it is not written any more", extra={"why": self._why})
 
 
 def lost_messages(store: Store, beside: Path) -> str:

@@ -14,11 +14,13 @@ from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable, sqlite_file
 from servotwin.store.integrity import (
     IntegrityReport,
+    check_all,
     check_bodies,
     check_pages,
     message_digest,
     missing_windows,
     newest_message,
+    read_error,
 )
 from servotwin.store.retention import delete_old_bodies
 from servotwin.store.store import Store, open_store
@@ -170,3 +172,26 @@ def test_an_error_that_passes_is_no_damage(url: str, caplog: pytest.LogCaptureFi
     aside.rename(file)
     assert check_pages(store, math.inf).complete
     store.close()
+
+
+def test_a_disk_that_does_not_give_a_file_is_told_from_damage(tmp_path):
+    file = filled(f"sqlite:///{tmp_path}/twin.db", 3)
+    with closing(open_store(str(file))) as store:
+        assert read_error(store) == ""
+        overwrite(file, 1)
+        assert read_error(store) == ""
+    file.unlink()
+    file.symlink_to("/proc/self/mem")  # whose first bytes belong to nothing, so that reading them is an I/O error
+    assert read_error(store) == f"Input/output error, in {file}"
+
+
+def test_a_check_of_everything_finds_each_kind_of_damage(tmp_path):
+    file = filled(f"sqlite:///{tmp_path}/twin.db", 300)
+    with closing(open_store(str(file))) as store:
+        assert check_all(store, math.inf) == IntegrityReport((), True, 300)
+        assert not check_all(store, math.inf, lambda: True).complete
+        with store.engines.writer.begin() as connection:
+            connection.exec_driver_sql("UPDATE bodies SET body = x'00' WHERE message = 299")
+        assert "message 299" in check_all(store, math.inf).faults[0]
+        file.rename(tmp_path / "moved")
+        assert "deleted, moved or replaced" in check_all(store, math.inf).faults[0]

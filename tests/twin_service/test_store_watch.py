@@ -14,6 +14,7 @@ from store_cases import postgresql_addresses
 
 from servotwin.messages import Resend, decode, encode
 from servotwin.store.engine import StoreUnavailable
+from servotwin.store.integrity import IntegrityReport
 from servotwin.store.store import open_store
 from servotwin.twin_service import missing_windows, store_watch
 from servotwin.twin_service.twin_file import service_of
@@ -22,6 +23,14 @@ pytest_plugins = ("store_fixtures",)
 
 PAGE = 8192
 _LOST = "the twin's store has lost messages"
+
+
+async def until(true: Callable[[], bool]) -> None:
+    async with asyncio.timeout(30.0):
+        while not true():
+            await asyncio.sleep(0.02)
+
+
 Body = Callable[..., Awaitable[None]]
 
 
@@ -66,6 +75,61 @@ def test_a_damaged_store_is_noticed_at_the_start_and_not_written(tmp_path, caplo
 
     serve(path, look)
     assert "store damaged: it is not written any more" in caplog.messages
+
+
+@pytest.mark.parametrize("passes", [True, False])
+def test_a_store_is_written_again_once_all_of_it_can_be_read(tmp_path, caplog, monkeypatch, passes):
+    """As where a disk does not give pages for a while: SQLite calls that damage."""
+    monkeypatch.setattr(store_watch, "_TELL_S", 0.01)
+    monkeypatch.setattr(store_watch, "_RECHECK_S", 0.01)
+    monkeypatch.setattr(store_watch, "_LONGEST_RECHECK_S", 0.02)
+    path, file, said = twin_file(tmp_path), tmp_path / "twin.db", []
+
+    async def fill(_system, client):
+        assert set(await send(client, *range(40))) == {201}
+
+    async def body(system, client):
+        sound = file.read_bytes()
+        with file.open("r+b") as opened:
+            opened.seek(8 * PAGE)
+            opened.write(os.urandom(len(sound) - 10 * PAGE))
+        telling = asyncio.create_task(system.watch.tell(lambda *about: said.append(about)))
+        system.watch._check_some(0)
+        assert await send(client, 100) == [503]
+        await asyncio.sleep(0.3)
+        assert await send(client, 100) == [503]  # checked many times meanwhile
+        if passes:
+            with file.open("r+b") as opened:
+                opened.write(sound)
+            await until(lambda: not system.watch.fault)
+            assert await send(client, 100) == [201]
+            assert (await client.get("/healthz")).json()["damage"] == ""
+            assert system.dispatching
+        telling.cancel()
+
+    serve(path, fill)
+    serve(path, body)
+    assert caplog.messages.count("store sound again: it is written") == passes
+    assert [kind for kind, _sentence in said] == ["store damaged"]
+
+
+def test_a_disk_that_does_not_give_the_store_is_named_and_a_passing_error_ends(tmp_path, caplog, monkeypatch):
+    errors = ["Input/output error, in twin.db", "Input/output error, in twin.db", ""]
+    monkeypatch.setattr(store_watch, "read_error", lambda _store: errors.pop(0))
+
+    async def body(system, client):
+        system.watch._found(IntegrityReport(("database disk image is malformed",), False))
+        for _ in range(2):
+            await system.watch.recheck(60.0)
+            assert (await client.get("/healthz")).json()["damage"] == (
+                "the disk does not give it: Input/output error, in twin.db"
+            )
+        await system.watch.recheck(60.0)
+        assert await send(client, 0) == [201]
+
+    monkeypatch.setattr(store_watch, "_TELL_S", 1e9)  # the service itself does not check
+    serve(twin_file(tmp_path), body)
+    assert caplog.messages.count("the disk does not give the store") == 1
 
 
 def test_damage_that_comes_later_is_noticed_by_the_digest_of_a_body(tmp_path):
