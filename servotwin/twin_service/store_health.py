@@ -56,13 +56,17 @@ class StoreHealth:
         self._last_cut = -math.inf
         self._logged = set[str]()
         self._posted, self._since, self._seen = False, 0.0, -math.inf
+        self._damage_seen = -math.inf
 
     @property
     def trouble(self) -> str:
         """Reason for which the last read or write failed, or gets no answer; empty: none did, or long ago."""
         if self._damage():
+            self._damage_seen = self._now()
             return ""
-        failed = self._writes.failure if self._now() - self._writes.failed_at < _UNHEALTHY_S else ""
+        # A write that failed because of damage says nothing once that is over; damage is looked at every second.
+        since = max(self._now() - _UNHEALTHY_S, self._damage_seen + _LOOK_S)
+        failed = self._writes.failure if self._writes.failed_at > since else ""
         return self._leases() or failed or self._executor.fault or self._stalled()
 
     @property

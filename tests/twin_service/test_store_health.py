@@ -152,6 +152,10 @@ def test_a_damaged_store_is_told_by_its_damage_alone() -> None:
     watched = Watched()
     watched.damage, watched.leases = "page 7 is damaged", "damaged"
     watched.looked(30)
+    watched.writes.failure, watched.writes.failed_at = "it is damaged and not written", watched.now
+    watched.looked(1)
+    watched.damage, watched.leases = "", ""
+    watched.looked(30)
     assert not watched.told
 
 
