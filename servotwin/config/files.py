@@ -9,6 +9,7 @@ import stat
 from collections.abc import Mapping
 from pathlib import Path
 
+from servotwin.config.named_file import check_named
 from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
 
@@ -65,14 +66,12 @@ def check_private(path: Path) -> None:
 
 def _check_regular(path: Path) -> int:
     """Check that a path is that of a file that can be read, and return its mode."""
+    check_named(path)
     try:
-        mode = path.stat().st_mode
-        if stat.S_ISREG(mode):  # another could wait for ever for its writer
-            path.open("rb").close()
-            return mode
+        path.open("rb").close()
+        return path.stat().st_mode
     except OSError as error:
         raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
-    raise InvalidInput(f"{path}: is {'a folder' if stat.S_ISDIR(mode) else 'no file'}; give the name of a file")
 
 
 def _line(text: str, where: str, in_header: bool) -> str:

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, cast
 
 from servotwin.config.own_units import OwnUnits
 from servotwin.config.units import unit_of
+from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
 
 _Default = TypeVar("_Default")
@@ -335,6 +336,7 @@ def read_toml(path: str | os.PathLike[str]) -> Table:
         The file is missing, unreadable, not UTF-8, not TOML, or empty.
     """
     source = os.fspath(path)
+    check_named(path)
     try:
         text = Path(path).read_bytes().decode("utf-8")
     except OSError as error:
@@ -368,8 +370,9 @@ def check_complete(path: Path, remedy: str) -> None:
     Raises
     ------
     InvalidInput
-        It was cut short; the sentence ends with the remedy.
+        It was cut short; the sentence ends with the remedy. Or it is no file.
     """
+    check_named(path)
     try:
         lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
     except OSError:

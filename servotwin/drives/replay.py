@@ -18,6 +18,7 @@ from math import isfinite
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
+from servotwin.config.named_file import check_named
 from servotwin.config.units import SIGNAL_COLUMNS, Unit, unit_of
 from servotwin.edge.drive import Block, DriveLost
 from servotwin.edge.parameters import Parameters
@@ -159,6 +160,7 @@ def opened(path: Path) -> TextIO:
     if path.suffix != ".csv":
         made = f"servotwin convert {path} {path.with_suffix('.csv')}"
         raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not allowed; give a .csv, for example by {made}")
+    check_named(path, "log ")
     try:
         return path.open(encoding="utf-8-sig")
     except OSError as error:

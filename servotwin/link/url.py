@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import urlsplit
 
+from servotwin.config.named_file import check_named
 from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
 
@@ -49,10 +50,12 @@ def tls_context(ca_file: str | None) -> ssl.SSLContext:
     Raises
     ------
     InvalidInput
-        The file cannot be read, or holds no certificates.
+        The file cannot be read, is no file, or holds no certificates.
     """
     import ssl  # the edge's control process, which has no TLS, does without it
 
+    if ca_file is not None:
+        check_named(ca_file)
     try:
         return ssl.create_default_context(cafile=ca_file)
     except OSError as error:  # ssl.SSLError is one

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from servotwin.config.named_file import check_named
 from servotwin.config.table import did_you_mean
 from servotwin.config.units import SIGNAL_COLUMNS, unit_of
 from servotwin.errors import InvalidInput
@@ -102,8 +103,9 @@ def _reading(path: Path, requested: Requested, whole: bool) -> Iterator[LogColum
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise InvalidInput(f"log {path}: the suffix {path.suffix!r} is not known: allowed are {', '.join(FORMATS)}")
+    check_named(path, "log ")
     if not path.is_file():
-        raise InvalidInput(f"log {path}: is {'a directory' if path.is_dir() else 'not there'}; give the name of a file")
+        raise InvalidInput(f"log {path}: is not there; give the name of a file")
     form = FORMATS[suffix]
     form.check_installed(f"log {path}")
     try:

@@ -10,6 +10,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from servotwin.config.keys import key
+from servotwin.config.named_file import check_named
 from servotwin.config.table import did_you_mean
 from servotwin.control import law_keys
 from servotwin.control import linear_law_file as keys
@@ -124,6 +125,7 @@ def _sample_time(path: Path, given: Any) -> float | None:
 
 
 def _arrays(path: Path) -> Mapping[str, Any]:
+    check_named(path, "law system = ")
     try:
         if path.stat().st_size > _LARGEST_FILE:
             raise InvalidInput(f"law system = {path}: has more than {_LARGEST_FILE} bytes; give the matrices alone")

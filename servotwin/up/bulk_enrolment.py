@@ -8,6 +8,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
+from servotwin.config.named_file import check_named
 from servotwin.config.table import did_you_mean
 from servotwin.errors import InvalidInput
 from servotwin.twin_service.auth import write_private, write_tokens
@@ -68,6 +69,7 @@ def read_enrolments(path: Path, defaults: Enrolment) -> dict[int, Enrolment]:
         The file cannot be read, or some rows are not allowed: one sentence for each, with its line.
     """
     columns = _columns(path.parent)
+    check_named(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.reader(file, strict=True)

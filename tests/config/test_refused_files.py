@@ -185,12 +185,14 @@ def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, e
 def faulty(path: Path, fault: str) -> None:
     if fault == "a folder":
         path.mkdir()
+    elif fault == "a pipe":
+        os.mkfifo(path, 0o600)
     elif fault != "missing":
         path.write_bytes(b"" if fault == "empty" else bytes(range(256)))
         path.chmod(0o600)
 
 
-FAULTS = pytest.mark.parametrize("fault", ["missing", "empty", "a folder", "rubbish"])
+FAULTS = pytest.mark.parametrize("fault", ["missing", "empty", "a folder", "a pipe", "rubbish"])
 
 
 @FAULTS

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 
+from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
 from servotwin.runtime.files import replace_file
 
@@ -48,6 +49,7 @@ def read_state(path: str | os.PathLike[str]) -> MachineState | None:
     InvalidInput
         The file cannot be read, or holds no state of a machine.
     """
+    check_named(path)
     try:
         state = msgspec.json.decode(Path(path).read_bytes(), type=MachineState)
     except FileNotFoundError:
@@ -72,6 +74,7 @@ def read_speed(path: Path) -> float | None:
     InvalidInput
         It cannot be read, or holds no allowed speed.
     """
+    check_named(path)
     try:
         text = path.read_bytes()[:_MAX_BYTES]
         speed = float(text)

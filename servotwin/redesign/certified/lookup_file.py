@@ -10,6 +10,7 @@ import msgspec
 from msgspec import Struct
 
 import servotwin
+from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
 from servotwin.redesign.certified.certificate import Certificate
 from servotwin.redesign.certified.fallback import flattened
@@ -112,6 +113,7 @@ def _finished_cells(path: Path, policy: CertifiedPolicy, grid: Grid) -> dict[Cel
 
 
 def _read(path: Path) -> TableFile:
+    check_named(path)
     try:
         if path.stat().st_size > LARGEST:
             raise InvalidInput(f"{path}: is larger than {LARGEST} bytes, which no table is")
