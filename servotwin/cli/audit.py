@@ -21,6 +21,7 @@ from servotwin.config.files import read_secret
 from servotwin.config.table import did_you_mean
 from servotwin.dashboard.series import machine_series
 from servotwin.errors import InvalidInput
+from servotwin.link.seal import MAX_TOKEN
 from servotwin.link.url import in_clear, is_encrypted
 from servotwin.runtime import files
 from servotwin.store.records import ServoSummary
@@ -217,7 +218,7 @@ def _client(source: Source) -> Callable[[str], bytes]:
     if source.token is not None and in_clear(url):
         raise InvalidInput(f"url {url!r}: would send the token in clear to another machine; give https://")
     if source.token is not None:
-        headers["Authorization"] = f"Bearer {read_secret(source.token, in_header=True)}"
+        headers["Authorization"] = f"Bearer {read_secret(source.token, in_header=True, longest=MAX_TOKEN)}"
     # A request in clear goes to this computer only, and must not pass a proxy, which could read the token.
     handler = HTTPSHandler(context=_context(source.ca)) if is_encrypted(url) else ProxyHandler({})
     opener = build_opener(_NoRedirect, handler)

@@ -5,6 +5,7 @@ The functions with `_table, _name` are for `config.keys.key(parse=...)`, which n
 
 from __future__ import annotations
 
+import math
 import stat
 from collections.abc import Mapping
 from pathlib import Path
@@ -30,29 +31,33 @@ def header_secret_file(_table: Table, _name: str, path: Path, _folder: Path) -> 
     return read_secret(path, in_header=True)
 
 
-def read_secret(path: Path, *, in_header: bool = False) -> str:
+def read_secret(path: Path, *, in_header: bool = False, longest: float = math.inf) -> str:
     """Read a private file with one line, without surrounding white space; no message shows it.
 
     Parameters
     ----------
     in_header : bool
         The secret goes into a header of HTTP: it has to be ASCII.
+    longest : float
+        Characters at most.
 
     Raises
     ------
     InvalidInput
-        It cannot be read, others than its owner may read it, or it holds no such line.
+        It cannot be read, others than its owner may read it, or it holds no such line, or a longer one.
     """
     check_private(path)
     try:
-        return _line(path.read_text(encoding="utf-8"), str(path), in_header)
+        return _line(path.read_text(encoding="utf-8"), str(path), in_header, longest)
     except UnicodeDecodeError as error:
         raise InvalidInput(f"{path}: is no text (byte {error.start} is not UTF-8)") from None
 
 
-def secret_in(environment: Mapping[str, str], variable: str, *, in_header: bool = False) -> str:
+def secret_in(
+    environment: Mapping[str, str], variable: str, *, in_header: bool = False, longest: float = math.inf
+) -> str:
     """Read an environment variable as `read_secret` reads a file; raises InvalidInput."""
-    return _line(environment.get(variable, ""), f"environment variable {variable}", in_header)
+    return _line(environment.get(variable, ""), f"environment variable {variable}", in_header, longest)
 
 
 def check_private(path: Path) -> None:
@@ -74,8 +79,10 @@ def _check_regular(path: Path) -> int:
         raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
-def _line(text: str, where: str, in_header: bool) -> str:
+def _line(text: str, where: str, in_header: bool, longest: float) -> str:
     text, allowed = text.strip(), f"must hold one line of printable {'ASCII ' if in_header else ''}characters"
+    if len(text) > longest:
+        raise InvalidInput(f"{where}: has {len(text)} characters; at most {longest:g} are allowed")
     if not text:
         raise InvalidInput(f"{where}: is empty; it {allowed}")
     if not text.isprintable() or (in_header and not text.isascii()):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -19,6 +20,7 @@ from servotwin.control.running_law import RunningLaw
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import is_mqtt
+from servotwin.link.seal import MAX_TOKEN
 from servotwin.link.url import in_clear, is_encrypted, tls_context
 
 ROLES = ("control", "supervise")
@@ -258,11 +260,11 @@ def token_of(config: EdgeConfig, environment: Mapping[str, str] = os.environ) ->
     Raises
     ------
     InvalidInput
-        It is missing, or others may read its file; the message names file and key, and never shows the token.
+        It is missing or too long, or others may read its file; the message names file and key, and never shows the token.
     """
     if config.twin is None:
         return ""
-    return _secret(config, config.twin.token_file, "token", environment, in_header=True)
+    return _secret(config, config.twin.token_file, "token", environment, in_header=True, longest=MAX_TOKEN)
 
 
 def password_of(config: EdgeConfig, environment: Mapping[str, str] = os.environ) -> str | None:
@@ -280,14 +282,23 @@ def check_certificates(config: EdgeConfig) -> None:
             tls_context(str(config.path(twin.ca_file)))
 
 
-def _secret(config: EdgeConfig, file: str | None, name: str, environment: Mapping[str, str], *, in_header: bool) -> str:
+def _secret(
+    config: EdgeConfig,
+    file: str | None,
+    name: str,
+    environment: Mapping[str, str],
+    *,
+    in_header: bool,
+    longest: float = math.inf,
+) -> str:
     """Read a secret from the file `NAME_file` of [twin], or from the environment variable `NAME_env`."""
     table = config.link_table
     if file is not None:
         with of_key(table, f"{name}_file"):
-            return read_secret(config.path(file), in_header=in_header)
+            return read_secret(config.path(file), in_header=in_header, longest=longest)
     with of_key(table, f"{name}_env"):
-        return secret_in(environment, str(table.values[f"{name}_env"]), in_header=in_header)
+        variable = str(table.values[f"{name}_env"])
+        return secret_in(environment, variable, in_header=in_header, longest=longest)
 
 
 def _is_http(url: str) -> bool:

@@ -31,6 +31,8 @@ _LONGEST_PAUSE_S = 300.0
 _PIECE = 65536
 _OUT_OF_DATE = 9, 10
 """OpenSSL's codes for a certificate that is not yet valid, and for one that has expired."""
+_NO_ADDRESS = 404, 405
+"""Statuses of a twin that knows no such path, or not that method: it has judged no message."""
 _MARKS = 5
 """Protocol from which on a twin tells which body came."""
 _OTHER_BODY = "the answer is not to this message as it was sent: a proxy on the way changes it, or swaps answers"
@@ -328,6 +330,8 @@ def _checked(response: _Response, good: tuple[int, ...], mark: str | None = None
     refusal = _refusal_body(response)
     if refusal is None:
         raise Unreachable(f"HTTP status {response.status}, without a reason code of the twin's")
+    if response.status in _NO_ADDRESS and refusal.code is Refusal.NOT_UNDERSTOOD:
+        raise Unreachable(f"the twin does not know the address: a proxy on the way changes it ({refusal.detail[:200]})")
     # One that is too large is refused before it is read.
     judged = refusal.code.temporary or refusal.code is Refusal.TOO_LARGE or mark in (None, refusal.mark)
     if not judged:

@@ -17,6 +17,8 @@ from servotwin.messages.checks import Count, Name, require
 TO_EDGE, TO_TWIN = "to edge", "to twin"
 _MAC_BYTES = 32
 OVERHEAD = 256
+MAX_TOKEN = 1024
+"""Characters of a token: a twin refuses longer ones unread."""
 """Largest number of bytes that a seal adds to a message."""
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from servotwin.config.files import check_private
 from servotwin.config.table import Table, check_complete, read_toml, with_end
 from servotwin.errors import InvalidInput
-from servotwin.link.seal import verifier_of
+from servotwin.link.seal import MAX_TOKEN, verifier_of
 from servotwin.messages import NAME_PATTERN, Refusal
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.locks import lock_beside, locked
@@ -34,7 +34,6 @@ _NO_VERIFIER = bytes(32)
 """Verifier of no token. A servo without a token is compared with it, so that a guess takes as long."""
 _OPEN = verifier_of("")
 """Verifier of the empty token, which seals messages where no tokens are configured."""
-_MAX_TOKEN = 1024
 """Characters."""
 _MISSING = "a token is needed: Authorization: Bearer TOKEN"
 _WRONG = "the token is not that of this servo"
@@ -267,7 +266,7 @@ def bearer_token(header: bytes | None) -> bytes | None:
 def _digest(token: bytes | None) -> bytes:
     if token is None:
         raise RequestRejected(Refusal.BAD_TOKEN, _MISSING)
-    if len(token) > _MAX_TOKEN or not token.isascii():
+    if len(token) > MAX_TOKEN or not token.isascii():
         raise RequestRejected(Refusal.BAD_TOKEN, "the token is not one that this service issues")
     return verifier_of(token.decode("ascii"))
 

@@ -261,8 +261,10 @@ class EdgeApi:
         body = await self._bodies.read(request.content_length, request.receive)
         with _marked(request, body):
             incoming, window = self._ingest.read_window(servo, body, request.content_encoding)
-            if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
-                raise RequestRejected(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
+        if (window.boot, str(window.sequence)) != (request.path["boot"], request.path["sequence"]):
+            # Without the mark: a proxy has changed the address, and the body that came is no reason to drop it.
+            raise RequestRejected(Refusal.OTHER_NAME, f"the window is {incoming.key}, not what the address says")
+        with _marked(request, body):
             new = await self._ingest.commit(incoming, window) is PutResult.NEW
         if new:
             self._wake()

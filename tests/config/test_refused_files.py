@@ -153,6 +153,14 @@ TOKEN = 'token_file = "token"\n'
             "open: has mode 0644, so that others may open it; make it 0600: chmod 600 ",
         ),
         (
+            '[twin]\nurl = "https://h"\ntoken_file = "long"',
+            "twin.token_file = 'long': ",
+        ),
+        (
+            '[twin]\nurl = "https://h"\ntoken_file = "long"',
+            "long: has 1025 characters; at most 1024 are allowed",
+        ),
+        (
             '[twin]\nurl = "https://h"\ntoken_env = "SERVOTWIN_NOT_SET"',
             "environment variable SERVOTWIN_NOT_SET: is empty",
         ),
@@ -176,6 +184,8 @@ def test_files_that_an_edge_s_file_names_must_exist(tmp_path: Path, more: str, e
     for name, mode in (("token", 0o600), ("open", 0o644)):
         (tmp_path / name).write_text("secret-token\n")
         (tmp_path / name).chmod(mode)
+    (tmp_path / "long").write_text("secret-token" + "x" * 1013)
+    (tmp_path / "long").chmod(0o600)
     with pytest.raises(InvalidInput) as refused:
         check(load(tmp_path / "edge.toml"))
     assert expected in str(refused.value)

@@ -2,13 +2,14 @@
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 
 import msgspec
 import pytest
 from faketwin import FakeTwin, Handler
 
 from servotwin.link.body_mark import body_mark
+from servotwin.link.claim import ExclusiveTransport, HeldClaim
 from servotwin.link.http import HttpTransport
 from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import (
@@ -41,6 +42,40 @@ def link(twin: FakeTwin) -> Iterator[HttpTransport]:
     transport = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
     yield transport
     transport.close()
+
+
+@pytest.mark.parametrize("status", [404, 405])
+@pytest.mark.parametrize("message", [PARCEL, LETTER])
+@pytest.mark.parametrize("asked", [True, False])
+def test_an_address_that_the_twin_does_not_know_refuses_no_message(
+    twin: FakeTwin, link: HttpTransport, message: Parcel, status: int, asked: bool
+) -> None:
+    """As where a proxy strips a part of the path: the twin's own answer, of which no edge may be sure before."""
+    twin.claim_status = ClaimStatus("axis-1", protocol=5)
+    if asked:
+        link.ask(EdgeClaim("axis-1", "b0"))
+    twin.fault = lambda handler, _body: (
+        handler.answer(status, b'{"code":"not_understood","detail":"there is no such path"}') or True
+    )
+    with pytest.raises(Unreachable, match="there is no such path"):
+        link.deliver(message)
+    with pytest.raises(Unreachable, match="there is no such path"):
+        link.listen(0)
+
+
+def test_a_proxy_that_loses_the_path_for_a_while_costs_neither_window_nor_claim(twin: FakeTwin) -> None:
+    twin.claim_status = ClaimStatus("axis-1", protocol=5)
+    link = ExclusiveTransport(HttpTransport(twin.url, "axis-1", "secret", wait_s=0.1), "axis-1", HeldClaim("b0"))
+    with closing(link):
+        twin.fault = lambda handler, _body: (
+            handler.answer(404, b'{"code":"not_understood","detail":"there is no such path"}') or True
+        )
+        with pytest.raises(Unreachable):
+            link.deliver(PARCEL)
+        twin.fault, twin.claim_status = None, ClaimStatus("axis-1", "b0", 1, protocol=5)
+        link.deliver(PARCEL)
+        assert link.claim == HeldClaim("b0", 1)
+        assert list(twin.windows) == [("b0", 0)]
 
 
 CHANGED = "a proxy on the way changes it, or swaps answers"

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import httpx
 import pytest
-from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, hello, served, twin_file
+from service_system import MSGPACK, OPERATOR, OTHER, TOKEN, bearer, hello, place, served, twin_file, window
 
+from servotwin.messages import encode
 from servotwin.twin_service import limits, refusals
 
 SLOW, CLIENTS, LASTS = 0.3, 5, 0.9
@@ -148,3 +149,18 @@ def test_a_sender_without_a_valid_token_is_its_address(one: str, other: str, sam
     known = refusals.Refusals(refusals.Metrics(), owner_of=lambda token: "ax-1" if token == b"right" else "")
     assert (known.sender(None, one) == known.sender(b"wrong", other)) is same
     assert known.sender(b"right", one) == known.sender(b"right", other) != known.sender(None, one)
+
+
+def test_a_window_at_another_window_s_address_is_not_judged(tmp_path: Path) -> None:
+    """The answer has no mark of the body, without which the edge keeps the window: a proxy changed the address."""
+
+    async def body() -> None:
+        async with served(twin_file(tmp_path)) as (_system, client):
+            answer = await client.put(place(window(1)), content=encode(window(0)), headers=bearer())
+            assert answer.status_code == 400
+            assert answer.json() == {
+                "code": "other_name",
+                "detail": "the window is b/0, not what the address says",
+            }
+
+    asyncio.run(body())
