@@ -15,6 +15,7 @@ from servotwin.edge.supervisor import Rules
 from servotwin.edge_process.config import EdgeConfig, check_certificates, password_of, token_of
 from servotwin.edge_process.monitoring import log
 from servotwin.errors import InvalidInput
+from servotwin.link.sqlite_file import check_kind
 from servotwin.runtime.extras import check_extra
 from servotwin.runtime.files import replace_file
 from servotwin.runtime.locks import locked
@@ -56,6 +57,7 @@ def _check_files(config: EdgeConfig) -> None:
             raise InvalidInput(f"{where}: cannot be used ({error.strerror})") from None
         if (other := taken.setdefault(path.resolve(), key)) != key:
             raise InvalidInput(f"{where}: is {other}; give another name")
+    check_kind(config.path(config.files.outbox))
 
 
 @contextmanager

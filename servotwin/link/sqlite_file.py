@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from servotwin.errors import InvalidInput
 from servotwin.messages import InvalidMessage, WindowMessage, decode
 from servotwin.messages.codec import DEFLATE, MAX_BYTES, decompress
 
@@ -46,6 +47,8 @@ _WAITING = (
 )
 STORED = "SELECT seq FROM sqlite_sequence WHERE name = 'windows'"
 _BROKEN = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+_STORES_TABLE = "servotwin_version"
+_PUT_BACK = "move it to its place, or give another name"
 BESIDE = ("-wal", "-shm")
 
 
@@ -81,6 +84,27 @@ def is_broken(error: sqlite3.Error) -> bool:
 def was_read_only(error: Exception) -> bool:
     """True where the disk was read-only when the file was opened: SQLite's connection stays read-only after that."""
     return getattr(error, "sqlite_errorcode", 0) & 0xFF == sqlite3.SQLITE_READONLY
+
+
+def check_kind(path: Path) -> None:
+    """Refuse a database of another kind in the place of an outbox; it stays as it is, and so do the files beside it.
+
+    Raises
+    ------
+    InvalidInput
+        It is a twin's store, or has none but tables of another program.
+    """
+    try:
+        # Immutable: SQLite would make a log beside it. What only the log has is new, and no reason to refuse it.
+        address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        with closing(sqlite3.connect(address, uri=True)) as connection:
+            tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
+    except (sqlite3.Error, UnicodeError):
+        return  # there is none, or whoever opens it finds it broken
+    if _STORES_TABLE in tables:
+        raise InvalidInput(f"{path}: is a twin's store, no outbox of an edge; {_PUT_BACK}")
+    if tables and "windows" not in tables:
+        raise InvalidInput(f"{path}: is another program's database, no outbox of an edge; {_PUT_BACK}")
 
 
 def connect(path: Path, check: bool = True) -> sqlite3.Connection:

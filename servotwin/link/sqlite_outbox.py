@@ -29,6 +29,7 @@ from servotwin.link.sqlite_file import (
     STORED,
     OtherOutbox,
     Statement,
+    check_kind,
     connect,
     connect_own,
     is_broken,
@@ -66,6 +67,11 @@ class SqliteOutbox:
     clock : callable
         Monotonic, s.
 
+    Raises
+    ------
+    InvalidInput
+        A limit is not allowed, or the file is of another kind.
+
     Attributes
     ----------
     salvages : list of Salvage
@@ -90,6 +96,7 @@ class SqliteOutbox:
     ) -> None:
         if windows < 1 or size < 1:
             raise InvalidInput(f"outbox of {windows!r} windows and {size!r} bytes: must be at least 1 of each")
+        check_kind(path)
         self._path, self._servo, self._windows, self._size = path, servo, windows, size
         self._contents = OutboxContents(AcknowledgedWindows(kept or AcknowledgedLimits(0, 0.0), clock))
         self._last: LastStatus | None = last

@@ -12,6 +12,7 @@ from servotwin.store.schema import REVISION, metadata
 
 VERSIONS = "servotwin_version"
 """Name of the table that holds the revision."""
+_OUTBOXS_TABLES = {"windows", "letters", "acknowledged"}
 SCRIPTS = Path(__file__).with_name("migrations")
 # Key of PostgreSQL's advisory lock: an arbitrary number, the same in every process that migrates.
 _LOCK = 7461127
@@ -58,6 +59,8 @@ def _check(connection: sa.Connection, current: str | None, to: str) -> None:
         tables = set(sa.inspect(connection).get_table_names())
         # A PostgreSQL may be shared with other programs; a file with tables is another program's, or an edge's outbox.
         foreign = sorted(tables & set(metadata.tables) if connection.dialect.name == POSTGRESQL else tables)
+        if foreign and _OUTBOXS_TABLES <= tables:
+            raise InvalidInput(f"store {where}: is the outbox of an edge, no store of a twin; give another one")
         if foreign:
             raise InvalidInput(f"store {where}: holds a table {foreign[0]!r} that is not servotwin's; give another one")
     elif current > to:
