@@ -14,6 +14,7 @@ from typing import Protocol
 
 from servotwin.link.transport import Parcel, Refused, Transport, Unreachable
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
+from servotwin.messages.claims import CLONED
 
 SUPERSEDED = "another edge of this servo runs and has taken over: end one of the two, and start the other one again"
 _OF_THE_SENDER = (Refusal.BAD_TOKEN, Refusal.UNKNOWN_SERVO, Refusal.TOO_MANY, Refusal.UNAVAILABLE, Refusal.SUPERSEDED)
@@ -88,8 +89,9 @@ class FormerRuns:
     last: str
 
     def knows(self, status: ClaimStatus) -> bool:
-        """True where the newest claim is of one of them, or older, as of a twin that was restored from a backup."""
-        return status.number <= self.claim.number or status.run in (self.claim.run, self.last)
+        """True where the newest claim is of one of them, of a copy of one that ran, or older, as of a twin that was
+        restored from a backup."""
+        return status.number <= self.claim.number or status.run in (self.claim.run, self.last, CLONED)
 
 
 class ExclusiveTransport:

@@ -15,6 +15,9 @@ PROTOCOL = 5
 own for an update that meets a fallback; 3 none for one at an edge that was superseded; the answers of 4 over HTTP did
 not tell which body had come."""
 
+CLONED = "cloned"
+"""In place of a run: two copies of one run send, of which the twin can tell none from the other, and neither counts."""
+
 
 class EdgeClaim(Struct, frozen=True, omit_defaults=True, tag="claim/1"):
     """Question of an edge that runs, which claim of its servo counts; or its claim.

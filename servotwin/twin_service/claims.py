@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from servotwin.link.claim import HeldClaim
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, Refusal
+from servotwin.messages.claims import CLONED
 from servotwin.store.claims import StoredClaim
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.store import Store
@@ -25,6 +26,8 @@ _FRESH_S = 1.0
 _KIND = "alarm"
 """Kind of the evidence of a conflict."""
 _SUPERSEDED = "another edge of this servo has taken over"
+_OF_COPIES = 2
+"""Windows under names that are taken by which a run has a copy: one alone may have been changed on its way."""
 
 
 class _Known(NamedTuple):
@@ -74,6 +77,7 @@ class EdgeClaims:
         self._clocks, self._shared, self._software, self._announce = clocks, shared, software, announce
         self._known: OrderedDict[str, _Known] = OrderedDict()
         self._reported: OrderedDict[tuple[str, str], None] = OrderedDict()
+        self._conflicts: OrderedDict[tuple[str, str], set[int]] = OrderedDict()
 
     async def check(self, servo: str, text: str) -> None:
         """Check the claim that a request names; "": none.
@@ -113,6 +117,44 @@ class EdgeClaims:
         limits = self._samples_per_window, self._bytes_per_day
         return ClaimStatus(servo, newest.run, newest.number, PROTOCOL, self._software, *limits)
 
+    async def conflicting(self, servo: str, boot: str, sequence: int) -> None:
+        """Report a window that came under the name of another one, as of a computer that was cloned while it ran.
+
+        Once the servo's live run has sent several, a copy of it runs, which has its claim too. Neither counts then, and
+        both fall back: nothing tells which of them moves the machine.
+
+        Raises
+        ------
+        RequestRejected
+            SUPERSEDED: they do not count any more. UNAVAILABLE.
+        """
+        log.warning("window in conflict", extra={"servo": servo, "boot": boot, "sequence": sequence})
+        found = self._conflicts.setdefault((servo, boot), set())
+        if not found:
+            await self._tell_conflict(servo, f"another window came under the name {boot}/{sequence} of a stored one")
+        if len(found) < _OF_COPIES:
+            found.add(sequence)
+        if len(self._conflicts) > MAX_SERVOS:
+            self._conflicts.popitem(last=False)
+        newest = await self._newest(servo)
+        if len(found) < _OF_COPIES or boot != newest.run:
+            return
+        new = StoredClaim(CLONED, newest.number + 1)
+        if await self._write(servo, partial(self._store.raise_claim, servo, new, new.number)) == new:
+            self._evict(servo)
+            await self._tell_conflict(
+                servo,
+                f"two copies of the run {boot} send, as of a computer that was cloned while it ran; neither counts "
+                "until one of them is started again",
+            )
+        raise RequestRejected(Refusal.SUPERSEDED, _SUPERSEDED)
+
+    async def _tell_conflict(self, servo: str, what: str) -> None:
+        sentence = f"conflict: {what}"
+        self._announce("conflict", sentence, servo)
+        await self._write(servo, lambda now: self._store.add_alarm(servo, sentence, now))
+        self._metrics.evidence.add(_KIND)
+
     async def _take(self, servo: str, new: StoredClaim, before: StoredClaim) -> StoredClaim:
         newest = await self._write(servo, partial(self._store.raise_claim, servo, new, new.number))
         if newest == new:
@@ -124,6 +166,8 @@ class EdgeClaims:
         """Report that an edge runs which was superseded: at each of its questions, and once in the evidence."""
         self._metrics.rejected.add(Refusal.SUPERSEDED.value)
         log.warning("conflict", extra={"servo": servo, "run": claim.run, "newer": newest.run})
+        if newest.run == CLONED:  # which was told
+            return
         sentence = f"conflict: two edges of this servo run, {claim.run} and {newest.run}; the newer one counts"
         self._announce("conflict", sentence, servo)
         if (servo, claim.run) in self._reported:

@@ -46,6 +46,10 @@ class Clocks(NamedTuple):
         return cls(lambda: zero + time.monotonic())
 
 
+async def _no_conflict(_servo: str, _boot: str, _sequence: int) -> None:
+    return
+
+
 class Ingest:
     """Checks and stores messages of edges.
 
@@ -66,6 +70,8 @@ class Ingest:
         Largest number of samples of a window: the time and the memory of the work on it grow with them.
     disk : RateLimiter, optional
         Limits the bytes that a servo adds to the store.
+    conflict : callable
+        Called with servo, boot and sequence of a window that came under the name of another one.
     """
 
     def __init__(
@@ -79,7 +85,9 @@ class Ingest:
         note: Callable[[WindowMessage], None] = lambda _window: None,
         samples: int = MAX_BYTES,
         disk: RateLimiter | None = None,
+        conflict: Callable[[str, str, int], Awaitable[None]] = _no_conflict,
     ) -> None:
+        self._conflict = conflict
         self._note, self._samples, self._disk = note, samples, disk
         self._put, self._has_servo, self._sample_times = put, has_servo, sample_times
         self._metrics, self._limit = metrics, limit
@@ -150,7 +158,8 @@ class Ingest:
         Raises
         ------
         RequestRejected
-            CONFLICT: another message was committed under this key. UNAVAILABLE, TOO_MANY: it may succeed later.
+            CONFLICT: another message was committed under this key. SUPERSEDED: so it was of earlier ones, as of two
+            copies of one edge. UNAVAILABLE, TOO_MANY: it may succeed later.
         """
         begun = self._clocks.monotonic()
         if self._disk is not None:
@@ -164,6 +173,8 @@ class Ingest:
             if self._disk is not None and put is not PutResult.NEW:
                 self._disk.give_back(incoming.servo, len(incoming.body))
         if put is PutResult.CONFLICT:
+            if isinstance(message, WindowMessage):
+                await self._conflict(message.servo, message.boot, message.sequence)
             raise RequestRejected(
                 Refusal.CONFLICT, f"{incoming.kind.value} {incoming.key}: another message is stored under this key"
             )

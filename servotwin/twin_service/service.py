@@ -147,6 +147,7 @@ class TwinService:
             note=sequences.note,
             samples=config.samples_per_window,
             disk=daily_bytes_limiter(config.megabytes_per_day, self.clocks.monotonic),
+            conflict=lambda servo, boot, sequence: self.claims.conflicting(servo, boot, sequence),
         )
 
     def _make_dispatcher(self) -> Dispatcher:

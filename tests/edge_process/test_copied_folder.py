@@ -30,8 +30,8 @@ class Edge:
         self.thread = Thread(target=LinkProcess(load(folder / "edge.toml"), theirs, run).run)
         self.thread.start()
 
-    def send(self) -> None:
-        self.pipe.post(frames.encode(frames.window_frame(cut(self.sent), self.run, self.sent + 1)))
+    def send(self, samples: int = 10) -> None:
+        self.pipe.post(frames.encode(frames.window_frame(cut(self.sent, samples), self.run, self.sent + 1)))
         self.sent += 1
         while self.pipe.backlog:
             self.pipe.send()
@@ -106,3 +106,51 @@ def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) 
             last.send()
             until(lambda: ("b4-dd", 0) in stored())
             assert len(asked(alarm)) == 2
+
+
+@pytest.mark.slow
+def test_of_a_computer_that_was_cloned_while_its_edge_ran_neither_copy_counts_and_all_say_so(tmp_path: Path) -> None:
+    """Same run, same claim, same numbers: only the windows differ. No window but the first to differ is lost."""
+
+    def asked(text: str) -> list[tuple]:
+        with closing(sqlite3.connect(f"file:{tmp_path / 'twin.db'}?mode=ro", uri=True)) as database:
+            return database.execute(text).fetchall()
+
+    def stored() -> set[tuple[str, int]]:
+        return set(asked("SELECT boot, sequence FROM messages WHERE kind = 'window'"))
+
+    config = twin_file(tmp_path, 'store = "sqlite:///twin.db"')
+    first, clone = tmp_path / "first", tmp_path / "clone"
+    first.mkdir()
+    with service(config) as url:
+        (first / "edge.toml").write_text(EDGE.format(url=url))
+        (first / "token").touch(0o600)
+        (first / "token").write_text(TOKEN)
+        with edge(first, "b1-aa") as one:
+            one.send()
+            until(lambda: stored() == {("b1-aa", 0)})
+            until(lambda: (first / "status.json").exists())
+            shutil.copytree(first, clone, ignore=shutil.ignore_patterns("*.new"))
+            with edge(clone, "b1-aa") as two:
+                two.sent = 1
+                for number in (1, 2):
+                    one.send()
+                    until(lambda number=number: ("b1-aa", number) in stored())
+                    two.send(samples=12)
+                until(one.heard)
+                until(two.heard)
+                one.send()
+                two.send(samples=12)
+                until(lambda: one.status.get("conflict") is True and one.status["windows"]["waiting"] == 1)
+                until(lambda: two.status.get("conflict") is True and two.status["windows"]["waiting"] == 2)
+                assert two.status["windows"]["dropped"] == {"conflict": 1}
+        assert stored() == {("b1-aa", 0), ("b1-aa", 1), ("b1-aa", 2)}
+        first_word, last_word = (text for (text,) in asked("SELECT status FROM evidence WHERE kind = 'alarm'"))
+        assert first_word == "conflict: another window came under the name b1-aa/1 of a stored one"
+        assert "two copies of the run b1-aa send" in last_word
+        with edge(first, "b2-bb") as again:  # an operator starts the right one again
+            again.send()
+            until(lambda: stored() >= {("b1-aa", 3), ("b2-bb", 0)})
+            until(lambda: again.status.get("conflict") is not True)
+            assert not again.status["disk"]["faults"].get("folder behind")
+        assert len(asked("SELECT 1 FROM evidence WHERE kind = 'alarm'")) == 2

@@ -11,6 +11,7 @@ from service_system import MSGPACK, OTHER, bearer, place, served, twin_file, win
 from servotwin import __version__
 from servotwin.link.claim import HeldClaim
 from servotwin.messages import PROTOCOL, ClaimStatus, EdgeClaim, decode, encode
+from servotwin.messages.claims import CLONED
 
 PATH = "/v1/servos/ax-1/claim"
 
@@ -24,11 +25,17 @@ async def ask(client: httpx.AsyncClient, claim: EdgeClaim) -> ClaimStatus:
 
 
 async def put(client: httpx.AsyncClient, sequence: int, boot: str, number: int, run: str | None = None) -> int:
+    return (await put_answer(client, sequence, boot, number, run)).status_code
+
+
+async def put_answer(
+    client: httpx.AsyncClient, sequence: int, boot: str, number: int, run: str | None = None, samples: int = 200
+) -> httpx.Response:
     headers = {**bearer(), **MSGPACK}
     if number:
         headers["servotwin-claim"] = HeldClaim(run or boot, number).text
-    message = window(sequence, boot=boot, start=0.0)
-    return (await client.put(place(message), content=encode(message), headers=headers)).status_code
+    message = window(sequence, boot=boot, start=0.0, samples=samples)
+    return await client.put(place(message), content=encode(message), headers=headers)
 
 
 async def listen(client: httpx.AsyncClient, held: HeldClaim, wait: float) -> int:
@@ -78,6 +85,50 @@ def test_a_copied_folder_is_refused_and_an_alarm_is_stored(tmp_path: Path, caplo
     with caplog.at_level(logging.INFO, "servotwin"):
         asyncio.run(run())
     assert [record.message for record in caplog.records].count("conflict") == 2
+
+
+def test_of_two_copies_of_a_running_edge_neither_counts_until_one_is_started_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As of a virtual machine that was cloned while it ran: same run, same claim, same numbers, other windows."""
+
+    async def run() -> None:
+        async with served(twin_file(tmp_path)) as (system, client):
+            await ask(client, EdgeClaim("ax-1", "one", 0, 1))
+            for number in (0, 1, 2):
+                assert await put(client, number, "one", 1) == 201
+            assert [await put(client, 0, "one", 1) for _ in range(3)] == [200, 200, 200], "repeated, and no conflict"
+            for _ in range(2):
+                assert (await put_answer(client, 0, "one", 1, samples=99)).json()["code"] == "conflict"
+            [alarm] = system.store.events("ax-1")
+            assert "another window came under the name one/0" in alarm.status
+            assert await put(client, 3, "one", 1) == 201, "one alone may be a program that repeats a name"
+            refused = await put_answer(client, 1, "one", 1, samples=99)
+            assert refused.json()["code"] == "superseded", "kept by its edge"
+            assert await put(client, 4, "one", 1) == 409
+            status = await ask(client, EdgeClaim("ax-1", "one", 1))
+            assert (status.run, status.number) == (CLONED, 2)
+            [told, _first] = system.store.events("ax-1")
+            assert "neither counts until one of them is started again" in told.status
+            assert (await ask(client, EdgeClaim("ax-1", "two", 0, 3))).run == "two"
+            assert await put(client, 0, "two", 3) == 201
+
+    asyncio.run(run())
+    assert caplog.messages.count("window in conflict") == 3
+
+
+def test_windows_of_an_earlier_run_in_conflict_stop_nobody(tmp_path: Path) -> None:
+    async def run() -> None:
+        async with served(twin_file(tmp_path)) as (system, client):
+            await ask(client, EdgeClaim("ax-1", "two", 0, 1))
+            for samples, code in ((200, 201), (99, 409)):
+                for number in (0, 1, 2):
+                    answer = await put_answer(client, number, "one", 1, "two", samples)
+                    assert answer.status_code == code
+            assert system.store.claim_of("ax-1").run == "two"
+            assert len(system.store.events("ax-1")) == 1
+
+    asyncio.run(run())
 
 
 def test_a_claim_outlives_a_restart_of_the_twin_and_an_older_backup_of_its_store(tmp_path: Path) -> None:
