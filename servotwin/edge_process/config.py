@@ -282,6 +282,24 @@ def check_certificates(config: EdgeConfig) -> None:
             tls_context(str(config.path(twin.ca_file)))
 
 
+def certificates_of(config: EdgeConfig) -> bytes:
+    """Read the certificates against which the twin's is checked; empty: the system's, or none.
+
+    Raises
+    ------
+    InvalidInput
+        The file cannot be read, or holds none.
+    """
+    twin = config.twin
+    if twin is None or twin.ca_file is None or not is_encrypted(twin.url):
+        return b""
+    check_certificates(config)
+    try:
+        return config.path(twin.ca_file).read_bytes()
+    except OSError as error:
+        raise InvalidInput(f"{twin.ca_file}: cannot be read ({error.strerror or error})") from None
+
+
 def _secret(
     config: EdgeConfig,
     file: str | None,

@@ -24,7 +24,7 @@ from typing import Any
 
 from servotwin.edge.outlet import FILTERED
 from servotwin.edge_process import frames
-from servotwin.edge_process.config import EdgeConfig, token_of
+from servotwin.edge_process.config import EdgeConfig, certificates_of, token_of
 from servotwin.edge_process.config_file import load
 from servotwin.edge_process.frame_handler import CURSOR, FrameHandler
 from servotwin.edge_process.live_view import LiveView
@@ -82,7 +82,7 @@ class LinkProcess:
         self._run, self.outbox = run, open_outbox(config, last, run)
         self.outbox.flush()
         self._handler = FrameHandler(config, self.outbox)
-        self._token, self._token_replaced = token_of(config), False
+        self._token, self._certificates, self._replaced = token_of(config), certificates_of(config), False
         self._transport = exclusive_transport(config, self.outbox, run)
         self._session = Session(self.outbox, config.agent.retry, random.random)
         self._sender = self._receiver = None
@@ -130,7 +130,7 @@ class LinkProcess:
 
     def _serve(self) -> None:
         checked = 0.0
-        while not (self._pipe.broken or self._broken or self._token_replaced):
+        while not (self._pipe.broken or self._broken or self._replaced):
             self._send_pending()
             while self._outgoing:
                 self._pipe.post(self._outgoing.pop(0))
@@ -166,7 +166,7 @@ class LinkProcess:
             self._pipe.post(frames.encode(frames.AckFrame(serial)))
         self._log_troubles()
         self._report_conflict()
-        self._check_token()
+        self._check_replaced()
         self._write_status()
 
     def _write_status(self) -> None:
@@ -190,14 +190,15 @@ class LinkProcess:
             trouble = str(error)
         self._troubles.update("metrics", trouble)
 
-    def _check_token(self) -> None:
-        """End where the token was replaced: the next link process reads the new one."""
-        if self._token_replaced or self._receiver is None or not (self._session.trouble or self._receiver.trouble):
+    def _check_replaced(self) -> None:
+        """End where the token, or the certificates, were replaced: the next link process reads the new ones."""
+        if self._replaced or self._receiver is None or not (self._session.trouble or self._receiver.trouble):
             return
-        with suppress(InvalidInput):  # it is being replaced just now
-            self._token_replaced = token_of(self._config) != self._token
-        if self._token_replaced:
-            log("token replaced")
+        with suppress(InvalidInput):  # one is being replaced just now
+            token, certificates = token_of(self._config), certificates_of(self._config)
+            self._replaced = (token, certificates) != (self._token, self._certificates)
+            if self._replaced:
+                log("token replaced" if token != self._token else "certificates replaced")
 
     def _log_troubles(self) -> None:
         """Log new troubles, and those that are over."""

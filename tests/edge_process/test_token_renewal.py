@@ -9,6 +9,7 @@ from threading import Thread
 import pytest
 from edge_process_parts import cut
 from faketwin import FakeTwin
+from selfsigned import self_made
 from waiting import until
 
 from servotwin.edge_process import frames
@@ -78,6 +79,31 @@ def test_the_link_process_goes_on_while_its_token_is_missing(linked):
     (folder / "token").unlink()
     running.join(2.5)
     assert running.is_alive()
+
+
+@pytest.mark.slow
+def test_the_link_process_ends_when_the_certificates_that_it_trusts_are_replaced(tmp_path, capfd):
+    """As where a twin's self-made certificate was renewed: the machine need not be stopped for it."""
+    (tmp_path / "new").mkdir()
+    made, renewed = self_made(tmp_path)[0], self_made(tmp_path / "new")[0]
+    (tmp_path / "edge.toml").write_text(
+        EDGE.format(port=9).replace("http:", "https:").replace("[twin]", '[twin]\nca_file = "made.crt"')
+    )
+    (tmp_path / "token").touch(0o600)
+    (tmp_path / "token").write_text("first")
+    link = Link(tmp_path, "b1-00")
+    try:
+        for content in (None, b"half of a file"):
+            if content is not None:
+                made.write_bytes(content)
+            link.running.join(1.5)
+            assert link.running.is_alive()
+        renewed.replace(made)
+        link.running.join(PATIENCE)
+        assert not link.running.is_alive()
+    finally:
+        link.end()
+    assert '"event":"certificates replaced"' in capfd.readouterr().err
 
 
 class Link:
