@@ -15,9 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from servotwin.config.named_file import check_named
 from servotwin.config.own_units import OwnUnits
 from servotwin.config.units import unit_of
-from servotwin.config.named_file import check_named
 from servotwin.errors import InvalidInput
 
 _Default = TypeVar("_Default")

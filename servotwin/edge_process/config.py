@@ -260,7 +260,7 @@ def token_of(config: EdgeConfig, environment: Mapping[str, str] = os.environ) ->
     Raises
     ------
     InvalidInput
-        It is missing or too long, or others may read its file; the message names file and key, and never shows the token.
+        It is missing or too long, or others may read its file; the message names file and key, never the token.
     """
     if config.twin is None:
         return ""

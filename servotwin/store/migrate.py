@@ -59,7 +59,7 @@ def _check(connection: sa.Connection, current: str | None, to: str) -> None:
         tables = set(sa.inspect(connection).get_table_names())
         # A PostgreSQL may be shared with other programs; a file with tables is another program's, or an edge's outbox.
         foreign = sorted(tables & set(metadata.tables) if connection.dialect.name == POSTGRESQL else tables)
-        if foreign and _OUTBOXS_TABLES <= tables:
+        if tables >= _OUTBOXS_TABLES and connection.dialect.name != POSTGRESQL:
             raise InvalidInput(f"store {where}: is the outbox of an edge, no store of a twin; give another one")
         if foreign:
             raise InvalidInput(f"store {where}: holds a table {foreign[0]!r} that is not servotwin's; give another one")

@@ -1,6 +1,5 @@
 """A twin's store in the place of an edge's outbox, an outbox in that of a store: one sentence, the file as it was."""
 
-import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -58,12 +57,12 @@ def test_an_edge_does_not_take_another_kind_of_file_for_its_outbox(tmp_path, mak
     (tmp_path / "edge.toml").write_text(EDGE)
     file = tmp_path / "any.db"
     make(file)
-    before, names = file.read_bytes(), set(os.listdir(tmp_path))
+    before, names = file.read_bytes(), set(tmp_path.iterdir())
     for opening in (lambda: check(load(tmp_path / "edge.toml")), lambda: SqliteOutbox(file, "ax-1")):
-        with pytest.raises(InvalidInput, match=f"any.db: is {kind}, no outbox of an edge; "):
+        with pytest.raises(InvalidInput, match=rf"any\.db: is {kind}, no outbox of an edge; "):
             opening()
     assert file.read_bytes() == before
-    assert set(os.listdir(tmp_path)) == names
+    assert set(tmp_path.iterdir()) == names
 
 
 def test_a_twin_does_not_take_an_outbox_for_its_store_or_its_backup(tmp_path):
@@ -72,7 +71,7 @@ def test_a_twin_does_not_take_an_outbox_for_its_store_or_its_backup(tmp_path):
     box.put(window(0))
     box.close()
     before = file.read_bytes()
-    with pytest.raises(InvalidInput, match="outbox.sqlite: is the outbox of an edge, no store of a twin; "):
+    with pytest.raises(InvalidInput, match=r"outbox\.sqlite: is the outbox of an edge, no store of a twin; "):
         open_store(str(file))
     with pytest.raises(InvalidInput):
         backup(str(file), tmp_path / "backup.db")
