@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from servotwin.config.own_units import OwnUnits
+from servotwin.config.own_units import AT_LOAD, OwnUnits
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
@@ -95,17 +95,21 @@ class Table:
     units : OwnUnits, optional
         Units in which the file counts commands and positions, this table's and those within it; None: keys are named
         as they are declared.
+    ratio : float, optional
+        The load's travel (m or rad) per angle of the motor, of gaps that count at the load; None: the machine is not
+        known, and they must count at the motor.
     """
 
     source: str
     values: Mapping[str, object]
     name: str = ""
     units: OwnUnits | None = None
+    ratio: float | None = None
     _known: set[str] = field(default_factory=set)
 
-    def in_units(self, units: OwnUnits | None) -> Table:
+    def in_units(self, units: OwnUnits | None, ratio: float | None = None) -> Table:
         """The same table, whose keys are named in other units; what one of the two has read the other has too."""
-        return Table(self.source, self.values, self.name, units, self._known)
+        return Table(self.source, self.values, self.name, units, ratio, self._known)
 
     def names(self, declared: Sequence[str]) -> tuple[str, ...]:
         """Names that the file may have for the keys that set one attribute.
@@ -120,7 +124,8 @@ class Table:
         own = self.units.keys(declared)
         for name in declared:
             if name in self.values and name not in own:
-                right = self.units.key(name) if self.units.key(name) in own else own[0]
+                alike = [each for each in own if (AT_LOAD in each) == (AT_LOAD in name)] or own
+                right = self.units.key(name) if self.units.key(name) in own else alike[0]
                 raise InvalidInput(
                     f"{self.source}: unknown key '{self.path(name)}': this machine counts it in {unit_of(right).si}; "
                     f"here its name is '{self.path(right)}'"
@@ -223,7 +228,7 @@ class Table:
             raise self.invalid(key, f"a table [{self.path(key)}]")
         if required and key not in self.values:
             raise self.missing(key, table=True)
-        return Table(self.source, value, self.path(key), self.units)
+        return Table(self.source, value, self.path(key), self.units, self.ratio)
 
     def tables(self, key: str) -> list[Table]:
         """The array of tables [[key]]; empty where it is absent."""
@@ -231,7 +236,9 @@ class Table:
         value = self.values.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.invalid(key, f"an array of tables [[{self.path(key)}]]")
-        return [Table(self.source, item, f"{self.path(key)}[{i}]", self.units) for i, item in enumerate(value)]
+        paths = [f"{self.path(key)}[{i}]" for i in range(len(value))]
+        inner = zip(value, paths, strict=True)
+        return [Table(self.source, item, path, self.units, self.ratio) for item, path in inner]
 
     def known(self, *keys: str) -> None:
         """Allow keys in this table, whether they are read or not."""
