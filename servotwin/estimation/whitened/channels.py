@@ -31,6 +31,7 @@ from servotwin.plant.signals import Array
 # Samples at the extreme, at a time (a swing in counts that moves in each sample before has fewer at its crest), and
 # before it; share of the fastest motion there.
 _FLAT, _CREST, _RUN, _STEEP = 20, 10, 6, 0.05
+_BRAKED = 18  # samples before an extreme in which a motion may show how hard it brakes
 _JUMP = 50.0  # times the usual fastest motion
 # Of the median step, of the motion's range; counts, of which noise makes two. A half more: whole counts differ in their
 # last digits.
@@ -176,8 +177,8 @@ def _abrupt(side: Array, least: float) -> bool:
 def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
     """Describe samples that stay at an extreme value which was reached at speed; empty without them.
 
-    The crests of an even swing may all be at one count, each for few samples; and a motor that friction stops slows
-    down before it.
+    The crests of an even swing may all be at one count, each for few samples; and what friction stops slows down
+    before it, or creeps so slowly that it stops within few samples.
     """
     for extreme in (float(samples.max()), float(samples.min())):
         begins, ends = _runs(samples == extreme)
@@ -187,7 +188,10 @@ def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: st
         fastest = float(np.partition(run, -5)[-5])
         entries = begins[(begins > _RUN) & (ends - begins >= _CREST)]
         reached = [entry for entry in entries if np.all(steps[entry - _RUN : entry] > 0.0)]
-        ways = (min(run[entry - _RUN], _run_ahead(steps, entry), _way_to_rest(steps, entry)) for entry in reached)
+        ways = (
+            min(run[entry - _RUN], _run_ahead(steps, entry), _way_to_rest(steps, entry), _way_as_before(steps, entry))
+            for entry in reached
+        )
         if any(way > _STEEP * fastest for way in ways):
             value = f"{factor * extreme:.6g} {unit}"
             return f"{name} stays at its extreme of {value} for {size} samples: it is saturated"
@@ -213,6 +217,17 @@ def _way_to_rest(steps: Array, entry: int) -> float:
         return math.inf
     brake, speed = second - third, max(0.0, 2.0 * third - second)
     return float(0.5 * speed * speed / brake)
+
+
+def _way_as_before(steps: Array, entry: int) -> float:
+    """Way to rest of what brakes before a sample as hard as it did shortly before; infinite where it did not.
+
+    By sums of three steps, without the last one: a load slows down to the speed of its motor, and stops soon after it.
+    """
+    threes = np.convolve(steps[max(0, entry - 1 - _BRAKED) : entry - 1], np.ones(3), "valid")
+    brake = float(np.max(threes[:-3] - threes[3:], initial=0.0)) / 9.0
+    speed = float(threes[-1]) / 3.0
+    return 0.5 * speed * speed / brake if brake > 0.0 else math.inf
 
 
 def _encoder_noise(theta_m: Array) -> float:
