@@ -31,7 +31,8 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar
 
 from servotwin.config.own_units import at_load
-from servotwin.config.table import Range, Table, did_you_mean
+from servotwin.config.range import Range
+from servotwin.config.table import Table, did_you_mean
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
