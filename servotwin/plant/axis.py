@@ -299,8 +299,7 @@ class Axis:
 
     def command_of(self, torque: float | Array) -> Any:
         """Command of a constant torque (N m); 0 for a drive that follows its command whatever the load."""
-        held, command = self._at_rest
-        return torque * held / command
+        return torque * self._at_rest[0] / self._at_rest[1]
 
     @cached_property
     def _at_rest(self) -> tuple[float, float]:
