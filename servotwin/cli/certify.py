@@ -22,6 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from servotwin.cli.gap_options import stated_gap
 from servotwin.cli.own_options import option_of, own_option
 from servotwin.config.table import Table, did_you_mean, read_toml
 from servotwin.config.toml import attribute
@@ -104,13 +105,17 @@ class GridOptions:
     Attributes
     ----------
     finest_deg : float, optional
+        At the motor.
     biases, noises : mapping
         VALUE,VALUE,... by key, such as `bias_mv` or `noise_mdeg`: in the units of the model's command and position.
+    finest_at_load : mapping
+        In place of `finest_deg`, by key: `finest_at_load_um`.
     """
 
     finest_deg: float | None = None
     biases: Mapping[str, str | None] = field(default_factory=dict)
     noises: Mapping[str, str | None] = field(default_factory=dict)
+    finest_at_load: Mapping[str, float] = field(default_factory=dict)
 
     def grid(self, name: str, policy: CertifiedPolicy) -> Grid:
         """The grid of a model of that name.
@@ -120,14 +125,16 @@ class GridOptions:
         InvalidInput
             A value is outside its range, or in a unit that the model does not have.
         """
-        if self.finest_deg is not None and not 0.0 < self.finest_deg < math.inf:
-            raise InvalidInput(f"--finest-deg {self.finest_deg:g} deg: must be finite and above 0")
+        machine = f"model {name!r}"
+        form, finest = stated_gap("finest", self.finest_deg, self.finest_at_load, machine, policy.servo)
+        if finest is not None and not 0.0 < finest < math.inf:
+            raise InvalidInput(f"{form.option} {finest:g} {form.unit}: must be finite and above 0")
         units = own_units(policy.servo)
         return Grid.of(
             policy,
-            None if self.finest_deg is None else math.radians(self.finest_deg),
-            _rising(units.key("bias_mv"), own_option(self.biases, "bias_mv", f"model {name!r}", units), above=True),
-            _rising(units.key("noise_um"), own_option(self.noises, "noise_um", f"model {name!r}", units), above=False),
+            None if finest is None else form.at_motor(finest),
+            _rising(units.key("bias_mv"), own_option(self.biases, "bias_mv", machine, units), above=True),
+            _rising(units.key("noise_um"), own_option(self.noises, "noise_um", machine, units), above=False),
         )
 
 

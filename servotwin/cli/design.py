@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from servotwin.cli.own_options import ARCMIN, MDEG, UM, travels
+
 _Enter = Annotated[float | None, typer.Option(help="Error at which the loop opens, in tolerances.")]
 _Leave = Annotated[float | None, typer.Option(help="Error above which the loop closes again, in tolerances.")]
 _Json = Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")]
@@ -34,7 +36,12 @@ _Servo = Annotated[str, typer.Argument(help="A preset's name, or the TOML of a s
 
 def limit_cycle(
     servo: _Servo = "paper",
-    gap_deg: Annotated[float, typer.Option(help="Total gap at the motor, deg.")] = 10.0,
+    gap_deg: Annotated[
+        float | None, typer.Option(help="Total gap at the motor, deg; 10 by default.", show_default=False)
+    ] = None,
+    gap_at_load_um: Annotated[float | None, UM] = None,
+    gap_at_load_mdeg: Annotated[float | None, MDEG] = None,
+    gap_at_load_arcmin: Annotated[float | None, ARCMIN] = None,
     tolerance_mm: Annotated[
         float | None, typer.Option(help="Half-width of the dead zone, mm; none by default.")
     ] = None,
@@ -51,7 +58,8 @@ def limit_cycle(
     from servotwin.cli.limit_cycle import print_limit_cycle
 
     positions = {"mm": (tolerance_mm, step_mm), "deg": (tolerance_deg, step_deg)}
-    print_limit_cycle(servo, gap_deg, positions, enter, leave, json)
+    at_load = travels("gap", gap_at_load_um, gap_at_load_mdeg, gap_at_load_arcmin)
+    print_limit_cycle(servo, gap_deg, at_load, positions, enter, leave, json)
 
 
 def tune(
@@ -103,11 +111,17 @@ def map_(
     gap_deg: Annotated[
         str | None, typer.Option(help="Instead of --tolerance and --amplitude: total gap at the motor, deg.")
     ] = None,
+    gap_at_load_um: Annotated[str | None, UM] = None,
+    gap_at_load_mdeg: Annotated[str | None, MDEG] = None,
+    gap_at_load_arcmin: Annotated[str | None, ARCMIN] = None,
     estimate_deg: Annotated[
-        str | None, typer.Option(help="With --gap-deg: estimate of the gap, deg; by default the true gap.")
+        str | None, typer.Option(help="With a gap: estimate of it at the motor, deg; by default the true gap.")
     ] = None,
-    k_dz: Annotated[str | None, typer.Option(help="With --gap-deg: dead zone / (p estimate).")] = None,
-    amplitude_mm: Annotated[str | None, typer.Option(help="With --gap-deg: reference step, mm.")] = None,
+    estimate_at_load_um: Annotated[str | None, UM] = None,
+    estimate_at_load_mdeg: Annotated[str | None, MDEG] = None,
+    estimate_at_load_arcmin: Annotated[str | None, ARCMIN] = None,
+    k_dz: Annotated[str | None, typer.Option(help="With a gap: dead zone / (p estimate).")] = None,
+    amplitude_mm: Annotated[str | None, typer.Option(help="With a gap: reference step, mm.")] = None,
     amplitude_deg: Annotated[str | None, typer.Option(help="The same for a rotary axis, deg.")] = None,
     enter: _Enter = None,
     leave: _Leave = None,
@@ -137,6 +151,10 @@ def map_(
         amplitude=amplitude,
         gap_deg=gap_deg,
         estimate_deg=estimate_deg,
+        at_load={
+            **travels("gap", gap_at_load_um, gap_at_load_mdeg, gap_at_load_arcmin),
+            **travels("estimate", estimate_at_load_um, estimate_at_load_mdeg, estimate_at_load_arcmin),
+        },
         k_dz=k_dz,
         amplitude_mm=amplitude_mm,
         amplitude_deg=amplitude_deg,
@@ -162,10 +180,14 @@ def certify(
     finest_deg: Annotated[
         float | None,
         typer.Option(
-            help="Width of the narrowest cells in the gap, deg; by default a sixteenth of the stated range.",
+            help="Width of the narrowest cells in the gap, deg at the motor; by default a sixteenth of the stated "
+            "range.",
             show_default=False,
         ),
     ] = None,
+    finest_at_load_um: Annotated[float | None, UM] = None,
+    finest_at_load_mdeg: Annotated[float | None, MDEG] = None,
+    finest_at_load_arcmin: Annotated[float | None, ARCMIN] = None,
     bias_mv: Annotated[
         str | None,
         typer.Option(
@@ -192,4 +214,5 @@ def certify(
     from servotwin.cli.certify import certify as run
 
     biases = {"bias_mv": bias_mv, "bias_mn_m": bias_mn_m, "bias_mrad_per_s": bias_mrad_per_s, "bias_mrad": bias_mrad}
-    run(file, model, out, GridOptions(finest_deg, biases, {"noise_um": noise_um, "noise_mdeg": noise_mdeg}))
+    finest = travels("finest", finest_at_load_um, finest_at_load_mdeg, finest_at_load_arcmin)
+    run(file, model, out, GridOptions(finest_deg, biases, {"noise_um": noise_um, "noise_mdeg": noise_mdeg}, finest))

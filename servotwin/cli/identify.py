@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from servotwin.cli.gap_options import GapForm, stated_gap
 from servotwin.errors import InvalidInput
 from servotwin.estimation.estimate import GapEstimate, GapStatus
 from servotwin.estimation.gap import is_motors_position
@@ -45,7 +46,10 @@ def _silent(_done: int, _total: int) -> None:
 
 @dataclass(frozen=True)
 class IdentifyOptions:
-    """Options of the command; times in s, angles in deg. None: the value of the log, or the default."""
+    """Options of the command; times in s, angles in deg. None: the value of the log, or the default.
+
+    `at_load` has wear and limit that were given at the load, by key.
+    """
 
     log: Path
     servo: str | None = None
@@ -57,6 +61,7 @@ class IdentifyOptions:
     wear_deg: float | None = None
     wear_over_s: float | None = None
     gap_limit_deg: float | None = None
+    at_load: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -97,11 +102,12 @@ def identify(options: IdentifyOptions, progress: Report = _silent) -> Identifica
     InvalidInput
         The log, the servo or an option is not valid, or no window fits into the log.
     """
-    log, stated = read_log(options.log), _settings(options)
+    log = read_log(options.log)
     servo = _servo(options, log)
+    stated = _settings(options, servo)
     settings, windows = stated.on(servo), cut(log, options, servo)
     seen = _with_seen_load(servo, log.whole)
-    if isinstance(servo, Axis) and options.wear_deg is None:
+    if isinstance(servo, Axis) and options.wear_over_s is None:
         estimates, trend = _followed_without_wear(log, windows, seen, settings, progress)
     else:
         estimates, trend = _followed(windows, seen, settings, progress)
@@ -237,15 +243,24 @@ def _with_seen_load(servo: Plant, whole: Window) -> Plant:
     return servo.replace(sensors=replace(servo.sensors, feedback=LOAD))
 
 
-def _settings(options: IdentifyOptions) -> TwinSettings:
-    wear, over, limit = options.wear_deg, options.wear_over_s, options.gap_limit_deg
+def _settings(options: IdentifyOptions, servo: Plant) -> TwinSettings:
+    machine = options.servo or str(options.log)
+    form, wear = stated_gap("wear", options.wear_deg, options.at_load, machine, servo)
+    over = options.wear_over_s
     if (wear is None) != (over is None):
-        raise InvalidInput("--wear-deg and --wear-over-s belong together: give both, or neither")
+        raise InvalidInput(f"{form.option} and --wear-over-s belong together: give both, or neither")
     known = wear is not None and over is not None
-    trend = TrendSettings.for_wear(math.radians(wear), over) if known else TrendSettings()  # type: ignore[arg-type]
+    trend = TrendSettings.for_wear(form.at_motor(wear), over) if known else TrendSettings()  # type: ignore[arg-type]
+    form, limit = _limit(options, servo)
     if limit is not None and not (math.isfinite(limit) and limit >= 0.0):
-        raise InvalidInput(f"--gap-limit-deg {limit!r}: must be a finite number of at least 0")
-    return TwinSettings(method=options.method, trend=trend, gap_limit=None if limit is None else math.radians(limit))
+        raise InvalidInput(f"{form.option} {limit!r}: must be a finite number of at least 0")
+    return TwinSettings(method=options.method, trend=trend, gap_limit=None if limit is None else form.at_motor(limit))
+
+
+def _limit(options: IdentifyOptions, servo: Plant) -> tuple[GapForm, float | None]:
+    """Largest acceptable gap, as it was given."""
+    machine = options.servo or str(options.log)
+    return stated_gap("gap_limit", options.gap_limit_deg, options.at_load, machine, servo)
 
 
 def show(options: IdentifyOptions, as_json: bool) -> None:
@@ -317,7 +332,8 @@ def _trend_lines(identification: Identification, options: IdentifyOptions) -> li
             if math.isfinite(identification.until_limit.median)
             else "perhaps never"
         )
-        lines.append(f"time until {options.gap_limit_deg:g} deg: {median} (median; 95 %: {early:.4g} .. {late:.4g} s)")
+        form, limit = _limit(options, identification.servo)
+        lines.append(f"time until {limit:g} {form.unit}: {median} (median; 95 %: {early:.4g} .. {late:.4g} s)")
     return lines
 
 

@@ -15,12 +15,15 @@ from servotwin.analysis.limit_cycles.cycle import CycleResult, limit_cycle
 from servotwin.analysis.limit_cycles.describing import limit_cycle_near, predictions
 from servotwin.analysis.limit_cycles.orbit import Orbit
 from servotwin.analysis.limit_cycles.shaft import Prediction
+from servotwin.cli.gap_options import stated_gap
 from servotwin.cli.own_options import own_option
 from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import MILLIMETRES, DisplayUnit, gap_in_words, position_unit
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant, resolve_plant
 from servotwin.plant.signals import turn_in_words
+
+_GAP_DEG = 10.0  # where none is given
 
 # Orbits whose frequencies differ by a smaller share are the same orbit.
 _EVENTS = 12  # shown of an orbit
@@ -63,13 +66,17 @@ def findings(servo: Plant, gap: float, tolerance: float | None, step: float) -> 
 
 def print_limit_cycle(
     name: str,
-    gap_deg: float,
+    gap_deg: float | None,
+    at_load: Mapping[str, float],
     positions: Mapping[str, tuple[float | None, float | None]],
     enter: float | None,
     leave: float | None,
     as_json: bool,
 ) -> None:
-    """Print a table, or one JSON object, on the standard output; `positions`: tolerance and step by their unit."""
+    """Print a table, or one JSON object, on the standard output.
+
+    The gap is stated in degrees at the motor or, by key, `at_load`; `positions` are tolerance and step by their unit.
+    """
     servo = resolve_plant(name)
     unit = position_unit(servo)
     tolerance_shown, step_shown = _in_unit(name, servo, positions)
@@ -78,17 +85,14 @@ def print_limit_cycle(
     servo = servo if enter is None else servo.replace(enter=enter)
     servo = servo if leave is None else servo.replace(leave=leave)
     tolerance = None if tolerance_shown is None else unit.si_of(tolerance_shown)
-    most = math.degrees(servo.largest_gap)
-    if not 0.0 <= gap_deg <= most * (1.0 + 1e-12):
-        turn = turn_in_words(servo.largest_gap)
-        raise InvalidInput(f"--gap-deg {gap_deg:g} deg: must be from 0 to {most:g}, {turn}")
-    computed = findings(servo, math.radians(gap_deg), tolerance, unit.si_of(step_shown))
+    gap = _gap(name, servo, gap_deg, at_load)
+    computed = findings(servo, gap, tolerance, unit.si_of(step_shown))
     if as_json:
         print(json.dumps(as_dict(computed, unit), indent=2))
         return
     console = Console()
     console.print(
-        f"{name}: total gap {gap_in_words(servo, math.radians(gap_deg))}, {_dead_zone(tolerance_shown, unit)}, after a "
+        f"{name}: total gap {gap_in_words(servo, gap)}, {_dead_zone(tolerance_shown, unit)}, after a "
         f"step of {step_shown:g} {unit.name}",
         highlight=False,
     )
@@ -134,6 +138,16 @@ def _orbit(orbit: Orbit | None, unit: DisplayUnit) -> dict[str, Any] | None:
         "events": [{"phase": event.phase, "kind": event.kind, "side": event.side} for event in orbit.events],
         "residual": orbit.residual,
     }
+
+
+def _gap(name: str, servo: Plant, gap_deg: float | None, at_load: Mapping[str, float]) -> float:
+    """The gap at the motor, rad; refused beyond a turn."""
+    form, given = stated_gap("gap", gap_deg, at_load, name, servo)
+    size, most = _GAP_DEG if given is None else given, form.shown(servo.largest_gap)
+    if not 0.0 <= size <= most * (1.0 + 1e-12):
+        turn = turn_in_words(servo.largest_gap)
+        raise InvalidInput(f"{form.option} {size:g} {form.unit}: must be from 0 to {most:g}, {turn}")
+    return form.at_motor(size)
 
 
 def _in_unit(

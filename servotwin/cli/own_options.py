@@ -5,11 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TypeVar
 
-from servotwin.config.own_units import OwnUnits
+import typer
+
+from servotwin.config.own_units import AT_LOAD, OwnUnits
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
 _Value = TypeVar("_Value", str, float)
+_TRAVELS = ("um", "mdeg", "arcmin")
+UM, MDEG, ARCMIN = (typer.Option(help=f"The same at the load, {unit}.", show_default=False) for unit in _TRAVELS)
+"""The options NAME-at-load-UNIT of a gap, beside NAME-deg."""
+
+
+def travels(name: str, *values: _Value | None) -> dict[str, _Value]:
+    """Those that were given of the values of `UM`, `MDEG` and `ARCMIN` of a gap, by key."""
+    pairs = zip(_TRAVELS, values, strict=True)
+    return {f"{name}{AT_LOAD}{unit}": value for unit, value in pairs if value is not None}
 
 
 def option_of(key: str) -> str:

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from servotwin.cli.own_options import ARCMIN, MDEG, UM, travels
 from servotwin.errors import InvalidInput
 
 # Columns of a foreign log, as all commands take them.
@@ -154,6 +155,9 @@ def identify(
     wear_deg: Annotated[
         float | None, typer.Option(help="Typical growth of the gap, deg, in the time of --wear-over-s.")
     ] = None,
+    wear_at_load_um: Annotated[float | None, UM] = None,
+    wear_at_load_mdeg: Annotated[float | None, MDEG] = None,
+    wear_at_load_arcmin: Annotated[float | None, ARCMIN] = None,
     wear_over_s: Annotated[
         float | None,
         typer.Option(
@@ -162,6 +166,9 @@ def identify(
         ),
     ] = None,
     gap_limit_deg: Annotated[float | None, typer.Option(help="Predict when the gap reaches this limit, deg.")] = None,
+    gap_limit_at_load_um: Annotated[float | None, UM] = None,
+    gap_limit_at_load_mdeg: Annotated[float | None, MDEG] = None,
+    gap_limit_at_load_arcmin: Annotated[float | None, ARCMIN] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object instead of tables.")] = False,
 ) -> None:
     """Estimate the gap from recordings of two encoders, or with a model of the machine (--servo, or the log's own)."""
@@ -183,6 +190,10 @@ def identify(
         wear_deg=wear_deg,
         wear_over_s=wear_over_s,
         gap_limit_deg=gap_limit_deg,
+        at_load={
+            **travels("wear", wear_at_load_um, wear_at_load_mdeg, wear_at_load_arcmin),
+            **travels("gap_limit", gap_limit_at_load_um, gap_limit_at_load_mdeg, gap_limit_at_load_arcmin),
+        },
     )
     travel = stated_travel(lead_mm, ratio)
     stated = any(each is not None for each in (axis, dates, travel)) or stiff or dynamics
@@ -191,7 +202,7 @@ def identify(
         if options != IdentifyOptions(log=logs[0]):
             raise InvalidInput(
                 "servotwin identify: --servo, --start, --duration, --window, --pre-trigger, --method, --wear-... and "
-                "--gap-limit-deg need a model of the machine: give --servo, without --motor, --load and other columns"
+                "--gap-limit-... need a model of the machine: give --servo, without --motor, --load and other columns"
             )
         show_lost_motion(logs, columns, json, page, axis, dates, stiff, dynamics, travel)
         return

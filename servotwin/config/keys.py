@@ -30,7 +30,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, TypeVar
 
-from servotwin.config.table import Range, Table, did_you_mean
+from servotwin.config.own_units import at_load
+from servotwin.config.range import Range
+from servotwin.config.table import Table, did_you_mean
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
@@ -84,6 +86,7 @@ class Key:
     in_file: bool = True
     later: bool = False
     ordered: bool = False
+    at_load: bool = False
 
 
 def key(
@@ -108,6 +111,7 @@ def key(
     form: Form | None = None,
     later: bool = False,
     ordered: bool = False,
+    at_load: bool = False,
 ) -> Key:
     """Declare the TOML key of an attribute.
 
@@ -145,12 +149,14 @@ def key(
         Released versions refuse the key: the default is not written, so that they read a file that does not need it.
     ordered : bool
         Of two numbers the first is at most the second.
+    at_load : bool
+        A gap, whose key counts at the motor; in its place a file may have one that counts at the load.
     """
     allowed = Range(minimum, maximum, above=above, below=below, infinite=infinite)
     return Key(
         names=names, unit=unit, range=allowed, help=help, table=table, choices=choices, prefix=prefix, switch=switch,
         relative=relative, required=required, makers=makers, select=select, parse=parse, dump=dump, form=form,
-        later=later, ordered=ordered,
+        later=later, ordered=ordered, at_load=at_load,
     )  # fmt: skip
 
 
@@ -184,7 +190,8 @@ class Item:
     @property
     def names(self) -> tuple[str, ...]:
         """The keys that set it."""
-        return self.key.names or (self.name,)
+        names = self.key.names or (self.name,)
+        return (*names, *at_load(names[0])) if self.key.at_load else names
 
     @property
     def exact_name(self) -> str:

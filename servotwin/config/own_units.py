@@ -13,6 +13,15 @@ COMMANDS = {"V": ("v", "voltage"), "N m": ("n_m", "torque"), "rad/s": ("rad_per_
 """Units of a command: the end of a key, and the word for its quantity."""
 POSITIONS: Mapping[str, Mapping[str, str]] = {"m": {}, "rad": {"m": "rad", "mm": "deg", "um": "mdeg"}}
 """Units of a position: ends of keys by those of a position in metres, where they are others."""
+AT_LOAD = "_at_load_"
+"""Before the unit, in keys of gaps that count at the load: elsewhere they count at the motor."""
+_TRAVELS = ("um", "mm", "mdeg", "deg", "arcmin")
+
+
+def at_load(name: str) -> tuple[str, ...]:
+    """Keys of a gap as the travel of the load, linear or rotary, beside its key at the motor."""
+    stem = name.removesuffix(f"_{suffix_of(name)}")
+    return tuple(f"{stem}{AT_LOAD}{unit}" for unit in _TRAVELS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +46,12 @@ class OwnUnits:
     def keys(self, names: Sequence[str]) -> tuple[str, ...]:
         """Names here of the keys that set one attribute, the same for all that it may be called otherwise.
 
-        Of keys that are declared in several units of commands or positions only those in the machine's own count.
+        Of keys that are declared in several units of commands or positions only those in the machine's own count. A
+        gap is an angle at the motor of every machine, and at the load a position.
         """
+        loads = [name for name in names if AT_LOAD in name]
+        if loads and len(loads) < len(names):
+            return (*self.keys([name for name in names if name not in loads]), *self.keys(loads))
         kinds = {unit_of(name).si for name in names}
         for own, alike in ((self.position, POSITIONS), (self.command, COMMANDS)):
             if len(kinds) > 1 and kinds <= alike.keys():

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 from servotwin.config.named_file import check_named
-from servotwin.config.own_units import OwnUnits
+from servotwin.config.own_units import AT_LOAD, OwnUnits
+from servotwin.config.range import Range
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
 
@@ -37,50 +38,6 @@ _BEGIN, _END = "# complete with the line: # end", "# end"
 """First and last line of a file of which a half must not be read."""
 
 
-@dataclass(frozen=True, slots=True)
-class Range:
-    """The numbers that a key accepts: `minimum` and `maximum` belong to it, `above` and `below` do not."""
-
-    minimum: float = -math.inf
-    maximum: float = math.inf
-    above: float = -math.inf
-    below: float = math.inf
-    infinite: bool = False
-
-    def accepts(self, value: float) -> bool:
-        """True where a number lies in the range; NaN never does, an infinite one only where `infinite`."""
-        if not (isinstance(value, int) or math.isfinite(value) or (self.infinite and not math.isnan(value))):
-            return False
-        if (self.above > -math.inf and value <= self.above) or (self.below < math.inf and value >= self.below):
-            return False
-        return self.minimum <= value <= self.maximum
-
-    def scaled(self, scale: Callable[[float], float]) -> Range:
-        """The same range in another unit."""
-        ends = (self.minimum, self.maximum, self.above, self.below)
-        minimum, maximum, above, below = (scale(end) if math.isfinite(end) else end for end in ends)
-        return Range(minimum, maximum, above, below, self.infinite)
-
-    @property
-    def whole(self) -> str:
-        """The words for integers."""
-        words = str(self).removesuffix(", finite")
-        return words.replace("a number", "an integer").replace("a positive number", "a positive integer")
-
-    def __str__(self) -> str:
-        words = ["a positive number" if self.above == 0.0 else "a number"]
-        if self.minimum > -math.inf:
-            words.append(f"at least {self.minimum:g}")
-        if self.above > -math.inf and self.above != 0.0:
-            words.append(f"above {self.above:g}")
-        if self.maximum < math.inf:
-            words.append(f"at most {self.maximum:g}")
-        if self.below < math.inf:
-            words.append(f"below {self.below:g}")
-        words.append("inf allowed" if self.infinite else "finite")
-        return ", ".join(words)
-
-
 @dataclass
 class Table:
     """One TOML table, read key by key.
@@ -96,17 +53,21 @@ class Table:
     units : OwnUnits, optional
         Units in which the file counts commands and positions, this table's and those within it; None: keys are named
         as they are declared.
+    ratio : float, optional
+        The load's travel (m or rad) per angle of the motor, of gaps that count at the load; None: the machine is not
+        known, and they must count at the motor.
     """
 
     source: str
     values: Mapping[str, object]
     name: str = ""
     units: OwnUnits | None = None
+    ratio: float | None = None
     _known: set[str] = field(default_factory=set)
 
-    def in_units(self, units: OwnUnits | None) -> Table:
+    def in_units(self, units: OwnUnits | None, ratio: float | None = None) -> Table:
         """The same table, whose keys are named in other units; what one of the two has read the other has too."""
-        return Table(self.source, self.values, self.name, units, self._known)
+        return Table(self.source, self.values, self.name, units, ratio, self._known)
 
     def names(self, declared: Sequence[str]) -> tuple[str, ...]:
         """Names that the file may have for the keys that set one attribute.
@@ -121,7 +82,8 @@ class Table:
         own = self.units.keys(declared)
         for name in declared:
             if name in self.values and name not in own:
-                right = self.units.key(name) if self.units.key(name) in own else own[0]
+                alike = [each for each in own if (AT_LOAD in each) == (AT_LOAD in name)] or own
+                right = self.units.key(name) if self.units.key(name) in own else alike[0]
                 raise InvalidInput(
                     f"{self.source}: unknown key '{self.path(name)}': this machine counts it in {unit_of(right).si}; "
                     f"here its name is '{self.path(right)}'"
@@ -224,7 +186,7 @@ class Table:
             raise self.invalid(key, f"a table [{self.path(key)}]")
         if required and key not in self.values:
             raise self.missing(key, table=True)
-        return Table(self.source, value, self.path(key), self.units)
+        return Table(self.source, value, self.path(key), self.units, self.ratio)
 
     def tables(self, key: str) -> list[Table]:
         """The array of tables [[key]]; empty where it is absent."""
@@ -232,7 +194,9 @@ class Table:
         value = self.values.get(key, [])
         if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
             raise self.invalid(key, f"an array of tables [[{self.path(key)}]]")
-        return [Table(self.source, item, f"{self.path(key)}[{i}]", self.units) for i, item in enumerate(value)]
+        paths = [f"{self.path(key)}[{i}]" for i in range(len(value))]
+        inner = zip(value, paths, strict=True)
+        return [Table(self.source, item, path, self.units, self.ratio) for item, path in inner]
 
     def known(self, *keys: str) -> None:
         """Allow keys in this table, whether they are read or not."""

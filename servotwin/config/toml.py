@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING
 from functools import partial
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 from servotwin.config.contradiction import Contradiction
 from servotwin.config.keys import ORDERED, Form, Item, Maker, items_of
+from servotwin.config.own_units import AT_LOAD
 from servotwin.config.table import Table, named, of_key
 from servotwin.config.units import unit_of
 from servotwin.errors import InvalidInput
@@ -109,10 +110,22 @@ def _read_item(table: Table, item: Item, folder: Path, base: object, values: Val
     if item.key.switch and not table.boolean(item.key.switch, True):
         values[item.name] = None
         return
+    if item.key.at_load:
+        _check_one_gap(table, item)
     for name in table.names(item.names):
         # A law without states has matrices without numbers.
         if name in table.values and not (item.form is Form.NUMBERS and table.values[name] == []):
             values[item.name] = _value(table, item, name, folder, base)
+
+
+def _check_one_gap(table: Table, item: Item) -> None:
+    """Refuse a gap that is stated twice, or at the load of a machine that is not known."""
+    given = [f"{table.path(name)} = {table.values[name]!r}" for name in item.names if name in table.values]
+    if len(given) > 1:
+        raise InvalidInput(f"{table.source}: {' and '.join(given)}: a gap is stated once; give only one of them")
+    if given and item.names[0] not in table.values and table.ratio is None:
+        usual = table.path(item.names[0])
+        raise InvalidInput(f"{table.source}: {given[0]}: no machine is known here; give {usual}, at its motor")
 
 
 def _prefixed(table: Table, item: Item, start: Any) -> Any:
@@ -157,19 +170,27 @@ def _plain(table: Table, item: Item, name: str, folder: Path) -> Any:
         return folder / table.text(name)
     if form is Form.INTEGER and unit.exact:
         return table.integer_in(name, item.key.range)
-    limits = item.key.range.scaled(unit.from_si)
+    to_si, limits = _conversion(table, name), item.key.range.scaled(unit.from_si)
     if form in (Form.PAIR, Form.NUMBERS):
         numbers = table.numbers_in(name, limits)
         if form is Form.PAIR and (not isinstance(numbers, tuple) or len(numbers) != 2):
             raise table.invalid(name, "two numbers")
         if item.key.ordered and isinstance(numbers, tuple) and numbers[0] > numbers[1]:
             raise table.invalid(name, f"two numbers{ORDERED}")
-        converted = tuple(map(unit.to_si, numbers)) if isinstance(numbers, tuple) else unit.to_si(numbers)
+        converted = tuple(map(to_si, numbers)) if isinstance(numbers, tuple) else to_si(numbers)
         return (converted,) if item.type == tuple[float, ...] and not isinstance(converted, tuple) else converted
     if form in (Form.NUMBER, Form.INTEGER):
-        number = unit.to_si(table.number_in(name, limits))
+        number = to_si(table.number_in(name, limits))
         return round(number) if form is Form.INTEGER else number
     return table.values[name]
+
+
+def _conversion(table: Table, name: str) -> Callable[[float], float]:
+    """Conversion of a key's value to the attribute's unit, and of a travel of the load to the angle of the motor."""
+    unit, ratio = unit_of(name), table.ratio
+    if AT_LOAD not in name or ratio is None:
+        return unit.to_si
+    return lambda number: unit.to_si(number) / ratio
 
 
 def _of_kind(table: Table, item: Item, folder: Path) -> Any:

@@ -76,7 +76,9 @@ class Scenario:
     ] = 0
     name: Annotated[str, key(help="The servo's name in messages.")] = "servo"
     reference: Annotated[SignalLike, key(makers=REFERENCES, required=True, help="Reference, m.")] = 0.0
-    gap: Annotated[SignalLike, key(makers=GAPS, select=gap_maker, required=True, help="Total gap, rad.")] = 0.0
+    gap: Annotated[
+        SignalLike, key(makers=GAPS, select=gap_maker, required=True, help="Total gap, at the motor or at the load.")
+    ] = 0.0
     theta_d0: Annotated[
         float,
         key(
@@ -152,7 +154,7 @@ class Scenario:
         """Read a scenario from a parsed table; a servo's path in it is relative to `folder`."""
         with named(table):
             servo: Plant = attribute(table, cls, "servo", folder)
-            table = table.in_units(own_units(servo))
+            table = table.in_units(own_units(servo), servo.p)
             scenario: Scenario = read(table, cls, folder, servo=servo, **read_parts(table, folder, servo))
             table.done()
             scenario.servo.check_loop(scenario.law)

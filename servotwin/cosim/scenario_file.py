@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from servotwin.commissioning.edge_settings import Recording
 from servotwin.config.keys import Maker, key, name_of
+from servotwin.config.own_units import AT_LOAD
 from servotwin.config.table import Table, named, read_inner
 from servotwin.config.toml import changes, made, part, read
 from servotwin.config.units import unit_of
@@ -24,7 +25,7 @@ from servotwin.messages import AnyGains
 from servotwin.novelty.settings import NoveltyRules
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Samples, SCurve, SignalLike, SquareWave, Step
-from servotwin.twin.settings import AT_LOAD, TwinSettings, check_gaps, read_twin_settings
+from servotwin.twin.settings import TwinSettings, check_gaps, read_twin_settings
 
 CONTROLLER, RECORDING, PROBE, NOVELTY, LINK, TWIN = (
     name_of(each) for each in (Controller, Recording, ProbeLimits, NoveltyRules, LinkSettings, TwinSettings)
@@ -82,15 +83,15 @@ REFERENCES: Mapping[str, Maker] = {
 
 
 def constant_gap(
-    total: Annotated[float, key("total_deg", minimum=0.0, help="Total gap, at the motor.")],
+    total: Annotated[float, key("total_deg", minimum=0.0, at_load=True, help="Total gap.")],
 ) -> SignalLike:
     """Constant gap."""
     return total
 
 
 def growing_gap(
-    begin_value: Annotated[float, key("from_deg", minimum=0.0, help="First total gap, at the motor.")],
-    end_value: Annotated[float, key("to_deg", minimum=0.0, help="Last total gap, at the motor.")],
+    begin_value: Annotated[float, key("from_deg", minimum=0.0, at_load=True, help="First total gap.")],
+    end_value: Annotated[float, key("to_deg", minimum=0.0, at_load=True, help="Last total gap.")],
     over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
     begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
 ) -> SignalLike:
@@ -98,58 +99,24 @@ def growing_gap(
     return SCurve(begin_value, end_value, over, begin)
 
 
-def _at_load(name: str) -> tuple[str, ...]:
-    """Keys of a gap as the travel of the load that it is, linear or rotary."""
-    return tuple(f"{name}{AT_LOAD}{unit}" for unit in ("um", "mm", "mdeg", "deg", "arcmin"))
-
-
-def constant_gap_at_load(
-    total: Annotated[float, key(*_at_load("total"), minimum=0.0, help="Total gap, at the load.")],
-    ratio: float = 1.0,
-) -> SignalLike:
-    """Constant gap at the load.
-
-    `ratio` is the load's travel per angle of the motor.
-    """
-    return total / ratio
-
-
-def growing_gap_at_load(
-    begin_value: Annotated[float, key(*_at_load("from"), minimum=0.0, help="First total gap, at the load.")],
-    end_value: Annotated[float, key(*_at_load("to"), minimum=0.0, help="Last total gap, at the load.")],
-    over: Annotated[float, key("over_s", above=0.0, help="Time from the first to the last.")],
-    begin: Annotated[float, key("begin_s", help="Time at which the growth begins.")] = 0.0,
-    ratio: float = 1.0,
-) -> SignalLike:
-    """Gap at the load that grows as an S-curve."""
-    return SCurve(begin_value / ratio, end_value / ratio, over, begin)
-
-
-GAPS: Mapping[str, Maker] = {
-    "constant": constant_gap,
-    "growing": growing_gap,
-    "constant at the load": constant_gap_at_load,
-    "growing at the load": growing_gap_at_load,
-}
+GAPS: Mapping[str, Maker] = {"constant": constant_gap, "growing": growing_gap}
 
 
 def gap_maker(table: Table) -> Maker:
     """Choose the kind of gap that a table describes."""
     # In whatever unit: keys of another one are refused by name.
     first = {name.split("_", 1)[0] for name in table.values}
-    grows = bool(first & {"from", "to", "over", "begin"}) and "total" not in first
-    # A length, or arc minutes, can be meant at the load only: the error names the key there.
-    at_load = any(AT_LOAD in name or unit_of(name).si == "m" or name.endswith("_arcmin") for name in table.values)
-    return GAPS[f"{'growing' if grows else 'constant'}{' at the load' * at_load}"]
+    return GAPS["growing" if first & {"from", "to", "over", "begin"} and "total" not in first else "constant"]
 
 
 def _gap(table: Table, servo: Plant) -> SignalLike:
-    """Read [gap], at the motor or at the load; the gap counts at the motor from here on."""
+    """Read [gap], which counts at the motor from here on."""
     inner = table.table(GAP, required=True)
     check_gaps(inner, [name for name in inner.values if unit_of(name).si in ("m", "rad")], servo)
-    maker = gap_maker(inner)
-    ratio: dict[str, Any] = {"ratio": servo.p} if maker in (constant_gap_at_load, growing_gap_at_load) else {}
-    gap: SignalLike = part(table, GAP, maker, **ratio)
+    ends = [name for name in ("from_deg", "to_deg") if name in inner.values]
+    if len(ends) == 1 and any(AT_LOAD in name for name in inner.values):
+        raise inner.invalid(ends[0], "both ends of the growth at the load, or both at the motor")
+    gap: SignalLike = part(table, GAP, gap_maker(inner))
     return gap
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from servotwin.config.table import Table, did_you_mean, named, parse_toml, read_toml
 from servotwin.config.toml import dumps
-from servotwin.control.controller import Controller, ControllerChanges
+from servotwin.control.controller import Controller
 from servotwin.control.laws import AnyController, filtered_pid, law_of
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
@@ -25,6 +25,7 @@ from servotwin.plant import loop
 from servotwin.plant.actuator import Actuator, ShaftMatrices, static_torque
 from servotwin.plant.axis_file import Parts, described_law, read_parts, values_of_parts
 from servotwin.plant.basis import BacklashKind, Guide, Stribeck
+from servotwin.plant.changes import AxisChanges, refuse_unknown
 from servotwin.plant.fit import PARTS, check_damped, check_fit, check_kinds
 from servotwin.plant.law_loop import LawLoop
 from servotwin.plant.linear import LinearSystem
@@ -43,16 +44,6 @@ AXES = (
     "two-mass-drive", "ball-screw", "robot-joint", "telescope", "stepper-stage", "micro-positioner", "gantry", "emps",
 )  # fmt: skip
 """Names of the presets of axes."""
-
-
-class AxisChanges(ControllerChanges, total=False):
-    """The keywords of `Axis.replace`: its parts and the fields of its controller, each of them optional."""
-
-    actuator: Actuator
-    transmission: Transmission
-    load: Load
-    controller: AnyController
-    sensors: Sensors
 
 
 # Stands for the controller where only the plant counts.
@@ -265,11 +256,7 @@ class Axis:
         parts = {name: value for name, value in changes.items() if name in PARTS}
         law = {name: value for name, value in changes.items() if name not in PARTS}
         known = [each.name for each in dataclasses.fields(parts.get("controller", self.controller))]  # type: ignore[arg-type]
-        for name in law:
-            if name not in known:
-                every = [*PARTS, *known]
-                hint = did_you_mean(name, every)
-                raise InvalidInput(f"axis has no part or gain named {name!r}{hint}; allowed are {', '.join(every)}")
+        refuse_unknown(law, [*PARTS, *known], "axis has no part or gain")
         changed = dataclasses.replace(self, **parts)  # type: ignore[arg-type]
         tuned = dataclasses.replace(changed.controller, **law) if law else changed.controller  # type: ignore[arg-type]
         return dataclasses.replace(changed, controller=tuned) if law else changed
@@ -312,8 +299,7 @@ class Axis:
 
     def command_of(self, torque: float | Array) -> Any:
         """Command of a constant torque (N m); 0 for a drive that follows its command whatever the load."""
-        held, command = self._at_rest
-        return torque * held / command
+        return torque * self._at_rest[0] / self._at_rest[1]
 
     @cached_property
     def _at_rest(self) -> tuple[float, float]:

@@ -22,8 +22,8 @@ from servotwin.plant.loop_set import (
     about_poles,
     eigenvalues,
     margins_of_responses,
-    response_of,
 )
+from servotwin.plant.schur_response import response_of
 from servotwin.plant.signals import Array
 
 

@@ -25,6 +25,7 @@ from servotwin.plant.late_readings import late_readings
 from servotwin.plant.linear import Complex, LinearSystem
 from servotwin.plant.loop import StateMatrices, continuous_law, sampled_law
 from servotwin.plant.margins import Margins, margins_of_response
+from servotwin.plant.schur_response import SchurForms, response_at, schur_forms
 from servotwin.plant.signals import Array
 
 _PER_DECADE = 60
@@ -127,15 +128,15 @@ class PlantSet:
         """(P, F) response at `omega`."""
         grid = self._grid
         common = np.broadcast_to(grid.common, (len(self.A), grid.common.size))
-        return _response(self._schur, 0.0, grid.sorted(common, grid.about))
+        return response_at(self._schur, 0.0, grid.sorted(common, grid.about))
 
     def at(self, omega: Array) -> Complex:
         """(P, K) response at (P, K) frequencies, rad/s."""
-        return _response(self._schur, 0.0, self.points(omega))
+        return response_at(self._schur, 0.0, self.points(omega))
 
     @cached_property
     def _schur(self) -> SchurForms:
-        return _schur_forms(self.A, self.B, self.C)
+        return schur_forms(self.A, self.B, self.C)
 
     def points(self, omega: Array) -> Complex:
         """Points of the stability boundary for frequencies in rad/s."""
@@ -158,7 +159,7 @@ class PlantSet:
             A, B = self.rate * (A - np.eye(len(A))), self.rate * B
         forms = SchurForms(*(each[None].astype(np.complex128) for each in (A, B, C)))
         if not np.array_equal(A, np.triu(A)):
-            forms = _schur_forms(A[None], B[None], C[None])
+            forms = schur_forms(A[None], B[None], C[None])
         return LawForms(StateMatrices(A, B, C, D), forms)
 
     @cached_property
@@ -188,8 +189,8 @@ class PlantSet:
     def _at_grid(self, law: AnyController) -> Complex:
         grid, (matrices, forms) = self._grid, self._law(law)
         # The frequencies that all plants share are most of them.
-        common = _response(forms, matrices.D, grid.common[None])
-        about = _response(forms, matrices.D, grid.about.reshape(1, -1)).reshape(grid.about.shape)
+        common = response_at(forms, matrices.D, grid.common[None])
+        about = response_at(forms, matrices.D, grid.about.reshape(1, -1)).reshape(grid.about.shape)
         return grid.sorted(np.broadcast_to(common, (len(self.A), common.shape[1])), about)
 
     def peaks(self, law: AnyController, delay: int = 0) -> Array:
@@ -255,7 +256,7 @@ class PlantSet:
     def _law_response(self, law: AnyController, delay: int, omega: Array) -> Complex:
         """Response of law and delay from measurement to minus the voltage."""
         matrices, forms = self._law(law)
-        value = _response(forms, matrices.D, self.points(omega).reshape(1, -1)).reshape(omega.shape)
+        value = response_at(forms, matrices.D, self.points(omega).reshape(1, -1)).reshape(omega.shape)
         return value if delay == 0 else np.asarray(value * self.late(delay, omega))
 
     def late(self, delay: int, omega: Array) -> Complex:
@@ -343,50 +344,11 @@ class FrequencyGrid(NamedTuple):
         return np.take_along_axis(np.concatenate([common, about], axis=1), self.order, axis=1)
 
 
-class SchurForms(NamedTuple):
-    """Triangular A (P, n, n) of balanced systems, with B and C (P, n) in its states."""
-
-    A: Complex
-    B: Complex
-    C: Complex
-
-
 class LawForms(NamedTuple):
     """A law in continuous time, or the delta operator's, and its triangular form."""
 
     matrices: StateMatrices
     forms: SchurForms
-
-
-def _schur_forms(A: Array, B: Array, C: Array) -> SchurForms:
-    from scipy.linalg import matrix_balance, schur
-
-    triangular, entries, exits = (np.empty(shape.shape, dtype=np.complex128) for shape in (A, B, C))
-    for i in range(len(A)):
-        if A.shape[1] == 0:
-            continue
-        balanced, scaling = matrix_balance(A[i])
-        triangular[i], unitary = schur(balanced, output="complex")
-        entries[i] = unitary.conj().T @ np.linalg.solve(scaling, B[i])
-        exits[i] = C[i] @ scaling @ unitary
-    return SchurForms(triangular, entries, exits)
-
-
-@np.errstate(all="ignore")
-def _response(forms: SchurForms, direct: float, points: Complex) -> Complex:
-    """(P, K) C (s - A)^-1 B + D at (P, K) points, by back substitution in the Schur form."""
-    states = np.zeros((forms.A.shape[1], *points.shape), dtype=np.complex128)
-    value = np.full(points.shape, direct, dtype=np.complex128)
-    for i in range(len(states) - 1, -1, -1):
-        driven = np.einsum("pj,jpk->pk", forms.A[:, i, i + 1 :], states[i + 1 :])
-        states[i] = (forms.B[:, i, None] + driven) / (points - forms.A[:, i, i, None])
-        value += forms.C[:, i, None] * states[i]
-    return value
-
-
-def response_of(A: Array, B: Array, C: Array, D: float, points: Complex) -> Complex:
-    """(1, K) response of one system of a single input at (1, K) points."""
-    return _response(_schur_forms(A[None], B[None], C[None]), D, points)
 
 
 def eigenvalues(matrices: Array) -> Complex:

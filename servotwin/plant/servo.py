@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cache, cached_property, lru_cache
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, Unpack
+from typing import Annotated, Any, Unpack
 
 import numpy as np
 
@@ -24,12 +24,13 @@ from servotwin.errors import InvalidInput
 from servotwin.plant import loop
 from servotwin.plant.actuator import ShaftMatrices
 from servotwin.plant.basis import BacklashKind, Guide, Stribeck
+from servotwin.plant.changes import PerMass, ServoChanges, refuse_unknown
+from servotwin.plant.interop import Control
 from servotwin.plant.linear import LinearSystem
 from servotwin.plant.margins import Margins, margins
 from servotwin.plant.motor import Motor
 from servotwin.plant.numbers import tolerance_of
 from servotwin.plant.sensors import Sensors
-from servotwin.plant.servo_changes import PerMass, ServoChanges
 from servotwin.plant.signals import LARGEST_GAP, Array
 from servotwin.plant.structure import Chain, Structure, chain
 from servotwin.runtime.notebook import html_table
@@ -40,16 +41,6 @@ _PLANT = (
 """The plant's numbers in the order of the file, of which `Servo.version` is the hash."""
 PRESETS = ("paper", "table1", "paper-gain2")
 _CONTROLLER_FIELDS = tuple(field.name for field in dataclasses.fields(Controller))
-
-
-class Control(NamedTuple):
-    """A servo's systems as python-control StateSpace objects."""
-
-    G1: Any
-    G2: Any
-    C: Any
-    loop: Any
-    closed_loop: Any
 
 
 @settings("servo")
@@ -201,7 +192,8 @@ class Servo:
         InvalidInput
             A name is unknown, or a value is out of its range.
         """
-        _refuse_unknown(changes)
+        known = [*(each.name for each in dataclasses.fields(Servo)), *_CONTROLLER_FIELDS]
+        refuse_unknown(changes, known, "servo has no value")
         for_plant = {key: value for key, value in changes.items() if key not in _CONTROLLER_FIELDS}
         for_controller = {key: value for key, value in changes.items() if key in _CONTROLLER_FIELDS}
         changed = dataclasses.replace(self, **for_plant)  # type: ignore[arg-type]
@@ -386,13 +378,7 @@ class Servo:
 
     def to_control(self) -> Control:
         """G1, G2, C, the loop and the closed loop as python-control systems (needs the extra `interop`)."""
-        return Control(
-            G1=self.G1().to_control(),
-            G2=self.G2().to_control(),
-            C=loop.pidf(self.controller).to_control(),
-            loop=self.loop().to_control(),
-            closed_loop=self.closed_loop().to_control(),
-        )
+        return Control.of(self.G1(), self.G2(), loop.pidf(self.controller), self.loop(), self.closed_loop())
 
 
 @lru_cache(maxsize=64)
@@ -408,11 +394,3 @@ def _preset_version(name: str) -> str:
 
 def _spread(value: PerMass, n: int) -> Array:
     return np.broadcast_to(np.asarray(value, dtype=float), (n,)).copy()
-
-
-def _refuse_unknown(changes: Mapping[str, object]) -> None:
-    known = (*(field.name for field in dataclasses.fields(Servo)), *_CONTROLLER_FIELDS)
-    for name in changes:
-        if name not in known:
-            hint = did_you_mean(name, known)
-            raise InvalidInput(f"servo has no value named {name!r}{hint}; allowed are {', '.join(known)}")

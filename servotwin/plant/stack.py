@@ -19,11 +19,11 @@ from servotwin.plant.actuator import ShaftMatrices, stacked
 from servotwin.plant.automaton import ServoAutomaton, Shape, continuous_parts, sampled_parts
 from servotwin.plant.axis import Axis
 from servotwin.plant.basis import BacklashKind, Stribeck
+from servotwin.plant.changes import PerMass
 from servotwin.plant.motor import Motor
 from servotwin.plant.plants import Plant
 from servotwin.plant.rest import Rest
 from servotwin.plant.servo import Servo
-from servotwin.plant.servo_changes import PerMass
 from servotwin.plant.signals import Array
 from servotwin.plant.structure import Chain, chain
 

@@ -36,7 +36,7 @@ from servotwin.simulation.continuous import at_zero
 from servotwin.simulation.inputs import RunInputs, quantised, whole_ratio
 from servotwin.simulation.readings import TICKED_MOTOR, NoiseBuffer, PositionErrors, Readings
 from servotwin.simulation.start import plant_start, set_states, started
-from servotwin.simulation.ticks import Output, Port, TickInputs, run_ticks, tick_and_record
+from servotwin.simulation.ticks import Port, TickInputs, new_output, run_ticks, shifted_output, tick_and_record
 
 _CHUNK, _LARGEST_CHUNK = 1 << 15, 1 << 16
 _RECORDED = ("theta_m", "theta_d", "voltage")
@@ -80,7 +80,7 @@ class SampledEngine:
         self.port = self._make_port(searches)
         samples = self.samples if self.keep is None else 2 * self.keep + 1 + self.tick_every
         between = self.readings is not None and self.readings.between_samples
-        self.output = _new_output(len(self.port.recorded), samples, self.tick_every, self.record_every, between)
+        self.output = new_output(len(self.port.recorded), samples, self.tick_every, self.record_every, between)
 
     def _started(self, command: float) -> tuple[Any, Any]:
         """State of the law at rest under a command that holds the load, and its parameters, of the kind that this
@@ -157,7 +157,7 @@ class SampledEngine:
     def make_room(self, index: int) -> None:
         """Drop the oldest samples if samples up to `index` would not fit."""
         if self.keep is not None and index - self.oldest > 2 * self.keep:
-            self.output = _shifted_output(self.output, self.index - self.keep, self.tick_every, self.record_every)
+            self.output = shifted_output(self.output, self.index - self.keep, self.tick_every, self.record_every)
             self.record.size[1] = 0
 
     def knots(self, end: int) -> list[tuple[int, list[Jump]]]:
@@ -389,24 +389,3 @@ def _divide(tick_rate: float, sample_rate: float) -> tuple[int, int]:
             "one must be a whole multiple of the other"
         )
     return (1, whole) if tick_rate >= sample_rate else (whole, 1)
-
-
-def _new_output(rows: int, samples: int, tick_every: int, record_every: int, motor: bool) -> Output:
-    """Buffers for so many samples of `rows` states, and for their ticks, with the motor's angle at these or without."""
-    ticks = -(-((samples - 1) * record_every + 1) // tick_every)
-    angles = np.empty(ticks if motor else 0)
-    return Output(np.empty((rows, samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8), angles, 0, 0)
-
-
-def _shifted_output(output: Output, sample: int, tick_every: int, record_every: int) -> Output:
-    """Shift the buffers to begin at `sample`; older samples are dropped."""
-    tick = sample * record_every // tick_every
-    for values, by in (
-        (output.states, sample - output.first_sample),
-        (output.measured, tick - output.first_tick),
-        (output.active, tick - output.first_tick),
-        (output.motor, tick - output.first_tick),
-    ):
-        # Source and destination overlap: the copy is needed.
-        values[..., : values.shape[-1] - by] = values[..., by:].copy()
-    return output._replace(first_sample=sample, first_tick=tick)

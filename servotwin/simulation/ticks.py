@@ -61,6 +61,27 @@ class Output(NamedTuple):
     first_tick: int
 
 
+def new_output(rows: int, samples: int, tick_every: int, record_every: int, motor: bool) -> Output:
+    """Buffers for so many samples of `rows` states, and for their ticks, with the motor's angle at these or without."""
+    ticks = -(-((samples - 1) * record_every + 1) // tick_every)
+    angles = np.empty(ticks if motor else 0)
+    return Output(np.empty((rows, samples)), np.empty(ticks), np.empty(ticks, dtype=np.int8), angles, 0, 0)
+
+
+def shifted_output(output: Output, sample: int, tick_every: int, record_every: int) -> Output:
+    """Shift the buffers to begin at `sample`; older samples are dropped."""
+    tick = sample * record_every // tick_every
+    for values, by in (
+        (output.states, sample - output.first_sample),
+        (output.measured, tick - output.first_tick),
+        (output.active, tick - output.first_tick),
+        (output.motor, tick - output.first_tick),
+    ):
+        # Source and destination overlap: the copy is needed.
+        values[..., : values.shape[-1] - by] = values[..., by:].copy()
+    return output._replace(first_sample=sample, first_tick=tick)
+
+
 @inlined
 def measured(position: float, noise: float, port: Port) -> float:
     """The measurement: noise, then whole counts."""

@@ -171,7 +171,7 @@ def _model(table: Table, name: str, folder: Path, checked: bool) -> ServoModel:
     if not re.match(NAME_PATTERN, name):
         raise InvalidInput(f"{name!r} is not a name of a model: 1 to 64 of A-Z a-z 0-9 . _ - are allowed")
     servo: Plant = read(table, servo_table, folder)
-    table = table.in_units(own_units(servo))
+    table = table.in_units(own_units(servo), servo.p)
     inner = table.table("controller")
     with named(inner):
         law = _changed(inner, servo.controller)

@@ -10,9 +10,10 @@ In a file::
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 from servotwin.config.table import Table, named
 from servotwin.errors import InvalidInput
@@ -56,6 +57,15 @@ class ServoNames:
             return None
         exact = self._exact.get(servo)
         return exact or next((model for pattern, model in self._patterns if fnmatchcase(servo, pattern)), None)
+
+    def test(self, most: int) -> Callable[[str], bool]:
+        """Test whether there is a servo of a name; so many answers are kept, of invalid names, however long, none."""
+
+        @lru_cache(maxsize=most)
+        def has(servo: str) -> bool:
+            return self.model_of(servo) is not None
+
+        return lambda servo: re.match(NAME_PATTERN, servo) is not None and has(servo)
 
     @cached_property
     def _exact(self) -> dict[str, str]:

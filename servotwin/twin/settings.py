@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from servotwin.config.keys import check, key, settings
+from servotwin.config.own_units import AT_LOAD, at_load
 from servotwin.config.table import Table
 from servotwin.config.toml import attribute, part, read
 from servotwin.config.units import unit_of
@@ -33,8 +34,6 @@ _NEWS, _TOLD, _MOST = 0.01, 0.05, math.radians(0.1)
 # Of the command that the model's friction holds: rests from either side are twice as far apart, on a machine whose
 # friction is up to a quarter larger.
 _RESTS = 2.5
-AT_LOAD = "_at_load_"
-"""Before the unit, in keys of gaps that count at the load: elsewhere they count at the motor."""
 _LARGEST_BIAS = 0.01  # of a command's limit: no larger offset of a drive is assumed where its file states none
 
 
@@ -54,6 +53,7 @@ class TriageSettings:
         key(
             "gap_deg",
             above=0.0,
+            at_load=True,
             help="A smaller change of the gap needs no estimate; where absent 1 % of the gap estimated last, at most "
             "0.1 deg.",
         ),
@@ -66,6 +66,7 @@ class TriageSettings:
         key(
             "widest_deg",
             above=0.0,
+            at_load=True,
             help="Largest standard deviation of a glance that decides; that of the last estimate where it is more. "
             "Where absent 5 % of the gap estimated last, at most 0.1 deg.",
         ),
@@ -223,7 +224,8 @@ class TwinSettings:
         key(help="Conditions under which a glance at a window is enough; where absent every window is estimated."),
     ] = None
     initial_gap: Annotated[
-        float, key("initial_gap_deg", minimum=0.0, help="Gap before the first estimate (section 4.2: zero).")
+        float,
+        key("initial_gap_deg", minimum=0.0, at_load=True, help="Gap before the first estimate (section 4.2: zero)."),
     ] = 0.0
     trend: Annotated[TrendSettings, key(makers={"": wear}, select=trend_maker, help="Assumptions on wear.")] = field(
         default_factory=TrendSettings
@@ -236,6 +238,7 @@ class TwinSettings:
         key(
             "gap_limit_deg",
             minimum=0.0,
+            at_load=True,
             help="Largest acceptable gap; the twin reports the time until then.",
         ),
     ] = None
@@ -340,7 +343,7 @@ def read_twin_settings(table: Table, folder: Path = Path(), plant: Plant | None 
     given = table.values.get("uncertainty", {})
     settings: TwinSettings = read(table, TwinSettings, folder, estimator=estimator)
     if plant is not None:
-        check_gaps(table.table("uncertainty"), ["gap_deg"], plant)
+        check_gaps(table.table("uncertainty"), ["gap_deg", *at_load("gap_deg")], plant)
     if not isinstance(plant, Axis) or not isinstance(given, Mapping):
         return settings
     known, own = settings.uncertainty, scales(plant)

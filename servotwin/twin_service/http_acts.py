@@ -16,8 +16,9 @@ from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.store.store import Store
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
 from servotwin.twin_service.http_operator import admitted_servo, store_query
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.limits import RateLimiter, RequestRejected

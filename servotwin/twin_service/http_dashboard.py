@@ -24,8 +24,9 @@ from servotwin.store.records import StoredMessage
 from servotwin.store.store import Store
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
 from servotwin.twin_service.fleet_reader import FleetReader
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, HttpStream, json_response
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, HttpStream, json_response
 from servotwin.twin_service.http_operator import MAX_ROWS, admitted_servo, limit_of, store_query, stored_window
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.limits import RequestRejected

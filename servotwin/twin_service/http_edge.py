@@ -14,7 +14,8 @@ from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import OutgoingMessage, PutResult
 from servotwin.twin_service.auth import EdgeGate
 from servotwin.twin_service.claims import EdgeClaims
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response, msgpack_response
+from servotwin.twin_service.http_app import HttpRoute
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response, msgpack_response
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Ingest, acknowledgement
 from servotwin.twin_service.limits import RequestRejected

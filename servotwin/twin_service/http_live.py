@@ -5,8 +5,9 @@ from __future__ import annotations
 from servotwin.messages import Refusal
 from servotwin.messages.live import MAX_LIVE_BYTES, Watched, encode_live
 from servotwin.twin_service.auth import EdgeGate
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import MAX_WAIT_S, SERVO_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
 from servotwin.twin_service.http_operator import admitted_servo
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.limits import RequestRejected

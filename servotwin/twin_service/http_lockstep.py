@@ -11,8 +11,9 @@ from servotwin.store.records import PutResult
 from servotwin.store.store import Store
 from servotwin.twin_service.auth import EdgeGate
 from servotwin.twin_service.dispatcher import Dispatcher, NoResult
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, msgpack_response
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, msgpack_response
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.ingest import Ingest, acknowledgement, end_of
 from servotwin.twin_service.limits import RequestRejected

@@ -17,8 +17,9 @@ from servotwin.runtime.prometheus import CONTENT_TYPE
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.records import Backlog, StoredEvidence, StoredMessage, WindowTrace
 from servotwin.store.store import Store
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
 from servotwin.twin_service.limits import RequestRejected
 from servotwin.twin_service.monitoring import Metrics
 from servotwin.twin_service.openapi import (

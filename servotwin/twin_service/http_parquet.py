@@ -9,9 +9,10 @@ import msgspec
 from servotwin.dashboard.series import machine_series
 from servotwin.dashboard.window_view import window_columns
 from servotwin.store.store import Store
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_dashboard import decoded_window
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse
 from servotwin.twin_service.http_operator import MAX_ROWS, admitted_servo, limit_of, store_query, stored_window
 from servotwin.twin_service.openapi import (
     BOOT,

@@ -20,7 +20,8 @@ from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
 from servotwin.runtime.service_manager import ServiceManager
 from servotwin.twin_service.config import ServiceConfig
-from servotwin.twin_service.http_app import ABORT, HttpApp
+from servotwin.twin_service.http_app import HttpApp
+from servotwin.twin_service.http_messages import ABORT
 from servotwin.twin_service.limits import Disconnected, Receive, RequestRejected
 from servotwin.twin_service.tls_handshakes import TlsHandshakes, address_of
 from servotwin.twin_service.unauthenticated import UnauthenticatedConnection, UnauthenticatedLimit

@@ -9,7 +9,8 @@ from functools import partial
 
 from servotwin.errors import InvalidInput
 from servotwin.messages import Refusal
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute, json_response
+from servotwin.twin_service.http_app import HttpRoute
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse, json_response
 from servotwin.twin_service.limits import RateLimiter, RequestRejected
 from servotwin.twin_service.openapi import JSON, operation
 from servotwin.twin_service.sessions import OperatorAccess

@@ -11,8 +11,9 @@ from servotwin.messages import MAX_BYTES, InvalidMessage, Refusal
 from servotwin.messages.codec import decompress
 from servotwin.store.records import StoredMessage
 from servotwin.store.store import Store
-from servotwin.twin_service.http_app import HttpRequest, HttpResponse, HttpRoute
+from servotwin.twin_service.http_app import HttpRoute
 from servotwin.twin_service.http_edge import SERVO_PATH, WINDOW_PATH
+from servotwin.twin_service.http_messages import HttpRequest, HttpResponse
 from servotwin.twin_service.http_operator import admitted_servo, store_query, stored_window
 from servotwin.twin_service.http_server import BodyReader
 from servotwin.twin_service.limits import RateLimiter, RequestRejected

@@ -5,22 +5,19 @@ from __future__ import annotations
 import asyncio
 import logging
 import math
-import re
 from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
 from contextlib import asynccontextmanager, suppress
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 from uuid import uuid4
 
 from servotwin import __version__
-from servotwin.messages import NAME_PATTERN
 from servotwin.store.clock_gaps import old_messages
 from servotwin.store.engine import StoreUnavailable
 from servotwin.store.group_commit import AwaitedCommits, CommitLimits, GroupCommit
 from servotwin.store.records import Backlog, OutgoingMessage, PutResult
 from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
-from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
 from servotwin.twin_service.claims import EdgeClaims
@@ -109,7 +106,7 @@ class TwinService:
         self._missing = MissingWindows(
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce
         )
-        has_servo = _servo_test(twin.servos)
+        has_servo = twin.servos.test(MAX_SERVOS)
         self.ingest = self._make_ingest(has_servo, sequences)
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
@@ -394,13 +391,3 @@ def _log_failure(task: asyncio.Task[None]) -> None:
     """Log the exception of a background task at once: the task is awaited only when the service stops."""
     if not task.cancelled() and (error := task.exception()) is not None:
         log.error("a task of the service ended", exc_info=error)
-
-
-def _servo_test(servos: ServoNames) -> Callable[[str], bool]:
-    """Test whether there is a servo of a name; invalid names, however long, are not cached."""
-
-    @lru_cache(maxsize=MAX_SERVOS)
-    def has(servo: str) -> bool:
-        return servos.model_of(servo) is not None
-
-    return lambda servo: re.match(NAME_PATTERN, servo) is not None and has(servo)

@@ -14,7 +14,7 @@ from hashlib import sha256
 
 from servotwin.messages import Refusal
 from servotwin.twin_service.auth import AccessControl
-from servotwin.twin_service.http_app import HttpRequest
+from servotwin.twin_service.http_messages import HttpRequest
 from servotwin.twin_service.limits import RequestRejected
 
 COOKIE = "servotwin-operator"

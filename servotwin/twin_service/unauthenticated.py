@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from servotwin.twin_service.auth import AccessControl, bearer_token
 from servotwin.twin_service.config import ServiceConfig
-from servotwin.twin_service.http_app import cookie_of
+from servotwin.twin_service.http_messages import cookie_of
 from servotwin.twin_service.servo_connections import ServoConnections
 from servotwin.twin_service.sessions import COOKIE, OperatorAccess
 

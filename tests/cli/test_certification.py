@@ -163,6 +163,11 @@ def test_the_search_for_a_fallback_set_is_shown(tmp_path: Path, monkeypatch) -> 
     ("servo", "options", "why"),
     [
         ("paper", {"finest_deg": -1.0}, "--finest-deg -1 deg: must be finite and above 0"),
+        (
+            "paper",
+            {"finest_at_load": {"finest_at_load_um": 0.0}},
+            "--finest-at-load-um 0 µm at the load: must be finite",
+        ),
         ("paper", {"biases": {"bias_mv": "x"}}, r"--bias-mv 'x': give VALUE,VALUE,\.\.\. in mV, rising, above 0"),
         ("paper", {"biases": {"bias_mv": "10,1"}}, "--bias-mv '10,1': give .* rising"),
         ("paper", {"biases": {"bias_mv": "0,1"}}, "--bias-mv '0,1': give .* above 0"),
@@ -189,6 +194,8 @@ def test_the_units_of_a_grid_are_converted() -> None:
     options = GridOptions(2.0, {"bias_mv": None, "bias_mn_m": "5,20"}, {"noise_um": None, "noise_mdeg": "0,90"})
     grid = options.grid("one", policy)
     assert grid.finest == math.radians(2.0)
+    options = GridOptions(finest_at_load={"finest_at_load_arcmin": 3.0})
+    assert options.grid("one", policy).finest == pytest.approx(math.radians(0.05) / policy.servo.p, rel=1e-14)
     assert grid.biases == pytest.approx((5e-3, 2e-2))
     assert grid.noises == pytest.approx((0.0, math.radians(0.09)))
 

@@ -172,6 +172,12 @@ def test_windows_of_one_flank_each_say_that_two_steps_show_both(tmp_path: Path) 
 
 def test_the_estimates_of_a_log_are_reported_one_by_one(logs: Path) -> None:
     reported: list[tuple[int, int]] = []
-    options = IdentifyOptions(logs / "own.npz", window=1.9, wear_deg=0.1, wear_over_s=10.0)
+    options = IdentifyOptions(logs / "own.npz", window=1.9, wear_deg=0.1, wear_over_s=10.0, gap_limit_deg=3.0)
     found = identify(options, lambda done, total: reported.append((done, total)))
+    travels = {"wear_at_load_mdeg": 100.0 * found.servo.p, "gap_limit_at_load_mdeg": 3000.0 * found.servo.p}
+    at_load = identify(IdentifyOptions(logs / "own.npz", window=1.9, wear_over_s=10.0, at_load=travels))
+    assert found.trend is not None
+    assert at_load.trend is not None
+    assert at_load.until_limit is not None
+    assert at_load.trend.gap == pytest.approx(found.trend.gap, rel=1e-9)
     assert reported == [(done, len(found.estimates)) for done in range(len(found.estimates))]

@@ -1,15 +1,18 @@
-"""A scenario may state its gap at the load: um of a screw, arc minutes of a gear."""
+"""Gaps may be stated at the load: um of a screw, arc minutes of a gear."""
 
 import math
 from pathlib import Path
 
 import pytest
 
+from servotwin.config.table import parse_toml
 from servotwin.cosim.scenario import Scenario
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import SCurve
+from servotwin.twin.model_registry import models_of
+from servotwin.twin.settings import TwinSettings, read_twin_settings
 
 TEXT = """servo = "{servo}"
 duration_s = 4.0
@@ -62,9 +65,17 @@ def test_the_papers_servo_may_state_the_travel_of_its_screw(tmp_path: Path) -> N
         (JOINT, "total_at_load_um = 3.0", r"counts it in rad; here its name is 'gap.total_at_load_mdeg'"),
         (SCREW, "total_at_load_arcmin = 3.0", r"counts it in m; here its name is 'gap.total_at_load_um'"),
         (SCREW, "from_at_load_mdeg = 3.0, to_at_load_um = 9.0, over_s = 1.0", r"its name is 'gap.from_at_load_um'"),
-        (SCREW, "total_deg = 1.0, total_at_load_um = 3.0", r"unknown key 'gap.total_deg'.*allows total_at_load"),
-        (SCREW, "from_at_load_um = 3.0, to_deg = 1.0, over_s = 1.0", r"unknown key 'gap.to_deg'|gap.to_at_load_um"),
-        (SCREW, "from_at_load_um = 3.0, over_s = 1.0", r"key 'gap.to_at_load_um' or .* is missing"),
+        (
+            SCREW,
+            "total_deg = 1.0, total_at_load_um = 3.0",
+            r"gap.total_deg = 1.0 and gap.total_at_load_um = 3.0: .*give only one",
+        ),
+        (
+            SCREW,
+            "from_at_load_um = 3.0, to_deg = 1.0, over_s = 1.0",
+            r"gap.to_deg = 1.0 is not allowed; give both ends .* at the load",
+        ),
+        (SCREW, "from_at_load_um = 3.0, over_s = 1.0", r"key 'gap.to_deg' or 'gap.to_at_load_um' or .* is missing"),
         (
             JOINT,
             "total_arcmin = 3.0",
@@ -85,3 +96,62 @@ def test_what_does_not_fit_is_refused_in_one_sentence(
     with pytest.raises(InvalidInput, match=f"own.toml: .*{sentence}") as caught:
         load(tmp_path, machine, gap)
     assert "\n" not in str(caught.value)
+
+
+STATED = """policy = "paper"
+initial_gap_{first}
+gap_limit_{limit}
+uncertainty = {{gap_{pair}}}
+trend = {{wear_{wear}, over_s = 1e6}}
+triage = {{gap_{first}, widest_{first}}}
+"""
+AT_MOTOR = STATED.format(first="deg = 0.72", limit="deg = 3.6", pair="deg = [0.36, 3.6]", wear="deg = 1.8")
+AT_LOAD = STATED.format(
+    first="at_load_um = 10.0", limit="at_load_mm = 0.05", pair="at_load_um = [5, 50]", wear="at_load_um = 25.0"
+)  # 5 mm per turn
+
+
+def twin_of(text: str, plant: Axis | None) -> TwinSettings:
+    """[twin] of a model's table."""
+    if plant is None:
+        return read_twin_settings(parse_toml(text, "twin.toml"))
+    lines = "\n".join(["[models.one]", 'servo = "ball-screw"', "[models.one.twin]", text])
+    return models_of(parse_toml(lines, "twin.toml"), Path())[0].settings
+
+
+def test_a_twin_may_state_every_gap_at_the_load() -> None:
+    screw = Axis.preset("ball-screw")
+    motor, load_side = twin_of(AT_MOTOR, screw), twin_of(AT_LOAD, screw)
+    assert load_side.uncertainty.gap == pytest.approx(motor.uncertainty.gap, rel=1e-14)
+    assert load_side.initial_gap == pytest.approx(motor.initial_gap, rel=1e-14)
+    assert load_side.gap_limit == pytest.approx(motor.gap_limit, rel=1e-14)
+    assert load_side.trend.rate_std_rad_per_s == pytest.approx(motor.trend.rate_std_rad_per_s, rel=1e-14)
+    assert load_side.triage is not None
+    assert motor.triage is not None
+    assert load_side.triage.gap == pytest.approx(motor.triage.gap, rel=1e-14)
+    assert load_side.triage.widest == pytest.approx(motor.triage.widest, rel=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("given", "sentence"),
+    [
+        (
+            "gap_deg = [0, 1], gap_at_load_um = [0, 9]",
+            r"gap_deg = \[0, 1\] and .*gap_at_load_um = \[0, 9\]: .* only one",
+        ),
+        ("gap_at_load_um = [0, 9], gap_at_load_mm = [0, 1]", "give only one"),
+        ("gap_at_load_arcmin = [0, 9]", r"counts it in m; here its name is '.*uncertainty.gap_at_load_um'"),
+        ("gap_at_load_um = [9, 0]", "give two numbers, the lower one first"),
+        ("gap_at_load_um = [-1, 9]", "give a number, at least 0"),
+        ("gap_at_load_mm = [0, 6]", "at most 5 mm, one turn"),
+    ],
+)
+def test_what_a_twin_cannot_mean_is_refused_in_one_sentence(given: str, sentence: str) -> None:
+    with pytest.raises(InvalidInput, match=f"twin.toml: .*uncertainty.*{sentence}") as caught:
+        twin_of(f"uncertainty = {{{given}}}", Axis.preset("ball-screw"))
+    assert "\n" not in str(caught.value)
+
+
+def test_without_a_machine_gaps_count_at_the_motor() -> None:
+    with pytest.raises(InvalidInput, match=r"gap_limit_at_load_um = 5.0: no machine is known here; give gap_limit_deg"):
+        twin_of("gap_limit_at_load_um = 5.0", None)

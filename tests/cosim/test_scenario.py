@@ -185,7 +185,7 @@ def test_steps_of_1_mm_are_a_replacement_away():
         (
             "total_deg = 10.0",
             "from_rad = 0.1\nto_rad = 0.2\nover_s = 3",
-            "'gap.from_deg' is missing (found 'gap.from_rad' instead)",
+            "'gap.from_at_load_mm' is missing (found 'gap.from_rad' instead)",
         ),
         ("total_deg = 10.0", "total_deg = 1\nto_deg = 3", "unknown key 'gap.to_deg'"),
         (
@@ -235,7 +235,7 @@ def test_steps_of_1_mm_are_a_replacement_away():
         ("[gap]", "[twin.estimator]\noffset_deg = 3\n[gap]", "offset_deg = 3 is not allowed; give two numbers"),
         ("[gap]", "[twin]\ngap_limit_deg = -1\n[gap]", "twin.gap_limit_deg = -1 is not allowed"),
         ("[gap]", "[twin.trend]\nwear_deg = 1\n[gap]", "'twin.trend.over_s' is missing"),
-        ("[gap]", "[twin.trend]\nrate_deg = 1\n[gap]", "'twin.trend.wear_deg' is missing"),
+        ("[gap]", "[twin.trend]\nrate_deg = 1\n[gap]", "'twin.trend.wear_deg' or 'twin.trend.wear_at_load_um' or"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, old, new, expected):

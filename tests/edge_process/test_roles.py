@@ -9,16 +9,15 @@ import pytest
 from edge_process_parts import CONFIG, LAW, RATE, LinkEnd, cut, exchange_all
 from hypothesis import given
 from hypothesis import strategies as st
+from scripted_edge import ScriptedDrive, edge_of, samples
 
 from servotwin.control.cascade import Cascade
 from servotwin.control.gains import gains_of
 from servotwin.control.law import start, tick
 from servotwin.control.running_law import RunningLaw, command_of
-from servotwin.edge.drive import Block, DriveLost, DriveRefused, DriveSample
+from servotwin.edge.drive import Block, DriveLost, DriveSample
 from servotwin.edge.guard import Limits
-from servotwin.edge.parameters import Parameters
 from servotwin.edge_process import frames, outlet
-from servotwin.edge_process.config import EdgeConfig
 from servotwin.edge_process.control import ControlRole, GuardedLaw
 from servotwin.edge_process.edge import EdgeRuntime
 from servotwin.edge_process.outlet import BEHIND, PipeOutlet
@@ -102,66 +101,6 @@ def test_a_cascade_runs_at_the_edge_and_takes_new_numbers_without_a_bump(far: "L
 def law_update(version: int, law: Cascade) -> Update:
     known = (None, None, (None, None))
     return Update("axis-1", version, 0, ("b0", 0), 0.0, *known, "OK", Setting.of(0.0, gains_of(law)), 60.0)
-
-
-class ScriptedDrive:
-    """A drive of both roles, with scripted samples; it records what is written to it."""
-
-    machine, lag, can_move, patient, rate = "m", 0.0, True, False, RATE
-
-    def __init__(self, given: list[DriveSample | Block | Exception | None]) -> None:
-        self.given, self.voltages, self.log = given, [], []
-        self.connects = 0
-        self.refuse = False
-
-    def connect(self) -> None:
-        self.connects += 1
-
-    def close(self) -> None:
-        """Nothing is open."""
-
-    def read(self, most: int = 0) -> DriveSample | Block | None:
-        self.log.append(most)
-        found = self.given.pop(0)
-        if isinstance(found, Exception):
-            raise found
-        return found
-
-    def write(self, value: float | Parameters) -> None:
-        if self.refuse and isinstance(value, Parameters):
-            raise DriveRefused("no")
-        self.voltages.append(value)
-
-    def move(self, offset: float) -> None:
-        self.log.append(f"move {offset}")
-
-
-class Clock:
-    """Time that only passes when somebody waits."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        self.now += 1e-4
-        return self.now
-
-    def pause(self, seconds: float) -> None:
-        self.now += seconds
-
-
-class NoChild:
-    def check(self, now: float) -> None:
-        """No link process."""
-
-
-def edge_of(box: PipeOutlet, config: EdgeConfig = CONFIG) -> EdgeRuntime:
-    clock = Clock()
-    return EdgeRuntime(config, "b0", box, NoChild(), None, clock, clock.pause)
-
-
-def samples(first: int, count: int, reference: float = 1e-3) -> list[DriveSample]:
-    return [DriveSample(k, reference, 0.0, 0.0) for k in range(first, first + count)]
 
 
 def letters(far: LinkEnd, kind: type | tuple[type, ...]) -> list[object]:

@@ -14,8 +14,9 @@ from servotwin.estimation.core.motor_angle import without_counts, without_noise
 from servotwin.estimation.estimate import GapStatus
 from servotwin.estimation.gap import estimate_gap
 from servotwin.estimation.output_error import OutputErrorSettings
-from servotwin.estimation.output_error.estimator import _problem, fitted
+from servotwin.estimation.output_error.estimator import _problem, fit, fitted
 from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.mismatches import hidden
 from servotwin.estimation.output_error.play_model import lagged
 from servotwin.estimation.output_error.possible import possible_half
 from servotwin.estimation.output_error.search import search
@@ -314,3 +315,16 @@ def test_a_shaft_that_looks_soft_within_few_counts_is_no_mismatch(
     else:
         assert estimate.ok
         assert estimate.interval[0] <= gap <= estimate.interval[1]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("fraction", "off"), [(1.0, False), (0.001, True)])
+def test_counts_hide_a_stiffness_and_fine_ones_show_it(fraction: float, off: bool) -> None:
+    """Seen on a two-mass drive with a gap of six counts, whose search ended at a stiffness that was 27 % too low."""
+    axis = Axis.preset("two-mass-drive")
+    axis = axis.replace(sensors=replace(axis.sensors, encoder_resolution=fraction * axis.encoder_resolution))
+    machine = axis.scaled({"k": 0.7 if off else 0.97})
+    run = simulate(machine, 15.0, reference=SquareWave(0.087, 20.0), gap=1.0 / 110.0, sample_rate=2000.0)
+    found = fit(Window.from_run(run, 9.5, 5.0), axis, None, OutputErrorSettings())
+    stiffness = next(place for place, each in enumerate(found.problem.model.unknowns) if each.name == "shaft stiffness")
+    assert hidden(found, stiffness) is not off

@@ -90,6 +90,18 @@ def test_a_load_that_friction_stops_within_few_samples_is_not_saturated() -> Non
     assert any("stays at its extreme" in each for each in faults(Window(1e-7 * cut, 1e-3 * counts, sample_rate=2000.0)))
 
 
+def test_a_load_that_creeps_behind_its_motor_before_it_stops_is_not_saturated() -> None:
+    """Seen on two ball screws: the load brakes to the speed of its motor, and stops within three samples of it."""
+    creeping = [27.0, 24.0, 20.0, 12.0, 8.0, 7.0, 7.0, 7.0, 8.0, 8.0, 6.0, 2.0]
+    steps = np.concatenate([np.full(400, 92.0), np.linspace(90.0, 30.0, 20), creeping, np.zeros(200)])
+    counts = np.cumsum(np.concatenate([steps, -steps]))
+    assert faults(Window(1e-7 * counts, 1e-3 * counts, sample_rate=2000.0)) == ()
+    for lost in (300.0, 1500.0):
+        cut = np.minimum(counts, counts.max() - lost)
+        told = faults(Window(1e-7 * cut, 1e-3 * counts, sample_rate=2000.0))
+        assert any("stays at its extreme" in each for each in told)
+
+
 def test_a_load_that_breaks_loose_by_a_count_has_not_slipped_where_samples_were_rounded_again() -> None:
     """A message's 16 bits lie beside the grid of an encoder of 17."""
     count = 2.0 * math.pi / 2**17

@@ -5,59 +5,23 @@ import ssl
 import threading
 import time
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from faketwin import FakeTwin, Handler
+from http_parcels import HELLO, LETTER, parcel, window
 
 from servotwin.errors import InvalidInput
 from servotwin.link.claim import HeldClaim
 from servotwin.link.http import HttpTransport, LiveHttp
-from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.link.transport import Refused, Unreachable
 from servotwin.messages import (
     Acknowledge,
-    Hello,
     Refusal,
-    Setting,
-    WindowMessage,
-    checksum,
     encode,
-    pack_channel,
 )
 from servotwin.messages.codec import deflated
 from servotwin.messages.live import LiveColumns, Watched, decode_columns, encode_live
-
-CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
-HELLO = Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")
-
-
-def window(sequence: int) -> WindowMessage:
-    return WindowMessage("axis-1", "b0", sequence, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
-
-
-def parcel(sequence: int) -> Parcel:
-    return Parcel("axis-1", *deflated(encode(window(sequence))), "b0", sequence)
-
-
-LETTER = Parcel("axis-1", encode(HELLO))
-
-
-@pytest.fixture
-def twin() -> Iterator[FakeTwin]:
-    with FakeTwin() as twin:
-        yield twin
-
-
-@pytest.fixture
-def link(twin: FakeTwin) -> Iterator[HttpTransport]:
-    transport = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
-    yield transport
-    release(transport)
-
-
-def release(transport: HttpTransport) -> None:
-    transport.close()
 
 
 def test_windows_and_letters_arrive(twin: FakeTwin, link: HttpTransport) -> None:
@@ -112,7 +76,7 @@ def test_a_wrong_token_is_a_refusal(twin: FakeTwin) -> None:
     with pytest.raises(Refused, match="bad_token") as refused:
         link.deliver(parcel(0))
     assert refused.value.reason.temporary
-    release(link)
+    link.close()
 
 
 @pytest.mark.parametrize(
@@ -151,7 +115,7 @@ def test_an_answer_that_never_comes_is_no_delivery() -> None:
         link = HttpTransport(f"http://127.0.0.1:{deaf.getsockname()[1]}", "axis-1", "secret", timeout_s=0.2)
         with pytest.raises(Unreachable, match="timed out"):
             link.deliver(parcel(0))
-        release(link)
+        link.close()
 
 
 def test_an_address_in_capitals_is_encrypted_all_the_same() -> None:
@@ -169,7 +133,7 @@ def test_an_address_in_capitals_is_encrypted_all_the_same() -> None:
         with pytest.raises(Unreachable):
             link.deliver(parcel(0))
         listening.join(10.0)
-        release(link)
+        link.close()
     assert received[0][:1] == b"\x16"  # a TLS handshake
     assert b"secret" not in received[0]
 
@@ -200,7 +164,7 @@ def test_closing_ends_a_poll_under_way(twin: FakeTwin) -> None:
     link.close()
     thread.join(10.0)
     assert woken == [True]
-    release(link)
+    link.close()
 
 
 def test_a_connection_made_while_the_link_closes_is_closed(twin: FakeTwin, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,7 +203,7 @@ def test_over_tls_the_certificate_is_checked(twin: FakeTwin, certificate: Path) 
     url = twin.url.replace("http:", "https:")
     trusting = HttpTransport(url, "axis-1", "secret", str(certificate), 5.0)
     trusting.deliver(parcel(0))
-    release(trusting)
+    trusting.close()
     doubting = HttpTransport(url, "axis-1", "secret", None, 5.0)
     with pytest.raises(Unreachable, match="certificate verify failed"):
         doubting.deliver(parcel(1))

@@ -1,12 +1,13 @@
 """Proxies between edge and twin: only the twin's answer to the very body that was sent counts."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing, suppress
 
 import msgspec
 import pytest
 from faketwin import FakeTwin, Handler
+from http_parcels import LETTER, parcel
 
 from servotwin.link.body_mark import body_mark
 from servotwin.link.claim import ExclusiveTransport, HeldClaim
@@ -15,33 +16,11 @@ from servotwin.link.transport import Parcel, Refused, Unreachable
 from servotwin.messages import (
     ClaimStatus,
     EdgeClaim,
-    Hello,
     Refusal,
-    Setting,
-    WindowMessage,
-    checksum,
-    encode,
-    pack_channel,
 )
-from servotwin.messages.codec import deflated
 
-CHANNEL = pack_channel("position", "m", [(k // 50) * 1e-6 for k in range(500)])
-WINDOW = WindowMessage("axis-1", "b0", 0, 0.0, 10.0, (CHANNEL,), (), 0, "", "reference", checksum((CHANNEL,)))
-PARCEL = Parcel("axis-1", *deflated(encode(WINDOW)), "b0", 0)
-LETTER = Parcel("axis-1", encode(Hello("axis-1", "b0", 0.0, 10.0, 0, Setting(0.0), "")))
-
-
-@pytest.fixture
-def twin() -> Iterator[FakeTwin]:
-    with FakeTwin() as twin:
-        yield twin
-
-
-@pytest.fixture
-def link(twin: FakeTwin) -> Iterator[HttpTransport]:
-    transport = HttpTransport(twin.url, "axis-1", "secret", timeout_s=5.0, wait_s=0.2)
-    yield transport
-    transport.close()
+PARCEL = parcel(0)
+CHANGED = "a proxy on the way changes it, or swaps answers"
 
 
 @pytest.mark.parametrize("status", [404, 405])
@@ -76,9 +55,6 @@ def test_a_proxy_that_loses_the_path_for_a_while_costs_neither_window_nor_claim(
         link.deliver(PARCEL)
         assert link.claim == HeldClaim("b0", 1)
         assert list(twin.windows) == [("b0", 0)]
-
-
-CHANGED = "a proxy on the way changes it, or swaps answers"
 
 
 def marking(mark: str | None) -> Callable[[Handler, bytes], bool]:

@@ -9,7 +9,7 @@ import pytest
 import servotwin as st
 from servotwin.control.controller import ControllerChanges
 from servotwin.errors import InvalidInput
-from servotwin.plant.servo_changes import ServoChanges
+from servotwin.plant.changes import ServoChanges
 from servotwin.simulation.ensemble import Cases, simulate_members
 
 TEN_DEGREES = math.radians(10.0)

@@ -16,7 +16,7 @@ from servotwin.store.engine import StoreUnavailable
 from servotwin.twin_service import fleet_feed, http_app
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
 from servotwin.twin_service.fleet_process import ChangeReader, ChangesQuestion
-from servotwin.twin_service.http_app import ABORT, HttpRequest, HttpStream
+from servotwin.twin_service.http_messages import ABORT, HttpRequest, HttpStream
 from servotwin.twin_service.limits import RequestRejected
 
 

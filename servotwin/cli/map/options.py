@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from servotwin.analysis.maps.axes import Axes, PhysicalAxes, RatioAxes, Values
 from servotwin.analysis.maps.settings import MapSettings
+from servotwin.cli.gap_options import GapForm, stated_gap
 from servotwin.cli.own_options import option_of, own_option
 from servotwin.control.linear_law import LinearLaw
 from servotwin.errors import InvalidInput
-from servotwin.plant.display_units import DisplayUnit, position_unit
+from servotwin.plant.display_units import position_unit
 from servotwin.plant.own_units import own_units
 from servotwin.plant.plants import Plant, resolve_plant
 
@@ -24,13 +25,14 @@ TOLERANCE, AMPLITUDE = "0:5:64", "0.5:500:64:log"
 
 @dataclass(frozen=True)
 class MapOptions:
-    """The options of `servotwin map` that the numbers depend on; None: not given."""
+    """The options of `servotwin map` that the numbers depend on; None: not given. `at_load`: gaps there, by key."""
 
     servo: str
     tolerance: str | None = None
     amplitude: str | None = None
     gap_deg: str | None = None
     estimate_deg: str | None = None
+    at_load: Mapping[str, str] = field(default_factory=dict)
     k_dz: str | None = None
     amplitude_mm: str | None = None
     amplitude_deg: str | None = None
@@ -86,7 +88,8 @@ class MapOptions:
     def _axes(self, servo: Plant) -> Axes:
         units = own_units(servo)
         ratios = {"--tolerance": self.tolerance, "--amplitude": self.amplitude}
-        physical = {"--gap-deg": self.gap_deg, "--estimate-deg": self.estimate_deg, "--k-dz": self.k_dz}
+        (gap, gaps), (estimate, estimates) = self._gap("gap", servo), self._gap("estimate", servo)
+        physical = {gap.option: gaps, estimate.option: estimates, "--k-dz": self.k_dz}
         steps = {"amplitude_mm": self.amplitude_mm, "amplitude_deg": self.amplitude_deg}
         own = option_of(units.key("amplitude_mm"))
         physical[own] = own_option(steps, "amplitude_mm", self.servo, units)
@@ -96,19 +99,22 @@ class MapOptions:
                 f"{given[0][0]} is in units of p b and {given[1][0]} is not: give axes of one kind, {', '.join(ratios)}"
                 f" or {', '.join(physical)}"
             )
-        return self._physical(own, physical[own] or "1", position_unit(servo)) if given[1] else self._ratios()
+        if not given[1]:
+            return self._ratios()
+        return PhysicalAxes(
+            parsed(gap.option, gaps or "10", gap.at_motor(1.0)),
+            parsed("--k-dz", self.k_dz or "1"),
+            parsed(own, physical[own] or "1", position_unit(servo).si_of(1.0)),
+            () if estimates is None else parsed(estimate.option, estimates, estimate.at_motor(1.0)),
+        )
+
+    def _gap(self, name: str, servo: Plant) -> tuple[GapForm, str | None]:
+        degrees = self.gap_deg if name == "gap" else self.estimate_deg
+        return stated_gap(name, degrees, self.at_load, self.servo, servo)
 
     def _ratios(self) -> RatioAxes:
         tolerance = parsed("--tolerance", self.tolerance or TOLERANCE)
         return RatioAxes(tolerance, parsed("--amplitude", self.amplitude or AMPLITUDE))
-
-    def _physical(self, name: str, step: str, position: DisplayUnit) -> PhysicalAxes:
-        return PhysicalAxes(
-            parsed("--gap-deg", self.gap_deg or "10", math.pi / 180.0),
-            parsed("--k-dz", self.k_dz or "1"),
-            parsed(name, step, position.si_of(1.0)),
-            () if self.estimate_deg is None else parsed("--estimate-deg", self.estimate_deg, math.pi / 180.0),
-        )
 
 
 def parsed(name: str, text: str, unit: float = 1.0) -> Values:

@@ -106,8 +106,8 @@ class TrendSettings:
 
 
 def wear(
-    gap: Annotated[float, key("wear_deg", above=0.0, help="Expected growth of the gap within over_s.")],
-    over: Annotated[float, key("over_s", above=0.0, help="Time in which the gap grows by wear_deg.")],
+    gap: Annotated[float, key("wear_deg", above=0.0, at_load=True, help="Expected growth of the gap within over_s.")],
+    over: Annotated[float, key("over_s", above=0.0, help="Time in which the gap grows by that.")],
 ) -> TrendSettings:
     """Make trend settings from the keys of a table."""
     return TrendSettings.for_wear(gap, over)

@@ -6,13 +6,15 @@ import math
 
 import numpy as np
 
-from servotwin.estimation.output_error.fit import Search
+from servotwin.estimation.output_error.fit import Search, descend
 from servotwin.estimation.output_error.models import HALF
 from servotwin.estimation.output_error.rounding import influence, rounded
+from servotwin.estimation.output_error.search import LEFT_COUNTS, rms
 from servotwin.estimation.output_error.unexplained import slow
 from servotwin.plant.signals import Array
 
 _UNUSUAL = 3.3  # standard deviations of one of the model's numbers beforehand
+_HELD_STEPS = 40  # of a fit
 APART = 4.0  # standard deviations between the halves of a window
 UNEXPLAINED = 0.05  # of the position's variation, or of half the gap where there are no dynamics
 _OUTLYING = 7.0  # standard deviations
@@ -38,16 +40,17 @@ def mismatches(found: Search, likely: Array, rate: float, least: float) -> tuple
         sentences.append(
             f"the model leaves motion of {100.0 * left / best.values[HALF]:.0f} % of half the gap unexplained"
         )
-    sentences += unusual_numbers(found, likely)
+    sentences += unusual_numbers(found, likely, shown=True)
     sentences += _outliers(found, least)
     sentences += differing_halves(found, rate)
     return tuple(sentences)
 
 
-def unusual_numbers(found: Search, likely: Array) -> tuple[str, ...]:
+def unusual_numbers(found: Search, likely: Array, shown: bool = False) -> tuple[str, ...]:
     """List the unknowns (u,), as they are `likely`, that would have to be far off what is known of them.
 
     Rounding may have moved them: a motor that touches softly, within few counts of its encoder, looks soft and late.
+    With `shown` only those count, of them at whose limit the search ended, that the window shows to be off.
     """
     problem, sentences = found.problem, list[str]()
     limits = problem.limits()
@@ -55,7 +58,8 @@ def unusual_numbers(found: Search, likely: Array) -> tuple[str, ...]:
         size = abs(float(likely[i]))
         known = math.isfinite(unknown.std) and unknown.unit != "damping"
         far = known and (size > _UNUSUAL * unknown.std or size >= limits[i])
-        if far and not _rounding_explains(found, i, size, bool(size >= limits[i])):
+        at_limit = bool(size >= limits[i])
+        if far and not _rounding_explains(found, i, size, at_limit) and not (shown and at_limit and hidden(found, i)):
             late = unknown.unit == "time"
             change = f"{1e3 * likely[i]:+.3g} ms" if late else f"{100.0 * math.expm1(likely[i]):+.2g} %"
             sentences.append(f"the {unknown.name} would be off by {change}")
@@ -66,6 +70,19 @@ def _rounding_explains(found: Search, which: int, size: float, at_limit: bool) -
     """Tell whether an unknown may be off by a size because of rounding: alone where the search ended at its limit."""
     rounding, known = rounded(found, which), found.problem.model.unknowns[which].std
     return size <= _UNUSUAL * (rounding if at_limit else math.hypot(rounding, known))
+
+
+def hidden(found: Search, which: int) -> bool:
+    """Tell whether rounding may hide what an unknown is.
+
+    Errors of rounding follow the motion, and a noise that was learnt of them speaks for an unknown that follows them:
+    held at what is known of it, the model may leave no more than rounding.
+    """
+    problem, rate = found.problem, found.problem.model.slowing[-1] * found.problem.model.speed
+    start, free = found.best.values.copy(), found.free.copy()
+    start[which], free[which] = 0.0, False
+    held = descend(problem, start, found.noise, free, _HELD_STEPS, rate)
+    return rate > 0.0 and rms(held.raw) <= LEFT_COUNTS * problem.count
 
 
 def differing_halves(found: Search, rate: float) -> tuple[str, ...]:

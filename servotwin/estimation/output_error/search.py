@@ -29,7 +29,7 @@ _LOW = 0.1  # the white noise, of what the best minimum before has left
 _ROUNDED_STEPS, _LEARNT_STEPS, _PASSES = 20, 20, 3
 _SAME = 0.02  # of a gap: minima that are one
 _NEIGHBOURS, _NEAR = 16, (0.01, 0.5)  # places beside the best minimum that are tried, and how far of the half gap
-_LEFT, _LEFT_COUNTS, _WHITE = 0.001, 0.33, 1.2  # of half the gap, a count, white noise: what a good fit leaves
+_LEFT, LEFT_COUNTS, _WHITE = 0.001, 0.33, 1.2  # of half the gap, a count, white noise: what a good fit leaves
 
 
 class SearchProblem(FitProblem, Protocol):
@@ -181,7 +181,7 @@ def _beside(problem: SearchProblem, best: Fit) -> Fit:
     return best
 
 
-def explains(problem: FitProblem, fit: Fit, counts: float = _LEFT_COUNTS) -> bool:
+def explains(problem: FitProblem, fit: Fit, counts: float = LEFT_COUNTS) -> bool:
     """Tell whether a fit leaves next to nothing, so many counts of the sensor, or white noise."""
     white = _WHITE * math.sqrt(0.5) * rms(np.diff(fit.raw))
     return rms(fit.raw) <= max(_LEFT * float(fit.values[HALF]), counts * problem.count, white)

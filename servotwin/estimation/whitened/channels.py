@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.core.decimation import decimation
@@ -21,6 +20,7 @@ from servotwin.estimation.paper.zero_phase import ZeroPhase
 from servotwin.estimation.whitened.fit import gaps_to_try
 from servotwin.estimation.whitened.gate import slow
 from servotwin.estimation.whitened.reduction import CONSTANT, RESIDUAL, Reduction, factor_for
+from servotwin.estimation.whitened.saturation import RUN, STEEP, runs, saturation
 from servotwin.estimation.whitened.search import search
 from servotwin.estimation.whitened.settings import WhitenedSettings
 from servotwin.estimation.window import Window
@@ -28,9 +28,6 @@ from servotwin.plant.load import LINEAR
 from servotwin.plant.servo import Servo
 from servotwin.plant.signals import Array
 
-# Samples at the extreme, at a time (a swing in counts that moves in each sample before has fewer at its crest), and
-# before it; share of the fastest motion there.
-_FLAT, _CREST, _RUN, _STEEP = 20, 10, 6, 0.05
 _JUMP = 50.0  # times the usual fastest motion
 # Of the median step, of the motion's range; counts, of which noise makes two. A half more: whole counts differ in their
 # last digits.
@@ -78,7 +75,7 @@ def _fault(name: str, samples: Array, factor: float, unit: str) -> str:
             "encoder, or samples are missing"
         )
     return (
-        _saturation(name, samples, steps, factor, unit)
+        saturation(name, samples, steps, factor, unit)
         or _repeating(name, np.diff(samples))
         or _spike(name, samples, factor, unit)
     )
@@ -145,16 +142,16 @@ def _repeating(name: str, steps: Array) -> str:
     leap, was held: samples are missing. A count more or less is no motion, and a channel that is
     recorded more often than measured repeats most values: `upsampled` speaks of it.
     """
-    begins, ends = _runs(steps == 0.0)
+    begins, ends = runs(steps == 0.0)
     long = ends - begins >= _REPEATED - 1
     if not np.any(long):
         return ""
     moving, sizes = np.flatnonzero(steps), np.abs(steps)
     if moving.size < 2 or np.median(np.diff(moving)) > 1.0:
         return ""
-    least = max(_ABRUPT * float(np.min(sizes[moving])), _STEEP * float(np.max(sizes)))
+    least = max(_ABRUPT * float(np.min(sizes[moving])), STEEP * float(np.max(sizes)))
     for begin, end in zip(begins[long], ends[long], strict=True):
-        before, after = steps[max(0, begin - _RUN) : begin][::-1], steps[end : end + _RUN]
+        before, after = steps[max(0, begin - RUN) : begin][::-1], steps[end : end + RUN]
         leaps = _abrupt(after, least) and abs(after[0]) > _LEAP * float(np.max(np.abs(after[1:])))
         if leaps or _abrupt(before, least):
             repeats = f"{name} repeats one value in full motion, in samples {begin} to {end}"
@@ -162,57 +159,9 @@ def _repeating(name: str, steps: Array) -> str:
     return ""
 
 
-def _runs(true: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Begins and ends (k,) of the stretches in which something is true."""
-    padded = np.concatenate([[False], true, [False]])
-    return np.flatnonzero(padded[1:] & ~padded[:-1]), np.flatnonzero(padded[:-1] & ~padded[1:])
-
-
 def _abrupt(side: Array, least: float) -> bool:
     """True where the first of some steps is beyond `least` and beyond the change of speed in the others."""
-    return side.size == _RUN and bool(abs(side[0]) > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
-
-
-def _saturation(name: str, samples: Array, steps: Array, factor: float, unit: str) -> str:
-    """Describe samples that stay at an extreme value which was reached at speed; empty without them.
-
-    The crests of an even swing may all be at one count, each for few samples; and a motor that friction stops slows
-    down before it.
-    """
-    for extreme in (float(samples.max()), float(samples.min())):
-        begins, ends = _runs(samples == extreme)
-        if (size := int(np.sum(ends - begins))) < _FLAT:
-            continue
-        run = np.abs(samples[_RUN:] - samples[:-_RUN])
-        fastest = float(np.partition(run, -5)[-5])
-        entries = begins[(begins > _RUN) & (ends - begins >= _CREST)]
-        reached = [entry for entry in entries if np.all(steps[entry - _RUN : entry] > 0.0)]
-        ways = (min(run[entry - _RUN], _run_ahead(steps, entry), _way_to_rest(steps, entry)) for entry in reached)
-        if any(way > _STEEP * fastest for way in ways):
-            value = f"{factor * extreme:.6g} {unit}"
-            return f"{name} stays at its extreme of {value} for {size} samples: it is saturated"
-    return ""
-
-
-def _run_ahead(steps: Array, entry: int) -> float:
-    """Way of a run of samples at the speed with which a sample is entered.
-
-    By a line through the speeds of the run before it, which leaves out the last step: a limit cuts that.
-    """
-    earlier, later = np.sum(steps[entry - 1 - _RUN : entry - 1].reshape(2, -1), axis=1)
-    return float(2.0 * later + (later - earlier) * (_RUN // 2 + 2) / (_RUN // 2))
-
-
-def _way_to_rest(steps: Array, entry: int) -> float:
-    """Way to rest of what brakes evenly before a sample, as a load does that friction stops; infinite where none does.
-
-    By the three steps before the last one, which a limit cuts.
-    """
-    first, second, third = steps[entry - 4 : entry - 1]
-    if not first > second > third:
-        return math.inf
-    brake, speed = second - third, max(0.0, 2.0 * third - second)
-    return float(0.5 * speed * speed / brake)
+    return side.size == RUN and bool(abs(side[0]) > max(least, _ABRUPT * float(np.max(np.abs(np.diff(side[1:]))))))
 
 
 def _encoder_noise(theta_m: Array) -> float:

@@ -147,45 +147,60 @@ def laws_within(
             "controller kp = 0: verified settings have scaled gains, proportional or integral alone, and this "
             'controller has neither; give one, or another policy than "certified"'
         )
-    plants = plant_set(servo, uncertainty, own.sample_rate)
-    delays = delays_of(own, uncertainty)
-    notched = with_notch(servo) if demands.notch else None
-    known: dict[AnyController, bool] = {}
-
-    def passes(law: AnyController) -> bool:
-        if law not in known:
-            # A dead zone may stop the integral: the law without it must be within the bounds too.
-            stopped = without_integral(law) if integrates(law) and 0.0 in integral else law
-            # A small peak alone says nothing: that of an unstable loop may be small.
-            known[law] = (
-                (stopped is law or passes(stopped))
-                and _keeps_to(plants, law, delays, demands)
-                and _stable(plants, law, delays)
-            )
-        return known[law]
-
+    bounds = _Bounds(servo, uncertainty, demands, 0.0 in integral)
     laws = _scaled_laws(own, demands, demands.shapes, integral)
     laws += _scaled_laws(own, demands, demands.learnt_shapes, integral) if uncertainty.learnt is not None else []
     always = {scaled(own, scale, (1.0, 1.0), 0.0) for scale in _ALWAYS}
-    within = _lively(laws, passes, always)
+    within = _lively(laws, bounds.allow, always)
     if servo.at_motor and isinstance(own, Controller) and _all_slow(within, own):
         laws += _scaled_laws(own, demands, demands.motor_shapes, integral)
-        within = _lively(laws, passes, always)
+        within = _lively(laws, bounds.allow, always)
+    notched = with_notch(servo) if demands.notch else None
     if isinstance(own, Cascade) and own.velocity_gain is not None and _all_slow(within, own):
-        slow = _slowed_laws(own, demands, integral)
-        slow += _scaled_laws(own, demands, demands.shapes, _LITTLE_INTEGRAL) if max(integral) > 0.0 else []
-        if notched is not None:
-            assert isinstance(notched, Cascade)
-            slow += _slowed_laws(notched, demands, integral)
-        within = list(dict.fromkeys([*within, *_lively(slow, passes, set())]))
+        slow = _slower_cascades(own, notched, demands, integral)
+        within = list(dict.fromkeys([*within, *_lively(slow, bounds.allow, set())]))
         laws += slow
     if notched is not None and (uncertainty.learnt is not None or not within):
         with_it = _scaled_laws(notched, demands, demands.notch_shapes, integral)
-        within += _lively(with_it, passes, set())
+        within += _lively(with_it, bounds.allow, set())
         laws += with_it
     if not within:
-        raise InvalidInput(_none_within(servo, uncertainty, demands, plants, laws))
+        raise InvalidInput(_none_within(servo, uncertainty, demands, bounds.plants, laws))
     return tuple(within)
+
+
+class _Bounds:
+    """Bounds on a law over every plant of an uncertainty; `stopped`: a dead zone may stop its integral."""
+
+    def __init__(self, servo: Plant, uncertainty: Uncertainty, demands: Demands, stopped: bool) -> None:
+        self.plants = plant_set(servo, uncertainty, servo.controller.sample_rate)
+        self._delays = delays_of(servo.controller, uncertainty)
+        self._demands, self._stopped = demands, stopped
+        self._known: dict[AnyController, bool] = {}
+
+    def allow(self, law: AnyController) -> bool:
+        """Tell whether a law is stable on all plants and keeps to the bounds on Ms, without its integral too."""
+        if law not in self._known:
+            stopped = without_integral(law) if integrates(law) and self._stopped else law
+            # A small peak alone says nothing: that of an unstable loop may be small.
+            self._known[law] = (
+                (stopped is law or self.allow(stopped))
+                and _keeps_to(self.plants, law, self._delays, self._demands)
+                and _stable(self.plants, law, self._delays)
+            )
+        return self._known[law]
+
+
+def _slower_cascades(
+    own: Cascade, notched: Controller | Cascade | None, demands: Demands, integral: tuple[float, ...]
+) -> list[AnyController]:
+    """Cascades with a slower velocity loop, with little integral action, and with a notch."""
+    slow = _slowed_laws(own, demands, integral)
+    slow += _scaled_laws(own, demands, demands.shapes, _LITTLE_INTEGRAL) if max(integral) > 0.0 else []
+    if notched is not None:
+        assert isinstance(notched, Cascade)
+        slow += _slowed_laws(notched, demands, integral)
+    return slow
 
 
 def _scaled_laws(

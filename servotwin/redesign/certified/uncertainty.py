@@ -123,7 +123,7 @@ class Uncertainty:
     m: Annotated[
         float, key("m_percent", minimum=0.0, below=1.0, help="Half-width of the mass, relative to the model's.")
     ] = 0.1
-    gap: Annotated[Range, key("gap_deg", minimum=0.0, ordered=True, help="Range of the total gap.")] = (
+    gap: Annotated[Range, key("gap_deg", minimum=0.0, ordered=True, at_load=True, help="Range of the total gap.")] = (
         0.0,
         math.radians(60.0),
     )
