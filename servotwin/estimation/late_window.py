@@ -1,9 +1,11 @@
-"""Windows of late encoders: their readings at the samples whose motion they show."""
+"""Windows as estimators take them: readings of late encoders at the samples whose motion they show, and the angle of a
+motor that has no encoder."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
+from servotwin.estimation.commanded_angle import with_commanded_angle
 from servotwin.estimation.window import Window
 from servotwin.plant.plants import Plant
 from servotwin.plant.signals import Array
@@ -18,8 +20,14 @@ def prompt_window(window: Window, plant: Plant) -> Window:
     """The window with the readings of a plant's late encoders moved to when they were true, in whole samples.
 
     What is left of a delay is at most half a sample. Commands and reference stay; the end is shorter by the longest
-    delay.
+    delay. Where the motor has no encoder its angle comes from the command (`with_commanded_angle`).
+
+    Raises
+    ------
+    InvalidInput
+        The motor's angle is neither measured nor follows from the command.
     """
+    window = with_commanded_angle(window, plant)
     motor, load = plant.sensors.motor.late(window.sample_rate), plant.sensors.load.late(window.sample_rate)
     if plant.at_motor and window.follows_motor(plant.p, within=plant.p * plant.encoder_resolution):
         load = motor
