@@ -2,7 +2,7 @@
 
 The log is a CSV as `servotwin simulate` writes it, read line by line: time_s, and of reference, position, motor's angle
 and command each one of the columns of `SIGNAL_COLUMNS`, converted to SI. `servotwin convert LOG LOG.csv` converts logs
-of other kinds; it needs numpy.
+of other kinds; it needs numpy. The motor's angle may be absent: it is then NaN, for an edge whose motor has no encoder.
 The replay accepts and records parameters, which change nothing: the samples are those of the log.
 """
 
@@ -14,7 +14,7 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import islice
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -25,6 +25,9 @@ from servotwin.errors import InvalidInput
 
 COLUMNS = (("time_s",), *(SIGNAL_COLUMNS[name] for name in ("reference", "theta_m", "position", "voltage")))
 """Columns that are read, by their possible names; the first one that the file has counts."""
+
+_MOTOR = 2
+"""Place of the motor's angle among them, the one that a log may lack."""
 
 _JITTER = 0.05
 """Largest distance of a rounded time stamp from a uniform grid, in sample intervals."""
@@ -98,6 +101,16 @@ class Replay:
     def machine(self) -> str:
         """Name of the log."""
         return self._path.name
+
+    def check_motor_angle(self) -> None:
+        """Refuse a log without the motor's angle, for an edge that records it; raises InvalidInput."""
+        with opened(self._path) as file:
+            first = next(rows(self._path, file), None)
+        if first is not None and first[_MOTOR] != first[_MOTOR]:
+            raise InvalidInput(
+                f"log {self._path}: column {' or '.join(COLUMNS[_MOTOR])} is missing; an edge of a motor without encoder "
+                "has motor_encoder = false in its file"
+            )
 
     def connect(self) -> None:
         """Check the whole log, then begin with its first sample.
@@ -211,25 +224,27 @@ class _Column(NamedTuple):
     unit: Unit
 
 
-def _columns(path: Path, names: list[str]) -> list[_Column]:
-    """The columns that are read."""
-    chosen = []
-    for allowed in COLUMNS:
+def _columns(path: Path, names: list[str]) -> list[_Column | None]:
+    """The columns that are read; None: the motor's angle is absent."""
+    chosen: list[str | None] = []
+    for place, allowed in enumerate(COLUMNS):
         present = next((name for name in allowed if name in names), None)
-        if present is None:
+        if present is None and place != _MOTOR:
             raise InvalidInput(f"log {path}: column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}")
         chosen.append(present)
     reference, position = chosen[1], chosen[3]
+    assert reference is not None
+    assert position is not None
     if unit_of(reference).si != unit_of(position).si:
         raise InvalidInput(f"log {path}: columns {position} and {reference}: must both be lengths or both be angles")
-    return [_Column(names.index(name), unit_of(name)) for name in chosen]
+    return [None if name is None else _Column(names.index(name), unit_of(name)) for name in chosen]
 
 
-def _numbers(path: Path, number: int, cells: list[str], columns: list[_Column]) -> tuple[float, ...]:
+def _numbers(path: Path, number: int, cells: list[str], columns: list[_Column | None]) -> tuple[float, ...]:
     try:
-        values = tuple(unit.to_si(float(cells[place])) for place, unit in columns)
+        values = tuple(nan if at is None else at.unit.to_si(float(cells[at.place])) for at in columns)
     except (ValueError, IndexError):
         values = ()
-    if not values or not all(map(isfinite, values)):
+    if not values or not all(at is None or isfinite(value) for value, at in zip(values, columns, strict=True)):
         raise InvalidInput(f"log {path}: line {number} must hold finite numbers, {len(cells)} cells were found")
     return values

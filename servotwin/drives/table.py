@@ -29,9 +29,15 @@ def control_drive(table: Table, folder: Path) -> ControlDrive:
     return _read(table, folder, CONTROLLED)
 
 
-def supervised_drive(table: Table, folder: Path) -> SupervisedDrive:
-    """Make a drive with its own controller; see `control_drive`."""
-    return _read(table, folder, SUPERVISED)
+def supervised_drive(table: Table, folder: Path, motor_encoder: bool = True) -> SupervisedDrive:
+    """Make a drive with its own controller, see `control_drive`; a log must have the motor's angle if it is measured."""
+    drive = _read(table, folder, SUPERVISED)
+    if motor_encoder and table.values.get("kind") == "replay":
+        from servotwin.drives.replay import Replay
+
+        assert isinstance(drive, Replay)
+        drive.check_motor_angle()
+    return drive
 
 
 def _read(table: Table, folder: Path, kinds: Mapping[str, Callable[..., _Drive]]) -> _Drive:

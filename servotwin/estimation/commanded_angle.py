@@ -34,6 +34,11 @@ def has_commanded_angle(plant: Plant) -> bool:
     )
 
 
+def begins_anew(plant: Plant) -> bool:
+    """True where no window tells the angle's zero from that of another: the angle is the integral of a speed."""
+    return has_commanded_angle(plant) and isinstance(plant, Axis) and isinstance(plant.actuator, VelocityDrive)
+
+
 def check_motor_angle(plant: Plant) -> None:
     """Refuse a machine whose motor's angle is neither measured nor follows from its command.
 
@@ -78,7 +83,7 @@ def with_commanded_angle(window: Window, plant: Plant) -> Window:
         )
     command = window.driven(plant.command_limit).voltage
     assert command is not None
-    angle, first = _angle(plant, window, command), _fading(plant, window.sample_rate)
+    angle, first = _angle(plant, window, command), samples_fading(plant, window.sample_rate)
     kept = {name: values[first:] for name, values in window.channels.items()}
     if window.samples - first < 1:
         raise InvalidInput(
@@ -92,8 +97,9 @@ def with_commanded_angle(window: Window, plant: Plant) -> Window:
     return Window(**kept, theta_m=angle, sample_rate=window.sample_rate, start=start, source=window.source)
 
 
-def _fading(axis: Axis, rate: float) -> int:
-    """Samples at a rate (Hz) in which what a drive did before them fades."""
+def samples_fading(axis: Plant, rate: float) -> int:
+    """Samples at a rate (Hz) in which what a drive did before them fades, of an axis that `has_commanded_angle`."""
+    assert isinstance(axis, Axis)
     if isinstance(axis.actuator, VelocityDrive):
         return math.ceil(rate * axis.actuator.lag * -math.log(_FORGOTTEN))
     assert isinstance(axis.actuator, Stepper)
