@@ -165,7 +165,9 @@ class Sensors:
             name, stated = item.name, getattr(self, item.name)
             if name.startswith("encoder_") and stated not in (None, item.default):
                 unit = f" {item.unit}" if item.unit else ""
-                raise InvalidInput(f"{without} {item.names[0]} = {stated!r}{unit} is of one; leave it out, or give true")
+                raise InvalidInput(
+                    f"{without} {item.names[0]} = {stated!r}{unit} is of one; leave it out, or give motor_encoder = true"
+                )
         if self.feedback == MOTOR:
             raise InvalidInput(f'{without} feedback = "motor" reads it; give feedback = "load", or motor_encoder = true')
 
