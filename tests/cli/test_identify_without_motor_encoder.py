@@ -14,7 +14,7 @@ from servotwin.logs.columns import SignalTable
 from servotwin.logs.log import write_log
 from servotwin.plant.axis import Axis
 
-GAP = math.radians(2.16)
+GAP = math.radians(8.0)
 
 
 def without_encoder(axis: Axis) -> Axis:
@@ -30,7 +30,7 @@ def log_of(folder: Path, axis: Axis, amplitude: float) -> Path:
 
 
 def test_the_log_of_a_stepper_without_encoder_shows_its_gap(tmp_path: Path) -> None:
-    path = log_of(tmp_path, without_encoder(Axis.preset("stepper-stage")), 20e-6)
+    path = log_of(tmp_path, without_encoder(Axis.preset("stepper-stage")), 40e-6)
     (estimate,) = identify(IdentifyOptions(path, None, start=0.0, duration=4.0)).estimates
     assert estimate.ok, estimate.reasons
     assert estimate.interval[0] <= GAP <= estimate.interval[1]

@@ -24,8 +24,8 @@ STAGE = without_encoder(Axis.preset("stepper-stage"))
 
 @pytest.fixture(scope="module")
 def stage_run() -> st.Run:
-    """The stage in steps of 20 um, with a gap of 2.16 degrees."""
-    return st.simulate(STAGE, 2.0, reference=st.SquareWave(20e-6, 4.0 / 3.0), gap=math.radians(2.16))
+    """The stage in steps of 40 um, with a gap of 8.0 degrees."""
+    return st.simulate(STAGE, 2.0, reference=st.SquareWave(40e-6, 4.0 / 3.0), gap=math.radians(8.0))
 
 
 def test_a_window_of_a_motor_without_encoder_has_no_angle(stage_run: st.Run) -> None:
@@ -48,8 +48,8 @@ def test_the_angle_of_a_stepper_comes_from_its_command(stage_run: st.Run) -> Non
 def test_the_gap_of_a_stepper_without_encoder_is_estimated(stage_run: st.Run) -> None:
     estimate = st.estimate_gap(st.Window.from_run(stage_run, start=0.0, duration=2.0), STAGE)
     assert estimate.ok, estimate.reasons
-    assert estimate.interval[0] <= math.radians(2.16) <= estimate.interval[1]
-    assert abs(estimate.gap - math.radians(2.16)) < 0.01 * math.radians(2.16)
+    assert estimate.interval[0] <= math.radians(8.0) <= estimate.interval[1]
+    assert abs(estimate.gap - math.radians(8.0)) < 0.01 * math.radians(8.0)
     assert estimate.model_version == STAGE.version
 
 
