@@ -8,10 +8,14 @@ import pytest
 
 import servotwin as st
 from servotwin.control.cascade import Cascade
+from servotwin.control.controller import Controller
 from servotwin.errors import InvalidInput
 from servotwin.estimation.commanded_angle import with_commanded_angle
+from servotwin.plant.actuator import Stepper
 from servotwin.plant.axis import Axis
+from servotwin.plant.load import LINEAR, Load
 from servotwin.plant.sensors import Sensors
+from servotwin.plant.transmission import Transmission
 
 
 def without_encoder(axis: Axis) -> Axis:
@@ -102,3 +106,30 @@ def test_the_key_is_written_where_it_is_needed_only() -> None:
     assert "motor_encoder = false" in STAGE.dumps()
     assert Axis.loads(STAGE.dumps(), "axis.toml") == STAGE
     assert STAGE.version != Axis.preset("stepper-stage").version
+
+
+def elastic_stage(seed: int) -> tuple[Axis, Axis, st.SquareWave, float]:
+    """A stepper before an elastic screw under integral action; its machine, amplitude's square wave, and gap in rad."""
+    random = np.random.default_rng(seed)
+    load = Load((0.004,), (0.0,), (0.0077,), LINEAR, 0.0, -0.059)
+    law = Controller(0.0, 91.0, 0.0, 1.0, sample_rate=1122.0)
+    sensors = Sensors(0.0, 1.45e-6, motor_encoder=False)
+    axis = Axis(Stepper(2.7e-3), Transmission(0.025, 360.0, 0.24, "held"), load, law, sensors)
+    errors = {"k": 1.0 + 0.05 * random.uniform(-1.0, 1.0), "c": 1.0 + 0.3 * random.uniform(-1.0, 1.0)}
+    return axis, axis.scaled(errors), st.SquareWave(0.125, 6.6), math.radians(18.6)
+
+
+def test_a_motion_one_way_of_a_stepper_behind_an_elastic_screw_is_refused() -> None:
+    axis, plant, reference, gap = elastic_stage(41)
+    run = st.simulate(plant, 6.6, reference=reference, gap=gap, sample_rate=1122.0)
+    estimate = st.estimate_gap(st.Window.from_run(run, start=3.14, duration=1.65), axis)
+    assert not estimate.ok
+    assert "the load moves one way" in estimate.reasons[0] or "one flank" in estimate.reasons[0]
+
+
+def test_a_motion_to_and_fro_shows_its_gap() -> None:
+    axis, plant, reference, gap = elastic_stage(41)
+    run = st.simulate(plant, 6.6, reference=st.SquareWave(0.125, 2.2), gap=gap, sample_rate=1122.0)
+    estimate = st.estimate_gap(st.Window.from_run(run, start=2.0, duration=3.3), axis)
+    assert estimate.ok, estimate.reasons
+    assert estimate.interval[0] <= gap <= estimate.interval[1]
