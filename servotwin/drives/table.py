@@ -31,7 +31,7 @@ def control_drive(table: Table, folder: Path) -> ControlDrive:
 
 
 def supervised_drive(table: Table, folder: Path, motor_encoder: bool = True) -> SupervisedDrive:
-    """Make a drive with its own controller; see `control_drive`. Without an encoder a log may lack the motor's angle."""
+    """Make a drive with its own controller; see `control_drive`. Without `motor_encoder` a log may lack the angle."""
     kinds = SUPERVISED if motor_encoder else {**SUPERVISED, "replay": _replay_without_motor}
     return _read(table, folder, kinds)
 

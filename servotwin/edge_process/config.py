@@ -218,8 +218,8 @@ class EdgeConfig:
         law = None if self.controller is None else law_of(self.controller)
         if not self.agent.motor_encoder and isinstance(law, LinearLaw) and law.reads("y_motor"):
             raise InvalidInput(
-                "motor_encoder = false: the controller reads y_motor, the motor's encoder; give one that reads the load "
-                "only, or motor_encoder = true"
+                "motor_encoder = false: the controller reads y_motor, the motor's encoder; give one that reads the "
+                "load only, or motor_encoder = true"
             )
         if "kind" not in self.drive:
             raise InvalidInput("key 'drive.kind' is missing")

@@ -52,7 +52,8 @@ def check_motor_angle(plant: Plant) -> None:
     assert isinstance(plant, Axis)
     raise InvalidInput(
         f"sensors motor_encoder = false: an estimate of the gap needs the motor's angle, which does not follow from a "
-        f'command in {plant.actuator.unit}; give an encoder of the motor, or an actuator of kind "stepper" or "velocity"'
+        f'command in {plant.actuator.unit}; give an encoder of the motor, or an actuator of kind "stepper" or '
+        '"velocity"'
     )
 
 
@@ -87,8 +88,8 @@ def with_commanded_angle(window: Window, plant: Plant) -> Window:
     kept = {name: values[first:] for name, values in window.channels.items()}
     if window.samples - first < 1:
         raise InvalidInput(
-            f"{window.where}the window lasts {window.duration:.6g} s: must be longer than {first / window.sample_rate:.6g} "
-            "s, in which the drive forgets what it did before"
+            f"{window.where}the window lasts {window.duration:.6g} s: must be longer than "
+            f"{first / window.sample_rate:.6g} s, in which the drive forgets what it did before"
         )
     angle = angle[first:]
     if isinstance(plant.actuator, VelocityDrive):

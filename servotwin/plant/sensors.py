@@ -166,10 +166,13 @@ class Sensors:
             if name.startswith("encoder_") and stated not in (None, item.default):
                 unit = f" {item.unit}" if item.unit else ""
                 raise InvalidInput(
-                    f"{without} {item.names[0]} = {stated!r}{unit} is of one; leave it out, or give motor_encoder = true"
+                    f"{without} {item.names[0]} = {stated!r}{unit} is of one; leave it out, or give "
+                    "motor_encoder = true"
                 )
         if self.feedback == MOTOR:
-            raise InvalidInput(f'{without} feedback = "motor" reads it; give feedback = "load", or motor_encoder = true')
+            raise InvalidInput(
+                f'{without} feedback = "motor" reads it; give feedback = "load", or motor_encoder = true'
+            )
 
     @property
     def motor(self) -> Encoder:
@@ -225,8 +228,8 @@ def check_encoders(plant: Sensed, law: Law) -> None:
     ------
     InvalidInput
         The law reads the load, and the controller acts on the motor's encoder; the law reads the motor, which has no
-        encoder; an encoder's delay is no whole number of
-        the law's samples; a continuous law reads a motor's encoder with an offset or noise.
+        encoder; an encoder's delay is no whole number of the law's samples; a continuous law reads a motor's encoder
+        with an offset or noise.
     """
     if isinstance(law, LinearLaw) and plant.at_motor and law.reads("y_load"):
         raise InvalidInput(
@@ -235,8 +238,8 @@ def check_encoders(plant: Sensed, law: Law) -> None:
         )
     if isinstance(law, LinearLaw) and not plant.sensors.motor_encoder and law.reads("y_motor"):
         raise InvalidInput(
-            "sensors motor_encoder = false: the controller reads y_motor, the motor's encoder, as the velocity loop of a "
-            "cascade does; give one that reads the load only, or motor_encoder = true"
+            "sensors motor_encoder = false: the controller reads y_motor, the motor's encoder, as the velocity loop of "
+            "a cascade does; give one that reads the load only, or motor_encoder = true"
         )
     plant.sensors.check_delays(law.sample_rate)
     motor = plant.sensors.motor

@@ -80,5 +80,3 @@ def test_a_log_without_the_motors_angle_is_replayed_for_it_only(tmp_path: Path) 
     assert block is not None
     assert list(block.position) == pytest.approx([1e-3 * k for k in range(10)])
     assert all(angle != angle for angle in block.theta_m)
-
-

@@ -84,7 +84,8 @@ def test_the_angle_of_a_velocity_drive_comes_from_its_command_but_for_its_begin(
 def test_what_needs_the_motors_encoder_is_refused_without_one(keys: dict[str, object], words: str) -> None:
     with pytest.raises(InvalidInput) as error:
         Sensors(motor_encoder=False, **keys)
-    assert "motor_encoder = false" in str(error.value) and words in str(error.value)
+    assert "motor_encoder = false" in str(error.value)
+    assert words in str(error.value)
     assert "\n" not in str(error.value)
 
 
@@ -128,7 +129,7 @@ def test_a_motion_one_way_of_a_stepper_behind_an_elastic_screw_is_refused() -> N
 
 
 def test_a_motion_to_and_fro_shows_its_gap() -> None:
-    axis, plant, reference, gap = elastic_stage(41)
+    axis, plant, _, gap = elastic_stage(41)
     run = st.simulate(plant, 6.6, reference=st.SquareWave(0.125, 2.2), gap=gap, sample_rate=1122.0)
     estimate = st.estimate_gap(st.Window.from_run(run, start=2.0, duration=3.3), axis)
     assert estimate.ok, estimate.reasons

@@ -30,6 +30,6 @@ def moves_one_way(axis: Axis, position: Array) -> str:
         return ""
     share = 100.0 * min(ways) / max(ways)
     return (
-        f"the load moves one way, and back by {share:.2g} % of it, where a lag of the load looks like another ratio and "
-        "another gap; a window with a motion to and fro would show the gap"
+        f"the load moves one way, and back by {share:.2g} % of it, where a lag of the load looks like another ratio "
+        "and another gap; a window with a motion to and fro would show the gap"
     )
