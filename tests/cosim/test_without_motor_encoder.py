@@ -11,10 +11,15 @@ from typer.testing import CliRunner
 
 import servotwin as st
 from servotwin.cli.app import app
+from servotwin.config.table import parse_toml
 from servotwin.cosim import cosimulate
+from servotwin.cosim.machine import endless
 from servotwin.cosim.scenario import Scenario
+from servotwin.edge_process.config import UNBOOTED, EdgeConfig
+from servotwin.edge_process.config_file import edge_toml, read_config
 from servotwin.errors import InvalidInput
 from servotwin.plant.axis import Axis
+from servotwin.simulation.endless import OpenLoopPlant
 
 SCENARIO = """servo = "axis.toml"
 duration_s = 4.0
@@ -78,3 +83,19 @@ def test_without_its_twin_it_runs_as_with_an_encoder(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match="motor_encoder = false: an estimate of the gap needs the motor's angle"):
         st.estimate_gap(window, axis)
     assert math.isnan(loop.run.measured_theta_m[0])
+
+
+def test_its_edge_and_its_simulated_drive_have_no_angle() -> None:
+    """What enrolment writes comes back, and the machine under the edge's command gives NaN for the angle."""
+    scenario = stage((5, 1)).scenario
+    scenario = scenario.replace(servo=without_encoder(scenario.model))
+    agent = dataclasses.replace(scenario.agent_settings(), boot=UNBOOTED, controller=None)
+    config = EdgeConfig(agent, "control", scenario.law, {"kind": "simulated"}, command_unit="rad")
+    text = edge_toml(config)
+    assert "motor_encoder = false" in text
+    assert read_config(parse_toml(text, "edge.toml")).agent.motor_encoder is False
+    plant = OpenLoopPlant(endless(scenario, 16))
+    plant.hold(0.1)
+    reference, angle, position = plant.sample()
+    assert math.isnan(angle)
+    assert math.isfinite(reference + position)
