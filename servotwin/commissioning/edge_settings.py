@@ -311,6 +311,7 @@ class Commissioning:
             limits=r.limits,
             model_version=self.servo.version,
             window_filter=self._novelty(),
+            motor_encoder=self.servo.sensors.motor_encoder,
             longest_window_s=r.longest_window,
             longest_pre_trigger_s=r.longest_pre_trigger,
             probe=r.probe,

@@ -2,7 +2,7 @@
 
 The log is a CSV as `servotwin simulate` writes it, read line by line: time_s, and of reference, position, motor's angle
 and command each one of the columns of `SIGNAL_COLUMNS`, converted to SI. `servotwin convert LOG LOG.csv` converts logs
-of other kinds; it needs numpy.
+of other kinds; it needs numpy. For an edge whose motor has no encoder the angle may be absent, and is NaN.
 The replay accepts and records parameters, which change nothing: the samples are those of the log.
 """
 
@@ -14,7 +14,7 @@ from array import array
 from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import islice
-from math import isfinite
+from math import isfinite, nan
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
@@ -26,6 +26,9 @@ from servotwin.errors import InvalidInput
 
 COLUMNS = (("time_s",), *(SIGNAL_COLUMNS[name] for name in ("reference", "theta_m", "position", "voltage")))
 """Columns that are read, by their possible names; the first one that the file has counts."""
+
+_MOTOR = 2
+"""Place of the motor's angle among them."""
 
 _JITTER = 0.05
 """Largest distance of a rounded time stamp from a uniform grid, in sample intervals."""
@@ -61,6 +64,8 @@ class Replay:
         Begin again at the end. Between two rounds one sample number is left out, so that the reader sees the break.
     block_s : float
         Length of a block where the reader gives none, s of the log.
+    motor_encoder : bool
+        False: the log may lack the motor's angle, which is then NaN.
     clock, sleep : callable
         Returns monotonic seconds; waits for a number of seconds.
     """
@@ -74,11 +79,12 @@ class Replay:
         speed: float = 1.0,
         loop: bool = False,
         block_s: float = 0.05,
+        motor_encoder: bool = True,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], object] = time.sleep,
     ) -> None:
         self._path, self._speed, self._loop, self._block_s = Path(path), speed, loop, block_s
-        self._clock, self._sleep = clock, sleep
+        self._motor_encoder, self._clock, self._sleep = motor_encoder, clock, sleep
         self._extent = Extent(0, 0.0)
         self._file: TextIO | None = None
         self._rows: Iterator[tuple[float, ...]] = iter(())
@@ -109,7 +115,7 @@ class Replay:
             The log is missing, has a damaged line, lacks a column, or its times are not uniform.
         """
         self.close()
-        self._extent = extent(self._path)
+        self._extent = extent(self._path, self._motor_encoder)
         self._begin()
         self._zero = self._clock() - (self._number / (self.rate * self._speed) if self._speed else 0.0)
 
@@ -146,7 +152,7 @@ class Replay:
     def _begin(self) -> None:
         self.close()
         self._file = opened(self._path)
-        self._rows = rows(self._path, self._file)
+        self._rows = rows(self._path, self._file, self._motor_encoder)
 
 
 def opened(path: Path) -> TextIO:
@@ -167,17 +173,17 @@ def opened(path: Path) -> TextIO:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror})") from None
 
 
-def check_begin(path: Path) -> None:
+def check_begin(path: Path, motor_encoder: bool = True) -> None:
     """Check that a log has its columns and a first sample, without reading it whole; raises InvalidInput."""
     with opened(path) as file:
-        if next(rows(path, file), None) is None:
+        if next(rows(path, file, motor_encoder), None) is None:
             raise InvalidInput(f"log {path}: has no samples")
 
 
-def extent(path: Path) -> Extent:
+def extent(path: Path, motor_encoder: bool = True) -> Extent:
     """Check every sample of a log, and return their number and rate."""
     with opened(path) as file:
-        times = array("d", (row[0] for row in rows(path, file)))
+        times = array("d", (row[0] for row in rows(path, file, motor_encoder)))
     if len(times) < 2:
         raise InvalidInput(f"log {path}: has {len(times)} samples; at least 2 are needed")
     interval = (times[-1] - times[0]) / (len(times) - 1)
@@ -187,8 +193,10 @@ def extent(path: Path) -> Extent:
     return Extent(len(times), float(f"{1.0 / interval:.9g}"))
 
 
-def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
+def rows(path: Path, file: TextIO, motor_encoder: bool = True) -> Iterator[tuple[float, ...]]:
     """Yield (time, reference, theta_m, position, command) of each line: s, m or rad, rad, m or rad, the drive's unit.
+
+    Without an encoder of the motor its angle is NaN.
 
     Raises
     ------
@@ -199,7 +207,7 @@ def rows(path: Path, file: TextIO) -> Iterator[tuple[float, ...]]:
         line, number = file.readline(), 1
         if line.startswith("#"):
             line, number = file.readline(), 2
-        columns = _columns(path, [name.strip() for name in line.split(",")])
+        columns = _columns(path, [name.strip() for name in line.split(",")], motor_encoder)
         for number, line in enumerate(file, number + 1):  # noqa: B020
             yield _numbers(path, number, line.split(","), columns)
     except UnicodeDecodeError as error:
@@ -213,25 +221,30 @@ class _Column(NamedTuple):
     unit: Unit
 
 
-def _columns(path: Path, names: list[str]) -> list[_Column]:
-    """The columns that are read."""
-    chosen = []
-    for allowed in COLUMNS:
+def _columns(path: Path, names: list[str], motor_encoder: bool) -> list[_Column | None]:
+    """The columns that are read; None: the motor's angle, where it has no encoder."""
+    chosen: list[str | None] = []
+    for place, allowed in enumerate(COLUMNS):
+        if place == _MOTOR and not motor_encoder:
+            chosen.append(None)
+            continue
         present = next((name for name in allowed if name in names), None)
         if present is None:
             raise InvalidInput(f"log {path}: column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}")
         chosen.append(present)
     reference, position = chosen[1], chosen[3]
+    assert reference is not None
+    assert position is not None
     if unit_of(reference).si != unit_of(position).si:
         raise InvalidInput(f"log {path}: columns {position} and {reference}: must both be lengths or both be angles")
-    return [_Column(names.index(name), unit_of(name)) for name in chosen]
+    return [None if name is None else _Column(names.index(name), unit_of(name)) for name in chosen]
 
 
-def _numbers(path: Path, number: int, cells: list[str], columns: list[_Column]) -> tuple[float, ...]:
+def _numbers(path: Path, number: int, cells: list[str], columns: list[_Column | None]) -> tuple[float, ...]:
     try:
-        values = tuple(unit.to_si(float(cells[place])) for place, unit in columns)
+        values = tuple(nan if at is None else at.unit.to_si(float(cells[at.place])) for at in columns)
     except (ValueError, IndexError):
         values = ()
-    if not values or not all(map(isfinite, values)):
+    if not values or not all(at is None or isfinite(value) for value, at in zip(values, columns, strict=True)):
         raise InvalidInput(f"log {path}: line {number} must hold finite numbers, {len(cells)} cells were found")
     return values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Annotated, TypeVar
 
@@ -29,9 +30,10 @@ def control_drive(table: Table, folder: Path) -> ControlDrive:
     return _read(table, folder, CONTROLLED)
 
 
-def supervised_drive(table: Table, folder: Path) -> SupervisedDrive:
-    """Make a drive with its own controller; see `control_drive`."""
-    return _read(table, folder, SUPERVISED)
+def supervised_drive(table: Table, folder: Path, motor_encoder: bool = True) -> SupervisedDrive:
+    """Make a drive with its own controller; see `control_drive`. Without `motor_encoder` a log may lack the angle."""
+    kinds = SUPERVISED if motor_encoder else {**SUPERVISED, "replay": _replay_without_motor}
+    return _read(table, folder, kinds)
 
 
 def _read(table: Table, folder: Path, kinds: Mapping[str, Callable[..., _Drive]]) -> _Drive:
@@ -50,10 +52,10 @@ def _variable(_table: Table, _name: str, variable: str, _folder: Path) -> str:
     return secret_in(os.environ, variable)
 
 
-def _log(table: Table, name: str, path: Path, folder: Path) -> Path:
+def _log(table: Table, name: str, path: Path, folder: Path, motor_encoder: bool = True) -> Path:
     from servotwin.drives.replay import check_begin
 
-    check_begin(readable(table, name, path, folder))
+    check_begin(readable(table, name, path, folder), motor_encoder)
     return path
 
 
@@ -101,6 +103,18 @@ def _replay(
     from servotwin.drives.replay import Replay
 
     return Replay(log, speed, loop, block_s)
+
+
+def _replay_without_motor(
+    log: Annotated[Path, key(parse=partial(_log, motor_encoder=False), help="CSV; the motor's angle may be absent.")],
+    speed: Annotated[float, key(minimum=0.0, help="Seconds of the log per second; 0: as fast as it is read.")] = 1.0,
+    loop: Annotated[bool, key(help="Begin again at the end.")] = False,
+    block_s: Annotated[float, key(above=0.0, help="Length of a block.")] = 0.05,
+) -> SupervisedDrive:
+    """Recorded log of a motor without encoder."""
+    from servotwin.drives.replay import Replay
+
+    return Replay(log, speed, loop, block_s, motor_encoder=False)
 
 
 def _opcua(

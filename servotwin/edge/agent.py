@@ -19,7 +19,7 @@ from typing import NamedTuple
 from servotwin.control.gains import gains_of, with_gains
 from servotwin.control.laws import AnyController
 from servotwin.edge.guard import Instant
-from servotwin.edge.outlet import CHANNELS, LocalOutlet, Outlet
+from servotwin.edge.outlet import LocalOutlet, Outlet, recorded_channels
 from servotwin.edge.parameters import Parameters
 from servotwin.edge.probe import ProbingMove
 from servotwin.edge.recorder import TIMED, Cut, Floats, Recorder, as_floats
@@ -89,7 +89,7 @@ class Agent:
         self.settings = settings
         self.windows_cut = 0
         self.outlet = LocalOutlet(settings, outbox) if outlet is None else outlet
-        self._recorder = recorder(tuple(CHANNELS), settings.kept_samples)
+        self._recorder = recorder(recorded_channels(settings.motor_encoder), settings.kept_samples)
         self._supervisor = Supervisor(settings, self._recorder, store)
         if self.outlet.unacknowledged:
             self._supervisor.window_sent(0.0)
@@ -146,8 +146,14 @@ class Agent:
         return Counter(self.outlet.dropped)
 
     def absorb(self, reference: float, theta_m: float, position: float, voltage: float) -> list[ScheduledMessage]:
-        """Take one sample (m, rad, m, V); return the letters to be sent now."""
-        self._recorder.append(reference, theta_m, position, voltage)
+        """Take one sample (m, rad, m, V); return the letters to be sent now.
+
+        Without an encoder of the motor its angle does not count, here and in blocks.
+        """
+        if self.settings.motor_encoder:
+            self._recorder.append(reference, theta_m, position, voltage)
+        else:
+            self._recorder.append(reference, position, voltage)
         if reference != self._expected:
             self._reference_changed(reference)
         return self._act() if self._recorder.samples >= self._deadline else []
@@ -156,7 +162,8 @@ class Agent:
         self, reference: Floats, theta_m: Floats, position: Floats, voltage: Floats
     ) -> list[ScheduledMessage]:
         """Take equally long blocks of samples: the same effect as one by one."""
-        blocks = [as_floats(block) for block in (reference, theta_m, position, voltage)]
+        motor = (theta_m,) if self.settings.motor_encoder else ()
+        blocks = [as_floats(block) for block in (reference, *motor, position, voltage)]
         if len({len(block) for block in blocks}) != 1:
             raise InvalidInput(f"blocks of {[len(block) for block in blocks]} samples: must be equally long")
         sent: list[ScheduledMessage] = []

@@ -28,7 +28,15 @@ from servotwin.messages import (
 from servotwin.messages.checks import all_finite
 
 CHANNELS = {"reference": "m", "theta_m": "rad", "position": "m", "voltage": "V"}
-"""Recorded channels, in this order, with their units."""
+"""Channels, in this order, with their units."""
+
+MOTOR = "theta_m"
+
+
+def recorded_channels(motor_encoder: bool) -> tuple[str, ...]:
+    """Names of the channels that an edge records: all, or all that are measured without an encoder of the motor."""
+    return tuple(name for name in CHANNELS if motor_encoder or name != MOTOR)
+
 
 MAX_CHANGES = 256
 """Reference changes listed per window; the reference channel has them all."""
@@ -42,7 +50,9 @@ def pack(cut: Cut, settings: AgentSettings, response_version: int | None = None)
     InvalidMessage
         A sample is not finite.
     """
-    packed = (_packed(name, values, settings.fine_angle) for name, values in cut.signals.items())
+    # Without an encoder the twin computes the motor's angle from the command, whose rounding it would integrate.
+    fine = "voltage" if not settings.motor_encoder else MOTOR if settings.fine_angle else ""
+    packed = (_packed(name, values, name == fine) for name, values in cut.signals.items())
     channels = tuple(chain.from_iterable(packed))
     return WindowMessage(
         servo=settings.servo,
@@ -65,8 +75,8 @@ def is_finite(cut: Cut) -> bool:
     return all(map(all_finite, cut.signals.values()))
 
 
-def _packed(name: str, values: "array[float]", fine_angle: bool) -> tuple[Channel, ...]:
-    if fine_angle and name == "theta_m":
+def _packed(name: str, values: "array[float]", fine: bool) -> tuple[Channel, ...]:
+    if fine:
         return pack_finely(name, CHANNELS[name], values)
     return (pack_channel(name, CHANNELS[name], values),)
 

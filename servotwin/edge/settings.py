@@ -127,6 +127,13 @@ class AgentSettings:
         key(help="Probing moves of the reference that the twin may request; none where absent."),
     ] = None
     window_filter: WindowFilterSettings | None = None
+    motor_encoder: Annotated[
+        bool,
+        key(
+            later=True,
+            help="false: the motor has no encoder, and windows have no theta_m; the command is then sent with 32 bits.",
+        ),
+    ] = True
     units: OwnUnits = field(default=VOLTS_METRES, compare=False)
 
     def __post_init__(self) -> None:
@@ -147,6 +154,11 @@ class AgentSettings:
         self._check_notch()
         self._check_ranges()
         if self.window_filter is not None:
+            if not self.motor_encoder:
+                raise InvalidInput(
+                    "agent motor_encoder = false: [novelty], which compares the motor's angle with the load, needs an "
+                    "encoder of the motor; leave it out"
+                )
             self.window_filter.check(self.sample_rate)
         fallback = self.supervision.fallback
         if self.controller is None and fallback is not None and fallback.setting.gains is not None:

@@ -15,7 +15,8 @@ from servotwin.config.keys import check, key, settings
 from servotwin.config.own_units import COMMANDS, POSITIONS, OwnUnits
 from servotwin.config.table import Table, of_key
 from servotwin.config.toml import values_of
-from servotwin.control.laws import AnyController
+from servotwin.control.laws import AnyController, law_of
+from servotwin.control.linear_law import LinearLaw
 from servotwin.control.running_law import RunningLaw
 from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
@@ -216,6 +217,12 @@ class EdgeConfig:
         if self.role == "control" and self.law_rate != self.agent.sample_rate:
             allowed = f"must be that of the samples, {self.agent.sample_rate!r} Hz"
             raise InvalidInput(f"controller sample_rate_hz = {self.law_rate!r} Hz: {allowed}")
+        law = None if self.controller is None else law_of(self.controller)
+        if not self.agent.motor_encoder and isinstance(law, LinearLaw) and law.reads("y_motor"):
+            raise InvalidInput(
+                "motor_encoder = false: the controller reads y_motor, the motor's encoder; give one that reads the "
+                "load only, or motor_encoder = true"
+            )
         if "kind" not in self.drive:
             raise InvalidInput("key 'drive.kind' is missing")
 

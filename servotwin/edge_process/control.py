@@ -9,6 +9,9 @@ from servotwin.edge.drive import ControlDrive, DriveSample
 from servotwin.edge.parameters import Parameters
 from servotwin.edge_process.edge import EdgeRuntime
 
+_UNREAD = 0.0
+"""rad, angle of a motor without encoder: no law reads it there, and it is not recorded."""
+
 
 class GuardedLaw:
     """The law in force and its state, guarded against samples that are not finite.
@@ -77,7 +80,7 @@ class ControlRole:
         self.law = GuardedLaw(self._law(self._applied), round(sensor.hold_s * rate), sensor.safe_voltage)
         self._safe = sensor.safe_voltage
         self._machine, self._drive_lost = drive.machine, False
-        self._reference = edge.config.agent.reference
+        self._reference, self._motor_encoder = edge.config.agent.reference, edge.config.agent.motor_encoder
 
     def step(self) -> bool:
         """Control one sample; False: the run is over. Raises `DriveLost`."""
@@ -86,6 +89,8 @@ class ControlRole:
         began = self._edge.clock()
         if sample is None:
             return False
+        if not self._motor_encoder:
+            sample = sample._replace(theta_m=_UNREAD)
         if sample.number != self._edge.due or self._drive_lost:
             self._jumped(sample.number)
         self._edge.due = sample.number + 1

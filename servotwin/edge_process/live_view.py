@@ -14,7 +14,7 @@ from math import isfinite
 from threading import Event
 from typing import Protocol
 
-from servotwin.edge.outlet import CHANNELS
+from servotwin.edge.outlet import CHANNELS, recorded_channels
 from servotwin.edge_process.shared_samples import SampleReader
 from servotwin.link.claim import HeldClaim
 from servotwin.link.transport import Refused, Unreachable
@@ -130,7 +130,8 @@ class LiveView:
                 self.counts["columns skipped"] += len(columns) + 1
                 first, columns = number + 1, []
             else:
-                columns.append(live_column(dict(zip(CHANNELS, read.channels, strict=True))))
+                names = recorded_channels(len(read.channels) == len(CHANNELS))
+                columns.append(live_column(dict(zip(names, read.channels, strict=True))))
         self._next = complete
         return LiveColumns(self._servo, self._recorded, first, self._width / self._rate, tuple(columns))
 

@@ -104,7 +104,7 @@ def _drive_of(config: EdgeConfig, path: Path) -> Drive:
     """Make the drive of the edge's file, not connected yet; refuse probing moves that it cannot make."""
     if config.role == "control":
         return table.control_drive(config.drive_table, config.folder)
-    drive = table.supervised_drive(config.drive_table, config.folder)
+    drive = table.supervised_drive(config.drive_table, config.folder, config.agent.motor_encoder)
     if config.agent.probe is not None and not drive.can_move:
         raise InvalidInput(f"{path}: edge.probe: this drive cannot move its reference; leave the table out")
     return drive

@@ -129,7 +129,8 @@ def compare_controller(window: Window, controller: AnyController, tolerance: flo
 def _compared_linear(window: Window, law: Cascade | LinearLaw, tolerance: float) -> ControllerComparison | None:
     """Compare as `compare_controller`, with a law that reads the motor's angle too."""
     window = at_ticks(window, law)
-    inputs, running, made = inputs_of(window), at_rate(law, window.sample_rate), None
+    running, made = at_rate(law, window.sample_rate), None
+    inputs = None if running is None else inputs_of(window, running)
     if inputs is None or running is None or window.voltage is None or len(inputs) < 2 * _FEWEST_BLOCKS + _DELAYS:
         return None
     spreads = np.array([0.0, *(_noise(each) + _rounding(each) for each in inputs.T[1:])])

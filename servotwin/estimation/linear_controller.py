@@ -182,8 +182,11 @@ def _moved(law: LinearLaw, state: LinearState, by: Array) -> LinearState:
     return state._replace(states=states, offset=state.offset + float(by[0]))
 
 
-def inputs_of(window: Window) -> Array | None:
-    """Reference, motor's angle and position of a window (n, 3); None where one was not recorded."""
-    channels = window.reference, window.theta_m, window.measured_position
+def inputs_of(window: Window, law: LinearLaw) -> Array | None:
+    """Reference, motor's angle and position of a window (n, 3); None where one that the law reads was not recorded."""
+    motor = window.theta_m
+    if motor is None and not law.reads("y_motor"):
+        motor = np.zeros(window.samples)
+    channels = window.reference, motor, window.measured_position
     present = [channel for channel in channels if channel is not None]
     return np.column_stack(present) if len(present) == len(channels) else None

@@ -131,7 +131,9 @@ class Window:
         """
         begin, rate = float(run.time[0]), run.sample_rate
         part = _samples("run: ", begin, rate, run.time.size, start, duration)
-        channels: dict[str, Any] = {name: run.measured(name)[part] for name in CHANNELS}
+        measured = {name: run.measured(name)[part] for name in CHANNELS}
+        # Without an encoder there is no reading.
+        channels: dict[str, Any] = {name: v for name, v in measured.items() if not np.isnan(v).all()}
         return cls(**channels, sample_rate=rate, start=begin + part.start / rate)
 
     def follows_motor(self, ratio: float, within: float = 0.0) -> bool:

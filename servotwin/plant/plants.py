@@ -129,7 +129,8 @@ PLANT_KEY = key(
 
 
 def prompt_plant(plant: _Plant) -> _Plant:
-    """The plant with encoders that are not late."""
-    if not isinstance(plant, Axis) or plant.sensors.encoder_delay == plant.sensors.position_delay == 0.0:
+    """The plant with encoders that are not late, and one of the motor: what windows are of once they are prompt."""
+    if not isinstance(plant, Axis):
         return plant
-    return replace(plant, sensors=replace(plant.sensors, encoder_delay=0.0, position_delay=0.0))
+    sensors = replace(plant.sensors, encoder_delay=0.0, position_delay=0.0, motor_encoder=True)
+    return plant if sensors == plant.sensors else replace(plant, sensors=sensors)

@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Protocol
 
-from servotwin.config.keys import check, key, settings
+from servotwin.config.keys import check, items_of, key, settings
 from servotwin.control.laws import Law
 from servotwin.control.linear_law import LOAD, MOTOR, LinearLaw
 from servotwin.errors import InvalidInput
@@ -140,9 +140,15 @@ class Sensors:
             help="Counts of a rotary load's encoder, in place of its resolution.",
         ),
     ] = None
+    motor_encoder: Annotated[
+        bool,
+        key(later=True, help="false: the motor has no encoder, and its angle is not measured; the load's encoder is."),
+    ] = True
 
     def __post_init__(self) -> None:
         check(self)
+        if not self.motor_encoder:
+            self._check_absent()
         for name in ("encoder", "position"):
             counts, resolution = getattr(self, f"{name}_counts"), f"{name}_resolution"
             if counts is not None and getattr(self, resolution) != 0.0:
@@ -151,6 +157,22 @@ class Sensors:
             object.__setattr__(self, resolution, float(value))
             # One way to hold it: equal sensors compare equal, whichever key described them.
             object.__setattr__(self, f"{name}_counts", None)
+
+    def _check_absent(self) -> None:
+        """Refuse what is stated of the motor's encoder, or asked of it, where there is none."""
+        without = "sensors motor_encoder = false: the motor has no encoder, and"
+        for item in items_of(type(self)):
+            name, stated = item.name, getattr(self, item.name)
+            if name.startswith("encoder_") and stated not in (None, item.default):
+                unit = f" {item.unit}" if item.unit else ""
+                raise InvalidInput(
+                    f"{without} {item.names[0]} = {stated!r}{unit} is of one; leave it out, or give "
+                    "motor_encoder = true"
+                )
+        if self.feedback == MOTOR:
+            raise InvalidInput(
+                f'{without} feedback = "motor" reads it; give feedback = "load", or motor_encoder = true'
+            )
 
     @property
     def motor(self) -> Encoder:
@@ -205,13 +227,19 @@ def check_encoders(plant: Sensed, law: Law) -> None:
     Raises
     ------
     InvalidInput
-        The law reads the load, and the controller acts on the motor's encoder; an encoder's delay is no whole number of
-        the law's samples; a continuous law reads a motor's encoder with an offset or noise.
+        The law reads the load, and the controller acts on the motor's encoder; the law reads the motor, which has no
+        encoder; an encoder's delay is no whole number of the law's samples; a continuous law reads a motor's encoder
+        with an offset or noise.
     """
     if isinstance(law, LinearLaw) and plant.at_motor and law.reads("y_load"):
         raise InvalidInput(
             'sensors feedback = "motor": the controller reads y_load, the load\'s encoder; the feedback must be '
             '"load", or on = "motor" in [controller] of a cascade'
+        )
+    if isinstance(law, LinearLaw) and not plant.sensors.motor_encoder and law.reads("y_motor"):
+        raise InvalidInput(
+            "sensors motor_encoder = false: the controller reads y_motor, the motor's encoder, as the velocity loop of "
+            "a cascade does; give one that reads the load only, or motor_encoder = true"
         )
     plant.sensors.check_delays(law.sample_rate)
     motor = plant.sensors.motor

@@ -162,7 +162,7 @@ class OpenLoopPlant:
 
     def _angle(self, angle: float) -> float:
         """Reading of the motor's encoder at the present sample, where the motor has an angle."""
-        if self._machine.simulation.readings is None:
+        if self._machine.simulation.readings is None and self._engine.servo.sensors.motor_encoder:
             return _rounded(angle, self._finest[0])
         return float(self._machine.measured("theta_m", self.index, self.index + 1)[0])
 

@@ -178,7 +178,12 @@ class Readings:
 def motor_readings(
     servo: Plant, readings: Readings | None, channel: Callable[[str, int, int], Array], first: int, last: int
 ) -> Array:
-    """(last - first,) rad, the motor's encoder at samples first .. last - 1; `channel` gives what was simulated."""
+    """(last - first,) rad, the motor's encoder at samples first .. last - 1; `channel` gives what was simulated.
+
+    NaN where the motor has no encoder.
+    """
+    if not servo.sensors.motor_encoder:
+        return np.full(last - first, np.nan)
     if readings is None or last == first:
         return quantised(channel("theta_m", first, last), servo.encoder_resolution)
     every = readings.every

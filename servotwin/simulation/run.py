@@ -105,7 +105,7 @@ class Run:
 
     @property
     def measured_theta_m(self) -> Array:
-        """Output of the motor's encoder, rad."""
+        """Output of the motor's encoder, rad; NaN where it has none."""
 
         def channel(name: str, first: int, last: int) -> Array:
             return self.theta_m[first:last] if name == "theta_m" else self.channel(name, first, last)
@@ -157,17 +157,18 @@ class Run:
     def columns(self) -> dict[str, Array]:
         """Signals by name with their unit, as log files name them; each ``(N,)``.
 
-        Positions of a rotary axis end with ``_rad``, and the command with its actuator's unit.
+        Positions of a rotary axis end with ``_rad``, and the command with its actuator's unit. The motor's angle is
+        absent where it has no encoder: who reads the log would take it for a reading.
         """
         position, command = position_unit(self.servo).si, command_unit(self.servo).lower()
         command = f"command_{command.replace(' ', '_').replace('/', '_per_')}"
+        motor = {"theta_m_rad": self.theta_m, "measured_theta_m_rad": self.measured_theta_m}
         return {
             "time_s": self.time,
             f"position_{position}": self.position,
             f"measured_position_{position}": self.measured_position,
             f"reference_{position}": self.reference,
-            "theta_m_rad": self.theta_m,
-            "measured_theta_m_rad": self.measured_theta_m,
+            **(motor if self.servo.sensors.motor_encoder else {}),
             "theta_d_rad": self.theta_d,
             "voltage_v" if command == "command_v" else command: self.voltage,
             "gap_rad": self.gap,

@@ -15,6 +15,7 @@ from servotwin.control.laws import AnyController
 from servotwin.errors import InvalidInput
 from servotwin.estimation import motor_side, output_error, whitened
 from servotwin.estimation.axis_model import servo_for
+from servotwin.estimation.commanded_angle import begins_anew, check_motor_angle
 from servotwin.estimation.controller import ControllerComparison, compare_controller
 from servotwin.estimation.disturbance import Disturbance, nothing_known
 from servotwin.estimation.estimate import GapEstimate, GapStatus, no_estimate
@@ -84,6 +85,7 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
     rate at which the gap may grow within the window and, where the window alone shows too little, the encoder's offset.
     """
     settings, version, read = settings.on(servo), servo.version, servo
+    check_motor_angle(servo)
     servo = prompt_plant(servo)
     model = servo_for(servo)
     # A file without a table [estimator] gives the defaults of its method.
@@ -117,7 +119,11 @@ def estimator_of(servo: Plant, settings: TwinSettings) -> Estimator:
         return replace(made, machine=other.machine) if other.ok else made
 
     def estimate(window: Window, expected: Expectation) -> GapEstimate:
-        return replace(of_model(window, expected), model_version=version)
+        made = of_model(window, expected)
+        if begins_anew(read):
+            # Places of one window are none of the next.
+            made = replace(made, offset=None, contact=None)
+        return replace(made, model_version=version)
 
     return of_model if model is servo else estimate
 

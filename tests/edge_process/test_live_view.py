@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin.edge.agent import Agent
-from servotwin.edge.outlet import CHANNELS
+from servotwin.edge.outlet import CHANNELS, recorded_channels
 from servotwin.edge.recorder import Recorder
 from servotwin.edge_process.config import TwinLink
 from servotwin.edge_process.live_view import LiveView, live_column
@@ -131,6 +131,17 @@ def test_columns_flow_only_while_somebody_watches() -> None:
         assert (third.boot, third.first, third.width) == (1, 2, 0.1)
         assert third.columns == ((20.0, 29.0, 1.0, 1.0, -29.0, -20.0), (30.0, 39.0, 1.0, 1.0, -39.0, -30.0))
         assert (fourth.first, len(fourth.columns)) == (4, 1)
+
+
+def test_columns_are_those_of_the_load_where_the_motor_has_no_encoder() -> None:
+    with Memory() as memory:
+        recorder, link = memory.writer.recorder(recorded_channels(motor_encoder=False), 100), Link(True, True)
+        live = view(link, memory)
+        live.step()
+        for k in range(10):
+            recorder.append(k + 1.0, float(k), -float(k))
+        live.step()
+        assert link.sent[1].columns == ((0.0, 9.0, 1.0, 1.0, -9.0, 0.0),)
 
 
 def test_what_was_overwritten_is_skipped_and_the_newest_is_sent() -> None:

@@ -113,6 +113,26 @@ def update(version: int, tolerance: float, sequence: int = 0, boot: str = "b0") 
     return Update("axis-1", version, version - 1, (boot, sequence), 0.0, *known, "OK", Setting(tolerance), 1e6)
 
 
+def test_without_an_encoder_the_motors_angle_is_neither_read_nor_recorded(far: "LinkEnd") -> None:
+    """A cascade over a drive in velocity mode; the drive has NaN for the angle that nothing measures."""
+    box = PipeOutlet(True)
+    box.connect(far.near)
+    law = replace(CASCADE, velocity_gain=None, integral_time=None)
+    agent = replace(CONFIG.agent, motor_encoder=False)
+    edge = edge_of(box, replace(CONFIG, agent=agent, controller=law))
+    given = [DriveSample(k, 1e-3, math.nan, 1e-5 * k) for k in range(10)]
+    role, running = ControlRole(edge, ScriptedDrive([*given])), RunningLaw(law, 0.0)
+    state = running.start(0.0, 0.0)
+    for sample in given:
+        role.step()
+        state = running.tick(state, sample.reference, 7.0, sample.position)  # whatever the angle
+        assert role.law.voltage == command_of(state) != 0.0
+    assert not edge.counts
+    exchange_all(box)
+    (window,) = (frame for frame in far.received() if isinstance(frame, frames.WindowFrame))
+    assert set(window.signals) == {"reference", "position", "voltage"}
+
+
 def test_an_update_changes_the_law_without_a_jump_of_the_voltage(far: LinkEnd) -> None:
     box = PipeOutlet(True)
     box.connect(far.near)

@@ -64,10 +64,12 @@ def test_the_paper_s_servo_made_of_parts_has_the_same_estimate() -> None:
     assert found.load.k == pytest.approx(PARTS.load.k, rel=1e-3)
 
 
-def test_an_axis_s_angle_is_computed_from_the_voltage_of_the_paper_s_motor() -> None:
+@pytest.mark.parametrize("motor_encoder", [True, False])
+def test_an_axis_s_angle_is_computed_from_the_voltage_of_the_paper_s_motor(motor_encoder: bool) -> None:
     seen = paper_window(sample_rate=5000.0)
     window = Window(seen.position, voltage=seen.voltage, sample_rate=5000.0)
-    found = st.estimate_jointly(window, PARTS.scaled({"k_B": 1.02}), free=("k_B",))
+    axis = PARTS.replace(sensors=dataclasses.replace(PARTS.sensors, motor_encoder=motor_encoder))
+    found = st.estimate_jointly(window, axis.scaled({"k_B": 1.02}), free=("k_B",))
     assert found.gap.ok, found.gap.reasons
     assert found.gap.gap == pytest.approx(0.2, abs=1e-3)
     assert isinstance(found.servo, Axis)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from servotwin.errors import InvalidInput
 from servotwin.estimation.axis_model import has_servo, servo_of
+from servotwin.estimation.commanded_angle import has_commanded_angle
 from servotwin.estimation.core.decimation import shortest_for
 from servotwin.estimation.core.family import InputHold
 from servotwin.estimation.joint.axis import WIDE, estimate_axis
@@ -46,7 +47,7 @@ from servotwin.estimation.joint.verdict import (
     mismatched,
     window_estimate,
 )
-from servotwin.estimation.late_window import prompt_window
+from servotwin.estimation.late_window import on_time, prompt_window
 from servotwin.estimation.learning.trend import Prior
 from servotwin.estimation.output_error.settings import OutputErrorSettings
 from servotwin.estimation.whitened.channels import faults, motor_angle
@@ -191,7 +192,9 @@ def estimate_jointly(
         axis whose angle cannot be computed from the command; several windows of a load with friction that the gap
         holds.
     """
-    windows = tuple(prompt_window(each, servo) for each in _windows(window))
+    # A DC motor's angle is then part of the fit.
+    ready = prompt_window if servo.sensors.motor_encoder or has_commanded_angle(servo) else on_time
+    windows = tuple(ready(each, servo) for each in _windows(window))
     if isinstance(servo, Axis):
         return _of_axis(windows, servo, free, prior, settings)
     return _of_servo(windows, servo, free, prior, _checked_settings(settings, JointSettings) or JointSettings())

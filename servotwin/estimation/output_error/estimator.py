@@ -25,6 +25,7 @@ from servotwin.estimation.output_error.flank_pair import with_contact
 from servotwin.estimation.output_error.held_chain import HeldChainModel, MovingChain, follows, lever
 from servotwin.estimation.output_error.learnt_shaft import ShaftReading, adapted_shaft, is_learnt, shaft_reading
 from servotwin.estimation.output_error.models import FRICTION_PARTS, MotionModel, Priors, ShaftModel
+from servotwin.estimation.output_error.one_way import moves_one_way
 from servotwin.estimation.output_error.play_model import PlayModel
 from servotwin.estimation.output_error.possible import PossibleHalf, possible_half
 from servotwin.estimation.output_error.problem import Problem
@@ -149,6 +150,8 @@ def fitted(
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=(*wrong, *verdict.reasons))
     if verdict.status is GapStatus.OK and other:
         verdict = JudgedFit(GapStatus.MODEL_MISMATCH, reasons=other)
+    if verdict.status is GapStatus.OK and (alike := moves_one_way(axis, window.position)):
+        verdict = JudgedFit(GapStatus.UNIDENTIFIABLE, reasons=(alike,))
     stated = _stated(blank, found, verdict, unit)
     told = _with_machine(stated, found, possible, settings, machine)
     return FittedWindow(told, found, possible, settings if verdict.one_flank else None)
