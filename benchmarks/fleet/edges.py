@@ -12,24 +12,33 @@ import sys
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
 from benchmarks.fleet.line import HttpConnection
 from benchmarks.fleet.plan import LoadPlan, LoadReport, LoadStart, decode_load, shares
+from servotwin.link.http import WAITING
 from servotwin.link.seal import Sealed
+from servotwin.link.window_order import WindowOrder
 from servotwin.messages import Reason, Receipt, Update, WindowMessage, decode, encode
 
 TAKEN, LATER = (200, 201, 202), (429, 503)
-FRESH_S = 10.0
-"""s after the end of an outage after which the newest windows go first, as `servotwin.link.session` has it."""
 PAUSE = 0.2
 """s after which a request that was put off is made again."""
 PATIENCE, ANSWER_S = 600.0, 120.0
 """s that windows may wait once no more fall due, and that a turn may take."""
 
 _sealed = msgspec.msgpack.Decoder(list[bytes])
+
+
+class DueWindow(NamedTuple):
+    """A window of an edge that is due: its number, and when it fell due (s)."""
+
+    sequence: int
+    due: float
 
 
 @dataclass
@@ -42,9 +51,16 @@ class LoadEdge:
     place, tuned : int
         Index of its gap in the stock, and of the gap that the parameters in force are for.
     version, sequence, serial : int
-        Of the parameters in force, of its next window, of the last message that it took.
+        Of the parameters in force, of the window that falls due next, of the last message that it took.
     receipts : list of Receipt
         Not yet sent.
+    waiting : deque of DueWindow
+        Not yet taken by the twin, the oldest first, without the one that is on its way.
+    order : WindowOrder
+        As of an edge's sender.
+    newest : int
+        Newest window that the twin has taken.
+    on_its_way : DueWindow or None
     """
 
     name: str
@@ -54,6 +70,40 @@ class LoadEdge:
     sequence: int = 0
     serial: int = 0
     receipts: list[Receipt] = field(default_factory=list)
+    waiting: deque[DueWindow] = field(default_factory=deque)
+    order: WindowOrder = field(default_factory=WindowOrder)
+    newest: int = -1
+    on_its_way: DueWindow | None = None
+    _fresh: bool = False
+
+    def add(self, due: float) -> DueWindow:
+        """Make the next window, due at a time (s)."""
+        self.sequence += 1
+        return DueWindow(self.sequence - 1, due)
+
+    def next(self, now: float) -> DueWindow | None:
+        """Take the window to be sent out of those that wait; None: none may be sent now."""
+        if self.on_its_way is not None or not self.waiting:
+            return None
+        newest = self.waiting[-1] if self.waiting[-1].sequence > self.newest else None
+        chosen = self.order.next(now, self.waiting[0], newest, len(self.waiting) - 1)
+        if chosen is not None:
+            self.waiting.remove(chosen)
+        self.on_its_way, self._fresh = chosen, chosen == newest
+        return chosen
+
+    def put_back(self) -> None:
+        """Put the window on its way back."""
+        assert self.on_its_way is not None
+        self.waiting, self.on_its_way = deque(sorted([*self.waiting, self.on_its_way])), None
+
+    def taken(self, now: float, pause: float) -> None:
+        """Note that the twin has the window on its way, and the pause that it asks for before older ones, s."""
+        assert self.on_its_way is not None
+        sent, self.on_its_way = self.on_its_way, None
+        if self._fresh:
+            self.newest = sent.sequence
+        self.order.taken(now, self._fresh, len(self.waiting), pause)
 
 
 @dataclass
@@ -68,6 +118,7 @@ class LoadCounts:
     bytes: int = 0
     waited: int = 0
     latency: list[float] = field(default_factory=list)
+    latency_after: list[float] = field(default_factory=list)
     late: list[float] = field(default_factory=list)
 
 
@@ -90,13 +141,10 @@ class EdgeLoad:
         plan, count = load.plan, len(self.places)
         self.edges = [LoadEdge(f"ax-{n:05d}", n % count, n % count, versions[n % count]) for n in range(plan.servos)]
         self.counts = LoadCounts()
-        self._issued, self._refreshed = 0, False
-        self._pending: deque[tuple[LoadEdge, float]] = deque()
-
-    @property
-    def waiting(self) -> int:
-        """Windows that are due and not sent."""
-        return len(self._pending)
+        self._issued, self._cut = 0, False
+        self._ready: deque[LoadEdge] = deque()
+        self._paused: list[tuple[float, str, LoadEdge]] = []
+        self.waiting = 0
 
     def add_due(self, now: float) -> None:
         """Queue the windows whose time has come."""
@@ -104,41 +152,60 @@ class EdgeLoad:
         most = min(int(since * plan.rate) + 1, round(plan.duration * plan.rate)) if plan.rate > 0.0 else 0
         while self._issued < most:
             edge = self.edges[self._issued % plan.servos]
-            self._pending.append((edge, self.begin + self._issued / plan.rate))
+            edge.waiting.append(edge.add(self.begin + self._issued / plan.rate))
+            self._ready.append(edge)
+            self.waiting += 1
             self._issued += 1
-        self.counts.waited = max(self.counts.waited, len(self._pending))
+        self.counts.waited = max(self.counts.waited, self.waiting)
 
-    def take(self, now: float) -> tuple[LoadEdge, float] | None:
-        """Take the next window to be sent, and its due time; None: not now."""
+    def take(self, now: float) -> LoadEdge | None:
+        """Take the next edge that has a window to be sent, `on_its_way`; None: not now."""
         plan, since = self.plan, now - self.begin
         if self.cut(now):
+            if not self._cut:
+                self._cut = True
+                for edge in self.edges:
+                    edge.order.out_of_reach()
             return None
-        if not self._refreshed and 0.0 < plan.outage[1] <= since - FRESH_S:
-            self._refresh()
-        if self._pending:
-            return self._pending.popleft()
-        if plan.rate == 0.0:
-            if since >= plan.duration:
-                return None
-            self._issued += 1
-            return self.edges[(self._issued - 1) % plan.servos], now
+        if plan.rate > 0.0:
+            return self._next(now)
+        if since >= plan.duration:
+            return None
+        self._issued += 1
+        edge = self.edges[(self._issued - 1) % plan.servos]
+        edge.on_its_way = edge.add(now)
+        return edge
+
+    def _next(self, now: float) -> LoadEdge | None:
+        """The edge that has been ready for longest, once those are whose pause is over."""
+        while self._paused and self._paused[0][0] <= now:
+            self._ready.append(heappop(self._paused)[2])
+        while self._ready:
+            edge = self._ready.popleft()
+            if edge.next(now) is not None:
+                self.waiting -= 1
+                return edge
+            if edge.waiting and edge.on_its_way is None:
+                heappush(self._paused, (now + edge.order.pause_left(now), edge.name, edge))
         return None
 
     def cut(self, now: float) -> bool:
         """Test for an outage that has cut every connection."""
         return self.plan.outage[0] <= now - self.begin < self.plan.outage[1]
 
-    def _refresh(self) -> None:
-        """Put the newest window of each servo first, as an edge does whose backlog has taken long."""
-        newest: dict[str, tuple[LoadEdge, float]] = {edge.name: (edge, due) for edge, due in self._pending}
-        rest = [(edge, due) for edge, due in self._pending if newest[edge.name][1] != due]
-        self._pending, self._refreshed = deque([*newest.values(), *rest]), True
+    def requeue(self, edge: LoadEdge) -> None:
+        """Put an edge's postponed window back."""
+        edge.put_back()
+        self.waiting += 1
+        self._ready.appendleft(edge)
 
-    def requeue(self, edge: LoadEdge, due: float) -> None:
-        """Put a postponed window back."""
-        self._pending.appendleft((edge, due))
+    def taken(self, edge: LoadEdge, now: float, pause: float) -> None:
+        """Note that the twin has taken an edge's window, and the pause that it asks for before older ones, s."""
+        edge.taken(now, pause)
+        if edge.waiting:
+            self._ready.append(edge)
 
-    def window(self, edge: LoadEdge, due: float) -> bytes:
+    def window(self, edge: LoadEdge, sequence: int, due: float) -> bytes:
         """Encoded window of the edge's source, readdressed; sometimes the gap has moved to that of the next source.
 
         Until the edge applies an update for that gap its windows are of the setting before.
@@ -147,7 +214,7 @@ class EdgeLoad:
             edge.place = (edge.place + 1) % len(self.places)
             self.counts.news += 1
         made = self.places[edge.place] if edge.tuned == edge.place else [self.moved[edge.place - 1]]
-        template = made[edge.sequence % len(made)]
+        template = made[sequence % len(made)]
         start = self.plan.start + (due - self.begin)
         shift = start - template.start
         changes = tuple((time + shift, value) for time, value in template.reference_changes)
@@ -156,7 +223,7 @@ class EdgeLoad:
                 template,
                 servo=edge.name,
                 boot=self.plan.boot,
-                sequence=edge.sequence,
+                sequence=sequence,
                 start=start,
                 parameter_version=edge.version,
                 reference_changes=changes,
@@ -192,11 +259,11 @@ class EdgeTurn:
 
     def __init__(self, fleet: EdgeLoad, line: HttpConnection, done: asyncio.Event, failed: list[str]) -> None:
         self.fleet, self.line, self.done, self.failed = fleet, line, done, failed
-        self.edge, self.due, self.sent, self.body = fleet.edges[0], 0.0, 0.0, b""
+        self.edge, self.sent, self.body = fleet.edges[0], 0.0, b""
 
-    def begin(self, edge: LoadEdge, due: float) -> None:
-        """Start with the poll, where there is one."""
-        self.edge, self.due, self.body = edge, due, b""
+    def begin(self, edge: LoadEdge) -> None:
+        """Start with the poll, where there is one; then the window that the edge has on its way."""
+        self.edge, self.body = edge, b""
         if self.fleet.plan.polls:
             self.fleet.counts.polls += 1
             self.line.ask(_head("GET", f"{_servo(edge)}/outgoing?after={edge.serial}&wait=0"), b"", self._polled)
@@ -219,21 +286,25 @@ class EdgeTurn:
         self.line.ask(_head("POST", f"{_servo(self.edge)}/letters"), encode(receipt), self._answer)
 
     def _put(self) -> None:
-        edge, counts = self.edge, self.fleet.counts
+        edge, counts, sending = self.edge, self.fleet.counts, self.edge.on_its_way
+        assert sending is not None
         self.sent = time.monotonic()
-        self.body = self.fleet.window(edge, self.due)
+        self.body = self.fleet.window(edge, *sending)
         if self.fleet.undisturbed(self.sent):
-            counts.late.append(self.sent - self.due)
-        path = f"{_servo(edge)}/windows/{self.fleet.plan.boot}/{edge.sequence}"
-        self.line.ask(_head("PUT", path), self.body, self._taken)
+            counts.late.append(self.sent - sending.due)
+        path = f"{_servo(edge)}/windows/{self.fleet.plan.boot}/{sending.sequence}"
+        more = f"{WAITING}: {len(edge.waiting)}\r\n".encode() if edge.waiting else b""
+        self.line.ask(_head("PUT", path) + more, self.body, self._taken)
 
     def _taken(self, status: int, _body: bytes) -> None:
         if self._bad(status):
             return
-        counts = self.fleet.counts
+        counts, now = self.fleet.counts, time.monotonic()
         counts.windows, counts.bytes = counts.windows + 1, counts.bytes + len(self.body)
-        counts.latency.append(time.monotonic() - self.sent)
-        self.edge.sequence += 1
+        counts.latency.append(now - self.sent)
+        if not self.fleet.undisturbed(self.sent):
+            counts.latency_after.append(now - self.sent)
+        self.fleet.taken(self.edge, now, self.line.older_pause)
         self.done.set()
 
     def _bad(self, status: int) -> bool:
@@ -242,7 +313,7 @@ class EdgeTurn:
             return False
         if status in LATER:
             self.fleet.counts.later += 1
-            self.fleet.requeue(self.edge, self.due)
+            self.fleet.requeue(self.edge)
         else:
             self.failed.append(f"the twin answered {status} to {self.edge.name}")
         self.done.set()
@@ -314,7 +385,7 @@ async def _serve(turn: EdgeTurn) -> None:
             turn.line = await _line(plan, turn.done, turn.failed)
         turn.done.clear()
         before = fleet.counts.later
-        turn.begin(*next_one)
+        turn.begin(next_one)
         try:
             async with asyncio.timeout(ANSWER_S):
                 await turn.done.wait()
@@ -336,6 +407,7 @@ def _report(counts: LoadCounts, seconds: float) -> LoadReport:
         bytes=counts.bytes,
         cpu=used,
         latency=shares(counts.latency),
+        latency_after=shares(counts.latency_after),
         late=shares(counts.late),
         waited=counts.waited,
     )

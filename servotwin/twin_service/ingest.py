@@ -24,6 +24,7 @@ from servotwin.messages.codec import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
+from servotwin.twin_service.backlog_pace import BacklogPace
 from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 
@@ -66,6 +67,8 @@ class Ingest:
         Largest number of samples of a window: the time and the memory of the work on it grow with them.
     disk : RateLimiter, optional
         Limits the bytes that a servo adds to the store.
+    pace : BacklogPace, optional
+        Pace of the edges' backlogs; None: as fast as they come.
     """
 
     def __init__(
@@ -79,8 +82,9 @@ class Ingest:
         note: Callable[[WindowMessage], None] = lambda _window: None,
         samples: int = MAX_BYTES,
         disk: RateLimiter | None = None,
+        pace: BacklogPace | None = None,
     ) -> None:
-        self._note, self._samples, self._disk = note, samples, disk
+        self._note, self._samples, self._disk, self._pace = note, samples, disk, pace
         self._put, self._has_servo, self._sample_times = put, has_servo, sample_times
         self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
@@ -172,6 +176,10 @@ class Ingest:
         if put is PutResult.NEW and isinstance(message, WindowMessage):
             self._note(message)
         return put
+
+    def older_pause(self, servo: str, waiting: int) -> float:
+        """Pause before older windows (s) of a servo whose window was committed, and that has so many others to send."""
+        return 0.0 if self._pace is None else round(self._pace.pause(servo, waiting), 1)
 
     def _check_samples(self, window: WindowMessage) -> None:
         if window.samples > self._samples:

@@ -23,6 +23,7 @@ from servotwin.store.store import Store
 from servotwin.twin.servo_names import ServoNames
 from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
+from servotwin.twin_service.backlog_pace import BacklogPace
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.clock_check import ClockCheck
 from servotwin.twin_service.config import SQLITE
@@ -110,6 +111,7 @@ class TwinService:
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce
         )
         has_servo = _servo_test(twin.servos)
+        self._pace = BacklogPace(self.clocks.monotonic, config.lag_limit_s)
         self.ingest = self._make_ingest(has_servo, sequences)
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
@@ -147,6 +149,7 @@ class TwinService:
             note=sequences.note,
             samples=config.samples_per_window,
             disk=daily_bytes_limiter(config.megabytes_per_day, self.clocks.monotonic),
+            pace=None if config.lockstep else self._pace,
         )
 
     def _make_dispatcher(self) -> Dispatcher:
@@ -226,6 +229,7 @@ class TwinService:
         if not self.config.lockstep:
             self._spawn(self.dispatcher.run())
             self._spawn(self._watch_lag())
+            self._spawn(self._pace.run(lambda: self.executor.run(lambda: self.store.turn_lag(self.clocks.wall()))))
             self._spawn(self._missing.run())
             self._spawn(self.watch.run())
             self._spawn(self.watch.run_mark())
