@@ -1,6 +1,6 @@
 """Pace of backlogs: after an outage of a whole fleet its older windows come no faster than beside the newest ones.
 
-Storing a window takes processor time that the workers need for the newest ones. Each edge is therefore told the pause
+Storing and looking at a window takes processor time that the newest ones need. Each edge is therefore told the pause
 before each window that a newer one has overtaken. All of it is in memory: after a restart the edges say again, with each
 window, what they have.
 """
@@ -8,7 +8,6 @@ window, what they have.
 from __future__ import annotations
 
 import asyncio
-import time
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
@@ -21,11 +20,11 @@ LOOK_S = 2.0
 """s between two looks at the lag while edges have backlogs."""
 _SHORTEST_PAUSE_S = 1.0
 """Where all edges with a backlog send a window within this time, s, nothing is gained by a pause."""
-_SHARE = 0.25
-"""Cores that storing of older windows may always use."""
-_FIRST_COST_S, _BUSY, _FORGETTING = 1e-3, 200.0, 0.2
-"""s of processor time for one window until it is measured; windows in one measurement, which is no measurement of a
-process that mostly rests; weight of the newest one."""
+_FIRST_SHARE, _FIRST_WORK_S = 0.5, 1e-3
+"""Share of the workers' capacity at which older windows are asked for at first, and s of work for one window until that
+is measured."""
+_LEAST_PER_S = 50.0
+"""Older windows/s that are always asked for: storing these takes a few percent of a core."""
 _LAG, _LONGEST_LAG_S = 0.1, 3.0
 """Part of the lag limit for which new messages may wait for a worker while backlogs come in; at most so many s."""
 _FASTER, _SLOWER = 1.4, 0.7
@@ -42,17 +41,16 @@ class BacklogPace:
         s.
     lag_limit_s : float
         Time for which new messages may wait before the service reports itself as degraded, s.
-    processor : callable
-        Processor time that this process has used, s.
+    work_s : callable
+        Time after which the workers are done with a further servo's new messages, s; 0: not known yet.
     """
 
     def __init__(
-        self, monotonic: Callable[[], float], lag_limit_s: float, processor: Callable[[], float] = time.process_time
+        self, monotonic: Callable[[], float], lag_limit_s: float, work_s: Callable[[], float] = lambda: 0.0
     ) -> None:
-        self._now, self._processor = monotonic, processor
+        self._now, self._work_s = monotonic, work_s
         self._lag = min(_LAG * lag_limit_s, _LONGEST_LAG_S)
         self._fleet, self._behind = OrderedDict[str, float](), OrderedDict[str, float]()
-        self._cost, self._taken, self._since, self._used = _FIRST_COST_S, 0, monotonic(), processor()
         self._rate, self._changed = 0.0, monotonic()
 
     @property
@@ -74,46 +72,45 @@ class BacklogPace:
             Number of windows that it has to send beside that.
         """
         now = self._now()
-        self._count_window(now)
         _note(self._fleet, servo, now, _FORGET_S)
-        if waiting:
-            _note(self._behind, servo, now, _GONE_S)
-        else:
+        if not waiting:
             self._behind.pop(servo, None)
-        pause = self._pause(len(self._behind), self._rate) if waiting else self._pause(len(self._fleet), 0.0)
-        return pause if pause >= _SHORTEST_PAUSE_S else 0.0
+            return _told(len(self._fleet) / self._first_rate)
+        if not self._behind:
+            self._rate, self._changed = self._first_rate, now
+        _note(self._behind, servo, now, _GONE_S)
+        return _told(self._pause)
 
     async def run(self, lag: Callable[[], Awaitable[float]]) -> None:
         """Look at the lag (s) every few seconds while edges have backlogs."""
         while True:
             await asyncio.sleep(LOOK_S)
             with suppress(StoreUnavailable):
-                self.note_lag(await lag() if self.behind else 0.0)
+                if self.behind:
+                    self.note_lag(await lag())
 
     def note_lag(self, seconds: float) -> None:
         """Note for how long new messages wait for a worker; older windows are then asked for faster, or slower."""
-        now, pause = self._now(), self._pause(self.behind, self._rate)
+        now = self._now()
         _forget(self._behind, now, _GONE_S)
-        if not self.behind:
-            self._rate, self._changed = 0.0, now
-        elif now - self._changed >= pause:  # the edges have followed the last change
-            least = self.behind / self._pause(self.behind, 0.0)
-            self._rate = max(self._rate, least) * (_FASTER if seconds <= self._lag else _SLOWER)
+        if self.behind and now - self._changed >= self._pause:  # the edges have followed the last change
+            least = max(_LEAST_PER_S, self.behind / LONGEST_OLDER_PAUSE_S)
+            self._rate = max(self._rate * (_FASTER if seconds <= self._lag else _SLOWER), least)
             self._changed = now
 
-    def _pause(self, servos: int, rate: float) -> float:
-        """Pause of each of some servos at a rate of all of them, windows/s, which has a lower limit."""
-        return min(servos / max(rate, _SHARE / self._cost), LONGEST_OLDER_PAUSE_S)
+    @property
+    def _first_rate(self) -> float:
+        """Older windows/s that are asked for at first."""
+        return max(_FIRST_SHARE / (self._work_s() or _FIRST_WORK_S), _LEAST_PER_S)
 
-    def _count_window(self, now: float) -> None:
-        """Measure the processor time that a window takes, while many come."""
-        self._taken += 1
-        if now - self._since < LOOK_S:
-            return
-        used = self._processor()
-        if self._taken >= _BUSY:
-            self._cost += _FORGETTING * ((used - self._used) / self._taken - self._cost)
-        self._taken, self._since, self._used = 0, now, used
+    @property
+    def _pause(self) -> float:
+        return min(self.behind / self._rate, LONGEST_OLDER_PAUSE_S)
+
+
+def _told(pause: float) -> float:
+    """Pause (s) as an edge is told, where it is worth one."""
+    return min(pause, LONGEST_OLDER_PAUSE_S) if pause >= _SHORTEST_PAUSE_S else 0.0
 
 
 def _note(servos: OrderedDict[str, float], servo: str, now: float, longest: float) -> None:

@@ -111,7 +111,9 @@ class TwinService:
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce
         )
         has_servo = _servo_test(twin.servos)
-        self._pace = BacklogPace(self.clocks.monotonic, config.lag_limit_s)
+        # In lock-step everything is worked on in order, however long it takes.
+        work = self._work_pace = WorkPace(1.0 if config.lockstep else config.worker_share)
+        self._pace = BacklogPace(self.clocks.monotonic, config.lag_limit_s, lambda: work.seconds / config.workers)
         self.ingest = self._make_ingest(has_servo, sequences)
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))
@@ -164,8 +166,7 @@ class TwinService:
             clocks=self.clocks,
             owner=self._owner,
             quota=VerificationQuota(config.verifications_per_minute),
-            # In lock-step everything is worked on in order, however long it takes.
-            pace=WorkPace(1.0 if config.lockstep else config.worker_share),
+            pace=self._work_pace,
             speed=min(1.0, config.speed),
             paused=lambda: bool(self.watch.fault),
         )
