@@ -11,6 +11,7 @@ import asyncio
 from collections import OrderedDict
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
+from typing import TypeVar
 
 from servotwin.link.transport import LONGEST_OLDER_PAUSE_S
 from servotwin.store.engine import StoreUnavailable
@@ -30,6 +31,8 @@ _LAG, _LONGEST_LAG_S = 0.1, 3.0
 _FASTER, _SLOWER = 1.4, 0.7
 _FORGET_S, _GONE_S = 3600.0, 3.0 * LONGEST_OLDER_PAUSE_S
 """s without a window after which a servo does not count as one of the fleet, and after which it has no backlog."""
+
+_Value = TypeVar("_Value")
 
 
 class BacklogPace:
@@ -51,7 +54,18 @@ class BacklogPace:
         self._now, self._work_s = monotonic, work_s
         self._lag = min(_LAG * lag_limit_s, _LONGEST_LAG_S)
         self._fleet, self._behind = OrderedDict[str, float](), OrderedDict[str, float]()
+        self._newest = OrderedDict[str, tuple[str, float]]()
         self._rate, self._changed = 0.0, monotonic()
+
+    def has_overtaken(self, servo: str, boot: str, start: float) -> bool:
+        """True where a newer window of a boot came before the one that starts at `start` (s of sample time)."""
+        newest = self._newest.get(servo)
+        return newest is not None and newest[0] == boot and start < newest[1]
+
+    def note(self, servo: str, boot: str, start: float) -> None:
+        """Note a window that was committed."""
+        if not self.has_overtaken(servo, boot, start):
+            _note(self._newest, servo, (boot, start))
 
     @property
     def behind(self) -> int:
@@ -72,13 +86,15 @@ class BacklogPace:
             Number of windows that it has to send beside that.
         """
         now = self._now()
-        _note(self._fleet, servo, now, _FORGET_S)
+        _note(self._fleet, servo, now)
+        _forget(self._fleet, now, _FORGET_S)
         if not waiting:
             self._behind.pop(servo, None)
             return _told(len(self._fleet) / self._first_rate)
         if not self._behind:
             self._rate, self._changed = self._first_rate, now
-        _note(self._behind, servo, now, _GONE_S)
+        _note(self._behind, servo, now)
+        _forget(self._behind, now, _GONE_S)
         return _told(self._pause)
 
     async def run(self, lag: Callable[[], Awaitable[float]]) -> None:
@@ -113,15 +129,15 @@ def _told(pause: float) -> float:
     return min(pause, LONGEST_OLDER_PAUSE_S) if pause >= _SHORTEST_PAUSE_S else 0.0
 
 
-def _note(servos: OrderedDict[str, float], servo: str, now: float, longest: float) -> None:
-    """Note when a servo sent a window, and forget those that sent none for a time (s)."""
-    servos[servo] = now
+def _note(servos: OrderedDict[str, _Value], servo: str, value: _Value) -> None:
+    """Note something of a servo, which is then the one that is forgotten last."""
+    servos[servo] = value
     servos.move_to_end(servo)
     if len(servos) > MAX_SERVOS:
         servos.popitem(last=False)
-    _forget(servos, now, longest)
 
 
 def _forget(servos: OrderedDict[str, float], now: float, longest: float) -> None:
+    """Forget the servos that sent nothing for a time (s)."""
     while servos and next(iter(servos.values())) < now - longest:
         servos.popitem(last=False)

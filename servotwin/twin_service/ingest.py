@@ -136,6 +136,7 @@ class Ingest:
                 boot=message.boot,
                 sequence=message.sequence,
                 start=message.start,
+                overtaken=self._pace is not None and self._pace.has_overtaken(servo, message.boot, message.start),
             )
             return incoming, message
         if not isinstance(message, LETTERS):
@@ -175,6 +176,8 @@ class Ingest:
         self._metrics.stored.add(incoming.kind.value, put.value)
         if put is PutResult.NEW and isinstance(message, WindowMessage):
             self._note(message)
+            if self._pace is not None:
+                self._pace.note(incoming.servo, message.boot, message.start)
         return put
 
     def older_pause(self, servo: str, waiting: int) -> float:

@@ -22,13 +22,13 @@ class Machine:
             pauses.append(self.pace.pause(f"ax-{n}", waiting))
         return pauses
 
-    def look(self, lag: float, times: int) -> list[float]:
-        """Look at the lag so many times; the pause of one servo after each."""
+    def look(self, lag: float, times: int, servos: int) -> list[float]:
+        """Look at the lag so many times; the pause of the servos, which all send a window after each."""
         pauses = []
         for _ in range(times):
             self.now += LOOK_S
             self.pace.note_lag(lag)
-            pauses.append(round(self.pace.pause("ax-0", 30), 2))
+            pauses.append(round(self.rush(servos, took=0.0)[-1], 2))
         return pauses
 
 
@@ -36,7 +36,7 @@ class Machine:
 def test_a_small_fleet_sends_its_backlog_at_full_speed(servos: int, work: float) -> None:
     """Even where the workers are slow: storing its windows costs them nothing."""
     machine = Machine(work)
-    assert set(machine.rush(servos) + machine.look(60.0, 20) + machine.rush(servos)) == {0.0}
+    assert set(machine.rush(servos) + machine.look(60.0, 20, servos) + machine.rush(servos)) == {0.0}
 
 
 def test_a_large_fleet_sends_older_windows_at_half_of_the_workers_capacity_at_first() -> None:
@@ -48,10 +48,10 @@ def test_a_large_fleet_sends_older_windows_at_half_of_the_workers_capacity_at_fi
 def test_older_windows_come_faster_while_new_ones_do_not_wait_and_slower_while_they_do() -> None:
     machine = Machine()
     machine.rush(4000)
-    assert list(dict.fromkeys(machine.look(0.0, 10)))[:3] == [8.0, 5.71, 4.08]
-    assert machine.look(0.0, 12)[-1] == 0.0
-    assert machine.look(5.0, 20)[-1] > 4.0
-    assert all(pause <= LONGEST_OLDER_PAUSE_S for pause in machine.rush(4000) + machine.look(60.0, 29))
+    assert list(dict.fromkeys(machine.look(0.0, 10, 4000)))[:3] == [8.0, 5.71, 4.08]
+    assert machine.look(0.0, 12, 4000)[-1] == 0.0
+    assert machine.look(5.0, 20, 4000)[-1] > 4.0
+    assert all(pause <= LONGEST_OLDER_PAUSE_S for pause in machine.look(60.0, 29, 4000))
     assert machine.pace.pause("ax-0", 30) == LONGEST_OLDER_PAUSE_S
 
 
@@ -63,6 +63,15 @@ def test_an_edge_without_a_backlog_is_told_what_the_whole_fleet_would_need() -> 
     assert machine.pace.pause("ax-1", 30) == 0.0
     machine.now += 3601.0
     assert machine.pace.pause("ax-0", 0) == 0.0
+
+
+def test_a_window_is_overtaken_by_a_newer_one_of_its_boot_only() -> None:
+    pace = Machine().pace
+    assert not pace.has_overtaken("ax-0", "b0", 5.0)
+    pace.note("ax-0", "b0", 5.0)
+    pace.note("ax-0", "b0", 3.0)
+    asked = [("ax-0", "b0", 4.0), ("ax-0", "b0", 5.0), ("ax-0", "b1", 1.0), ("ax-1", "b0", 1.0)]
+    assert [pace.has_overtaken(*one) for one in asked] == [True, False, False, False]
 
 
 def test_an_edge_that_is_done_or_gone_has_no_backlog() -> None:
