@@ -89,7 +89,9 @@ def _of_outage(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
     within = ", ".join(f"{until:g}" for until in WITHIN_S)
     yield ReportLine(f"... share of the servos within {within} s", "100 % within 30 s", f"{done} %")
     yield ReportLine(
-        "... request to answer since then: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in report.latency_after))
+        "... request to answer since then: median, 99 %, most",
+        "",
+        _numbers("ms", *(1e3 * x for x in report.latency_after)),
     )
     yield ReportLine(
         f"... {backlog.windows} windows of the outage taken: half, 99 %, all after", "", _numbers("s", *backlog.came)

@@ -146,9 +146,7 @@ class _PersistentConnection:
         if response.will_close:
             self.drop()
         headers_back = response.headers
-        return _Response(
-            response.status, data, headers_back.get("Retry-After", ""), headers_back.get(OLDER_PAUSE, "")
-        )
+        return _Response(response.status, data, headers_back.get("Retry-After", ""), headers_back.get(OLDER_PAUSE, ""))
 
     def _open(self) -> HTTPConnection:
         if self._closed:

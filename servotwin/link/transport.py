@@ -38,8 +38,8 @@ class Parcel(NamedTuple):
         return self.boot != ""
 
 
-LONGEST_OLDER_PAUSE_S = 20.0
-"""Longest pause before an older window, s: a third below the time after which the twin counts a number as missing."""
+LONGEST_OLDER_PAUSE_S = 30.0
+"""Longest pause before an older window, s: the time within which a fleet's newest windows are to be looked at."""
 
 
 class Unreachable(Exception):

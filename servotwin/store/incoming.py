@@ -15,8 +15,8 @@ from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import bodies, messages, twins
 
-BACKLOG_LATER_S = 60.0
-"""s for which other servos' new messages come before a servo's backlog. It only orders the queue."""
+OVERTAKEN_LATER_S = 10.0
+"""s for which other servos' new messages come before a window that was overtaken. It only orders the queue."""
 Name = tuple[str, str]
 """(servo, key)."""
 
@@ -102,7 +102,7 @@ def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
 
 def _turn(item: Incoming) -> float:
     """Time (s since the epoch) by which a message orders the servos that wait."""
-    return item.received + BACKLOG_LATER_S * item.overtaken
+    return item.received + OVERTAKEN_LATER_S * item.overtaken
 
 
 def _by_servo(items: Sequence[Incoming]) -> list[tuple[str, list[Incoming]]]:

@@ -11,11 +11,13 @@ import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
 from servotwin.store.engine import SQLITE
-from servotwin.store.incoming import BACKLOG_LATER_S, insert_once, put, rows_by_name, select_by_name
+from servotwin.store.incoming import insert_once, put, rows_by_name, select_by_name
 from servotwin.store.records import EvidenceRecord, MessageKind, WorkResult
 from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import VERIFICATIONS, WORK, contexts, evidence, messages, outgoing, states, twins
 
+BACKLOG_LATER_S = 60.0
+"""s for which other servos' new messages come before the rest of a servo's backlog. It only orders the queue."""
 _ESTIMATES = ("glance", "estimate")
 
 

@@ -24,12 +24,14 @@ _SHORTEST_PAUSE_S = 1.0
 _FIRST_SHARE, _FIRST_WORK_S = 0.5, 1e-3
 """Share of the workers' capacity at which older windows are asked for at first, and s of work for one window until that
 is measured."""
+_FIRST_SPREAD = 1.0 / 3.0
+"""Part of an edge's first pause over which those of a fleet are spread."""
 _LEAST_PER_S = 50.0
 """Older windows/s that are always asked for: storing these takes a few percent of a core."""
 _LAG, _LONGEST_LAG_S = 0.1, 3.0
 """Part of the lag limit for which new messages may wait for a worker while backlogs come in; at most so many s."""
 _FASTER, _SLOWER = 1.4, 0.7
-_FORGET_S, _GONE_S = 3600.0, 3.0 * LONGEST_OLDER_PAUSE_S
+_FORGET_S, _GONE_S = 3600.0, 2.0 * LONGEST_OLDER_PAUSE_S
 """s without a window after which a servo does not count as one of the fleet, and after which it has no backlog."""
 
 _Value = TypeVar("_Value")
@@ -88,14 +90,24 @@ class BacklogPace:
         now = self._now()
         _note(self._fleet, servo, now)
         _forget(self._fleet, now, _FORGET_S)
+        whole = min(len(self._fleet) / self._first_rate, LONGEST_OLDER_PAUSE_S)
         if not waiting:
             self._behind.pop(servo, None)
-            return _told(len(self._fleet) / self._first_rate)
+            return _told(whole)
         if not self._behind:
             self._rate, self._changed = self._first_rate, now
+        first = servo not in self._behind
         _note(self._behind, servo, now)
         _forget(self._behind, now, _GONE_S)
+        if first:  # the whole fleet may be about to come back
+            return _told(whole * (1.0 - _FIRST_SPREAD * (1.0 - self.behind / len(self._fleet))))
         return _told(self._pause)
+
+    def holds(self, servo: str) -> bool:
+        """True where a servo's edge waits before older windows because it was asked to."""
+        if servo not in self._behind or not _told(max(self._pause, len(self._fleet) / self._first_rate)):
+            return False
+        return self._now() - self._behind[servo] <= _GONE_S
 
     async def run(self, lag: Callable[[], Awaitable[float]]) -> None:
         """Look at the lag (s) every few seconds while edges have backlogs."""

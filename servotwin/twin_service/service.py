@@ -106,14 +106,14 @@ class TwinService:
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
         writes = self._writes.put, self._writes.commit
         self.watch = StoreWatch(store, self.executor, *writes, self.clocks.wall, self.clocks.monotonic, twin.path)
-        sequences = SequenceWatch(self.clocks.monotonic)
+        # In lock-step everything is worked on in order, however long it takes.
+        work = self._work_pace = WorkPace(1.0 if config.lockstep else config.worker_share)
+        self._pace = BacklogPace(self.clocks.monotonic, config.lag_limit_s, lambda: work.seconds / config.workers)
+        sequences = SequenceWatch(self.clocks.monotonic, self._pace.holds)
         self._missing = MissingWindows(
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce
         )
         has_servo = _servo_test(twin.servos)
-        # In lock-step everything is worked on in order, however long it takes.
-        work = self._work_pace = WorkPace(1.0 if config.lockstep else config.worker_share)
-        self._pace = BacklogPace(self.clocks.monotonic, config.lag_limit_s, lambda: work.seconds / config.workers)
         self.ingest = self._make_ingest(has_servo, sequences)
         limiter = partial(RateLimiter, config.rate_limit_per_s, config.rate_burst, self.clocks.monotonic)
         self.gate = EdgeGate(self.access, has_servo, limiter("messages"), limiter("polls"))

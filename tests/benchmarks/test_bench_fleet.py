@@ -16,7 +16,8 @@ from twin_messages import window_message
 from typer.testing import CliRunner
 
 from benchmarks.fleet import findings
-from benchmarks.fleet.edges import EdgeLoad, EdgeTurn
+from benchmarks.fleet.edge_load import EdgeLoad
+from benchmarks.fleet.edges import EdgeTurn
 from benchmarks.fleet.line import HttpConnection
 from benchmarks.fleet.plan import LoadPlace, LoadPlan, LoadStart, decode_load, encode_load, shares
 from benchmarks.fleet.processes import ProcessUsage, children, used

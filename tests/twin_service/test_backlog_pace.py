@@ -2,9 +2,11 @@
 
 import pytest
 
+from service_system import window
+
 from servotwin.link.transport import LONGEST_OLDER_PAUSE_S
-from servotwin.twin_service import missing_windows
 from servotwin.twin_service.backlog_pace import LOOK_S, BacklogPace
+from servotwin.twin_service.missing_windows import SequenceWatch
 
 
 class Machine:
@@ -40,9 +42,23 @@ def test_a_small_fleet_sends_its_backlog_at_full_speed(servos: int, work: float)
 
 
 def test_a_large_fleet_sends_older_windows_at_half_of_the_workers_capacity_at_first() -> None:
-    pauses = Machine().rush(4000)
-    assert (pauses[0], pauses[1999], pauses[-1]) == (0.0, pytest.approx(4.0), pytest.approx(8.0))
-    assert max(Machine().rush(20_000)) == LONGEST_OLDER_PAUSE_S
+    machine = Machine()
+    machine.rush(4000, waiting=0)
+    first, later = machine.rush(4000), machine.rush(4000)
+    assert (first[0], first[-1]) == (pytest.approx(8.0 * 2.0 / 3.0, rel=1e-3), pytest.approx(8.0))
+    assert first == sorted(first)
+    assert (later[0], later[-1]) == (pytest.approx(8.0), pytest.approx(8.0))
+    machine = Machine()
+    machine.rush(20_000, waiting=0)
+    pauses = machine.rush(20_000)
+    assert (min(pauses), max(pauses)) == (pytest.approx(20.0, rel=1e-3), LONGEST_OLDER_PAUSE_S)
+
+
+def test_an_edge_that_comes_back_alone_sends_at_full_speed_after_a_first_pause() -> None:
+    machine = Machine()
+    machine.rush(4000, waiting=0)
+    assert machine.pace.pause("ax-7", 30) == pytest.approx(8.0 * 2.0 / 3.0, rel=1e-3)
+    assert machine.pace.pause("ax-7", 29) == 0.0
 
 
 def test_older_windows_come_faster_while_new_ones_do_not_wait_and_slower_while_they_do() -> None:
@@ -52,7 +68,7 @@ def test_older_windows_come_faster_while_new_ones_do_not_wait_and_slower_while_t
     assert machine.look(0.0, 12, 4000)[-1] == 0.0
     assert machine.look(5.0, 20, 4000)[-1] > 4.0
     assert all(pause <= LONGEST_OLDER_PAUSE_S for pause in machine.look(60.0, 29, 4000))
-    assert machine.pace.pause("ax-0", 30) == LONGEST_OLDER_PAUSE_S
+    assert machine.pace.pause("ax-0", 30) == pytest.approx(LONGEST_OLDER_PAUSE_S)
 
 
 def test_an_edge_without_a_backlog_is_told_what_the_whole_fleet_would_need() -> None:
@@ -60,7 +76,6 @@ def test_an_edge_without_a_backlog_is_told_what_the_whole_fleet_would_need() -> 
     machine.rush(4000, waiting=0)
     assert machine.pace.pause("ax-0", 0) == pytest.approx(8.0)
     assert machine.pace.behind == 0
-    assert machine.pace.pause("ax-1", 30) == 0.0
     machine.now += 3601.0
     assert machine.pace.pause("ax-0", 0) == 0.0
 
@@ -79,10 +94,24 @@ def test_an_edge_that_is_done_or_gone_has_no_backlog() -> None:
     machine.rush(4000)
     machine.rush(2000, waiting=0)
     assert machine.pace.pause("ax-2000", 30) == pytest.approx(4.0)
-    machine.now += 3.1 * LONGEST_OLDER_PAUSE_S
+    assert [machine.pace.holds(servo) for servo in ("ax-2000", "ax-0", "other")] == [True, False, False]
+    machine.now += 2.1 * LONGEST_OLDER_PAUSE_S
+    assert not machine.pace.holds("ax-2000")
     machine.pace.note_lag(0.0)
     assert machine.pace.behind == 0
 
 
-def test_a_backlog_at_the_longest_pause_is_not_missing() -> None:
-    assert LONGEST_OLDER_PAUSE_S <= 2.0 / 3.0 * missing_windows._PATIENCE_S
+def test_windows_of_a_backlog_are_not_missing_while_the_edge_waits_and_are_once_it_is_done() -> None:
+    machine = Machine()
+    watch = SequenceWatch(lambda: machine.now, machine.pace.holds)
+    machine.rush(4000)
+    for n, (sequence, waiting) in enumerate(((0, 0), (31, 30), (1, 29), (32, 29), (2, 28))):
+        machine.now += 40.0 * (n > 1)
+        machine.rush(4000)
+        assert watch.due() == []
+        watch.note(window(sequence))
+        machine.pace.pause("ax-1", waiting)
+    machine.now += 31.0
+    assert watch.due() == []
+    machine.pace.pause("ax-1", 0)
+    assert watch.due() == [("ax-1", "b")]
