@@ -21,16 +21,17 @@ LOOK_S = 2.0
 """s between two looks at the lag while edges have backlogs."""
 _SHORTEST_PAUSE_S = 1.0
 """Where all edges with a backlog send a window within this time, s, nothing is gained by a pause."""
-_FIRST_SHARE, _FIRST_WORK_S = 0.5, 1e-3
-"""Share of the workers' capacity at which older windows are asked for at first, and s of work for one window until that
-is measured."""
+_FIRST_SHARE, _LEAST_SHARE, _FIRST_WORK_S = 0.5, 0.25, 1e-3
+"""Share of the workers' capacity at which older windows are asked for at first, and at least, however long new messages
+wait; and s of work for one window until that is measured."""
 _FIRST_SPREAD = 1.0 / 3.0
 """Part of an edge's first pause over which those of a fleet are spread."""
 _LEAST_PER_S = 50.0
 """Older windows/s that are always asked for: storing these takes a few percent of a core."""
 _LAG, _LONGEST_LAG_S = 0.1, 3.0
 """Part of the lag limit for which new messages may wait for a worker while backlogs come in; at most so many s."""
-_FASTER, _SLOWER = 1.4, 0.7
+_MUCH_FASTER, _FASTER, _SLOWER = 2.0, 1.2, 0.7
+"""Factors of the rate at each change: where new messages wait for less than a third of that time, for less, for longer."""
 _FORGET_S, _GONE_S = 3600.0, 2.0 * LONGEST_OLDER_PAUSE_S
 """s without a window after which a servo does not count as one of the fleet, and after which it has no backlog."""
 
@@ -95,7 +96,8 @@ class BacklogPace:
             self._behind.pop(servo, None)
             return _told(whole)
         if not self._behind:
-            self._rate, self._changed = self._first_rate, now
+            # Until the first pauses are over, no older windows are what new messages wait for.
+            self._rate, self._changed = self._first_rate, now + whole
         first = servo not in self._behind
         _note(self._behind, servo, now)
         _forget(self._behind, now, _GONE_S)
@@ -121,15 +123,22 @@ class BacklogPace:
         """Note for how long new messages wait for a worker; older windows are then asked for faster, or slower."""
         now = self._now()
         _forget(self._behind, now, _GONE_S)
-        if self.behind and now - self._changed >= self._pause:  # the edges have followed the last change
-            least = max(_LEAST_PER_S, self.behind / LONGEST_OLDER_PAUSE_S)
-            self._rate = max(self._rate * (_FASTER if seconds <= self._lag else _SLOWER), least)
-            self._changed = now
+        if not self.behind or now - self._changed < self._pause:  # the edges have not followed the last change yet
+            return
+        faster = _MUCH_FASTER if seconds <= self._lag / 3.0 else _FASTER
+        least = max(self._capacity * _LEAST_SHARE, _LEAST_PER_S, self.behind / LONGEST_OLDER_PAUSE_S)
+        self._rate = max(self._rate * (faster if seconds <= self._lag else _SLOWER), least)
+        self._changed = now
+
+    @property
+    def _capacity(self) -> float:
+        """Windows/s that the workers can look at."""
+        return 1.0 / (self._work_s() or _FIRST_WORK_S)
 
     @property
     def _first_rate(self) -> float:
         """Older windows/s that are asked for at first."""
-        return max(_FIRST_SHARE / (self._work_s() or _FIRST_WORK_S), _LEAST_PER_S)
+        return max(_FIRST_SHARE * self._capacity, _LEAST_PER_S)
 
     @property
     def _pause(self) -> float:
