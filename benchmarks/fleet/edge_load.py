@@ -1,4 +1,4 @@
-"""Edges of a bench's fleet, without the connections: windows fall due, wait in the order of a real edge, and are sent."""
+"""Edges of a bench's fleet, without the connections: windows fall due, and wait in the order of a real edge."""
 
 from __future__ import annotations
 

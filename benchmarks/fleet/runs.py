@@ -44,7 +44,7 @@ class FleetRun(NamedTuple):
         Windows that waited when the link came back, at the edges and at the twin.
     drained : float
         s from then until no more than a second's windows waited; NaN: never.
-    fresh : list of float
+    fresh : tuple of float
         s from when the link came back until the first window of a servo was processed that was cut in the last period
         before that or later, rising: of each servo with such a window.
     backlog : BacklogWork
@@ -56,7 +56,7 @@ class FleetRun(NamedTuple):
     made: dict[str, int]
     behind: float
     drained: float
-    fresh: list[float] = []
+    fresh: tuple[float, ...] = ()
     backlog: BacklogWork = BacklogWork()
 
 
@@ -115,10 +115,10 @@ def _run(
         broken = findings.failures(store)
         if broken or twin.process.poll() is not None:
             raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
-        fresh, backlog, (begin, end) = list[float](), BacklogWork(), plan.outage
+        fresh, backlog, (begin, end) = tuple[float, ...](), BacklogWork(), plan.outage
         if end > 0.0:
             # The edges begin when they are connected: by a fraction of a second later than `since`.
-            fresh = findings.fresh(store, plan.start + end - plan.servos / plan.rate, since + end)
+            fresh = tuple(findings.fresh(store, plan.start + end - plan.servos / plan.rate, since + end))
             backlog = findings.worked_off(store, plan.start + begin, plan.start + end, since + end)
         return FleetRun(report, watch, work, findings.made(store, since), *behind, fresh, backlog)
 

@@ -42,7 +42,7 @@ def backlog(connection: sa.Connection, now: float) -> Backlog:
 
 
 def turn_lag(connection: sa.Connection, now: float) -> float:
-    """Longest time (s) for which new messages of a servo have waited for its turn; a backlog's turn is in the future."""
+    """Longest time (s) for which new messages of a servo have waited for its turn; backlogs have theirs later."""
     first = connection.scalar(sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None)))
     return 0.0 if first is None else max(0.0, now - first)
 

@@ -26,7 +26,7 @@ twins = sa.Table(
     sa.Column("windows", sa.BigInteger, nullable=False, server_default="0"),
     sa.Column("attempts", sa.Integer, nullable=False, server_default="0"),
     # Place in the queues: time at which the oldest verification, or the oldest window or letter since the servo's last
-    # turn, was received; of a backlog alone, a later time (results.BACKLOG_LATER_S, incoming.OVERTAKEN_LATER_S); null: nothing waits.
+    # turn, was received; of a backlog alone, a later time (results.BACKLOG_LATER_S); null: nothing waits.
     sa.Column("ready", sa.Double),
     sa.Column("verification_ready", sa.Double),
     # Time at which a window was first deferred, since which the servo waits for an estimate; null: it does not.

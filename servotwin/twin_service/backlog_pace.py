@@ -1,8 +1,8 @@
 """Pace of backlogs: after an outage of a whole fleet its older windows come no faster than beside the newest ones.
 
 Storing and looking at a window takes processor time that the newest ones need. Each edge is therefore told the pause
-before each window that a newer one has overtaken. All of it is in memory: after a restart the edges say again, with each
-window, what they have.
+before each window that a newer one has overtaken. All of it is in memory: after a restart the edges say again, with
+each window, what they have.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ _LEAST_PER_S = 50.0
 _LAG, _LONGEST_LAG_S = 0.1, 3.0
 """Part of the lag limit for which new messages may wait for a worker while backlogs come in; at most so many s."""
 _MUCH_FASTER, _FASTER, _SLOWER = 2.0, 1.2, 0.7
-"""Factors of the rate at each change: where new messages wait for less than a third of that time, for less, for longer."""
+"""Factors of the rate at each change: where new messages wait for less than a third of that time, for less than all of
+it, and for longer."""
 _FORGET_S, _GONE_S = 3600.0, 2.0 * LONGEST_OLDER_PAUSE_S
 """s without a window after which a servo does not count as one of the fleet, and after which it has no backlog."""
 

@@ -62,8 +62,8 @@ CLAIM = parameter("servotwin-claim", {"type": "string"}, "Number and run of the 
 WAITING = parameter(
     "servotwin-waiting",
     INTEGER,
-    "Number of windows that the edge has to send beside this one; the answer's servotwin-older-pause is the pause before "
-    "each that a newer one has overtaken, s.",
+    "Number of windows that the edge has to send beside this one. The answer's header servotwin-older-pause is the "
+    "pause before each that a newer one has overtaken, s.",
     "header",
 )
 ENCODING = parameter(

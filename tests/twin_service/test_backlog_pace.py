@@ -1,7 +1,6 @@
 """Pace of backlogs: pauses of a fleet's edges, on a clock and a lag of the test."""
 
 import pytest
-
 from service_system import window
 
 from servotwin.link.transport import LONGEST_OLDER_PAUSE_S
