@@ -7,184 +7,23 @@ edge, it imports no numerical library.
 from __future__ import annotations
 
 import asyncio
-import random
 import sys
 import time
-from collections import deque
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
 
+from benchmarks.fleet.edge_load import EdgeLoad, LoadCounts, LoadEdge
 from benchmarks.fleet.line import HttpConnection
 from benchmarks.fleet.plan import LoadPlan, LoadReport, LoadStart, decode_load, shares
-from servotwin.link.seal import Sealed
-from servotwin.messages import Reason, Receipt, Update, WindowMessage, decode, encode
+from servotwin.link.http import WAITING
+from servotwin.messages import encode
 
 TAKEN, LATER = (200, 201, 202), (429, 503)
-FRESH_S = 10.0
-"""s after the end of an outage after which the newest windows go first, as `servotwin.link.session` has it."""
 PAUSE = 0.2
 """s after which a request that was put off is made again."""
 PATIENCE, ANSWER_S = 600.0, 120.0
 """s that windows may wait once no more fall due, and that a turn may take."""
-
-_sealed = msgspec.msgpack.Decoder(list[bytes])
-
-
-@dataclass
-class LoadEdge:
-    """One servo.
-
-    Attributes
-    ----------
-    name : str
-    place, tuned : int
-        Index of its gap in the stock, and of the gap that the parameters in force are for.
-    version, sequence, serial : int
-        Of the parameters in force, of its next window, of the last message that it took.
-    receipts : list of Receipt
-        Not yet sent.
-    """
-
-    name: str
-    place: int
-    tuned: int
-    version: int
-    sequence: int = 0
-    serial: int = 0
-    receipts: list[Receipt] = field(default_factory=list)
-
-
-@dataclass
-class LoadCounts:
-    """Counters that become a `LoadReport`."""
-
-    windows: int = 0
-    news: int = 0
-    polls: int = 0
-    updates: int = 0
-    later: int = 0
-    bytes: int = 0
-    waited: int = 0
-    latency: list[float] = field(default_factory=list)
-    late: list[float] = field(default_factory=list)
-
-
-class EdgeLoad:
-    """All servos, and what falls due.
-
-    Parameters
-    ----------
-    load : LoadStart
-    clock : callable
-        s, that never steps.
-    """
-
-    def __init__(self, load: LoadStart, now: float) -> None:
-        self.plan, self.begin = load.plan, now
-        self.places = [[_window(body) for body in place.windows] for place in load.places]
-        self.moved = [_window(place.moved) for place in load.places]
-        self.gaps, versions = [place.gap for place in load.places], [place.version for place in load.places]
-        self.chance = random.Random(load.plan.seed)
-        plan, count = load.plan, len(self.places)
-        self.edges = [LoadEdge(f"ax-{n:05d}", n % count, n % count, versions[n % count]) for n in range(plan.servos)]
-        self.counts = LoadCounts()
-        self._issued, self._refreshed = 0, False
-        self._pending: deque[tuple[LoadEdge, float]] = deque()
-
-    @property
-    def waiting(self) -> int:
-        """Windows that are due and not sent."""
-        return len(self._pending)
-
-    def add_due(self, now: float) -> None:
-        """Queue the windows whose time has come."""
-        plan, since = self.plan, now - self.begin
-        most = min(int(since * plan.rate) + 1, round(plan.duration * plan.rate)) if plan.rate > 0.0 else 0
-        while self._issued < most:
-            edge = self.edges[self._issued % plan.servos]
-            self._pending.append((edge, self.begin + self._issued / plan.rate))
-            self._issued += 1
-        self.counts.waited = max(self.counts.waited, len(self._pending))
-
-    def take(self, now: float) -> tuple[LoadEdge, float] | None:
-        """Take the next window to be sent, and its due time; None: not now."""
-        plan, since = self.plan, now - self.begin
-        if self.cut(now):
-            return None
-        if not self._refreshed and 0.0 < plan.outage[1] <= since - FRESH_S:
-            self._refresh()
-        if self._pending:
-            return self._pending.popleft()
-        if plan.rate == 0.0:
-            if since >= plan.duration:
-                return None
-            self._issued += 1
-            return self.edges[(self._issued - 1) % plan.servos], now
-        return None
-
-    def cut(self, now: float) -> bool:
-        """Test for an outage that has cut every connection."""
-        return self.plan.outage[0] <= now - self.begin < self.plan.outage[1]
-
-    def _refresh(self) -> None:
-        """Put the newest window of each servo first, as an edge does whose backlog has taken long."""
-        newest: dict[str, tuple[LoadEdge, float]] = {edge.name: (edge, due) for edge, due in self._pending}
-        rest = [(edge, due) for edge, due in self._pending if newest[edge.name][1] != due]
-        self._pending, self._refreshed = deque([*newest.values(), *rest]), True
-
-    def requeue(self, edge: LoadEdge, due: float) -> None:
-        """Put a postponed window back."""
-        self._pending.appendleft((edge, due))
-
-    def window(self, edge: LoadEdge, due: float) -> bytes:
-        """Encoded window of the edge's source, readdressed; sometimes the gap has moved to that of the next source.
-
-        Until the edge applies an update for that gap its windows are of the setting before.
-        """
-        if self.plan.news > 0.0 and self.chance.random() < self.plan.news:
-            edge.place = (edge.place + 1) % len(self.places)
-            self.counts.news += 1
-        made = self.places[edge.place] if edge.tuned == edge.place else [self.moved[edge.place - 1]]
-        template = made[edge.sequence % len(made)]
-        start = self.plan.start + (due - self.begin)
-        shift = start - template.start
-        changes = tuple((time + shift, value) for time, value in template.reference_changes)
-        return encode(
-            msgspec.structs.replace(
-                template,
-                servo=edge.name,
-                boot=self.plan.boot,
-                sequence=edge.sequence,
-                start=start,
-                parameter_version=edge.version,
-                reference_changes=changes,
-            )
-        )
-
-    def apply_messages(self, edge: LoadEdge, body: bytes) -> None:
-        """Handle messages of the twin: apply an update at once, and queue its receipt."""
-        for each in _sealed.decode(body):
-            sealed = msgspec.msgpack.decode(each, type=Sealed)
-            edge.serial = max(edge.serial, sealed.serial)
-            message = decode(sealed.body)
-            if isinstance(message, Update) and message.version > edge.version:
-                edge.version = message.version
-                edge.tuned = self._place_of(message.gap)
-                self.counts.updates += 1
-                receipt = Receipt(edge.name, message.version, True, 1, Reason.APPLIED, message.version, self.plan.boot)
-                edge.receipts.append(receipt)
-
-    def _place_of(self, gap: float | None) -> int:
-        """Index of the place whose gap (rad) is the nearest."""
-        assert gap is not None
-        return min(range(len(self.gaps)), key=lambda n: abs(self.gaps[n] - gap))
-
-    def undisturbed(self, now: float) -> bool:
-        """Test that no outage has begun by `now`."""
-        begin, end = self.plan.outage
-        return begin == end or now - self.begin < begin
 
 
 class EdgeTurn:
@@ -192,11 +31,11 @@ class EdgeTurn:
 
     def __init__(self, fleet: EdgeLoad, line: HttpConnection, done: asyncio.Event, failed: list[str]) -> None:
         self.fleet, self.line, self.done, self.failed = fleet, line, done, failed
-        self.edge, self.due, self.sent, self.body = fleet.edges[0], 0.0, 0.0, b""
+        self.edge, self.sent, self.body = fleet.edges[0], 0.0, b""
 
-    def begin(self, edge: LoadEdge, due: float) -> None:
-        """Start with the poll, where there is one."""
-        self.edge, self.due, self.body = edge, due, b""
+    def begin(self, edge: LoadEdge) -> None:
+        """Start with the poll, where there is one; then the window that the edge has on its way."""
+        self.edge, self.body = edge, b""
         if self.fleet.plan.polls:
             self.fleet.counts.polls += 1
             self.line.ask(_head("GET", f"{_servo(edge)}/outgoing?after={edge.serial}&wait=0"), b"", self._polled)
@@ -219,21 +58,25 @@ class EdgeTurn:
         self.line.ask(_head("POST", f"{_servo(self.edge)}/letters"), encode(receipt), self._answer)
 
     def _put(self) -> None:
-        edge, counts = self.edge, self.fleet.counts
+        edge, counts, sending = self.edge, self.fleet.counts, self.edge.on_its_way
+        assert sending is not None
         self.sent = time.monotonic()
-        self.body = self.fleet.window(edge, self.due)
+        self.body = self.fleet.window(edge, *sending)
         if self.fleet.undisturbed(self.sent):
-            counts.late.append(self.sent - self.due)
-        path = f"{_servo(edge)}/windows/{self.fleet.plan.boot}/{edge.sequence}"
-        self.line.ask(_head("PUT", path), self.body, self._taken)
+            counts.late.append(self.sent - sending.due)
+        path = f"{_servo(edge)}/windows/{self.fleet.plan.boot}/{sending.sequence}"
+        more = f"{WAITING}: {len(edge.waiting)}\r\n".encode() if edge.waiting else b""
+        self.line.ask(_head("PUT", path) + more, self.body, self._taken)
 
     def _taken(self, status: int, _body: bytes) -> None:
         if self._bad(status):
             return
-        counts = self.fleet.counts
+        counts, now = self.fleet.counts, time.monotonic()
         counts.windows, counts.bytes = counts.windows + 1, counts.bytes + len(self.body)
-        counts.latency.append(time.monotonic() - self.sent)
-        self.edge.sequence += 1
+        counts.latency.append(now - self.sent)
+        if not self.fleet.undisturbed(self.sent):
+            counts.latency_after.append(now - self.sent)
+        self.fleet.taken(self.edge, now, self.line.older_pause)
         self.done.set()
 
     def _bad(self, status: int) -> bool:
@@ -242,7 +85,7 @@ class EdgeTurn:
             return False
         if status in LATER:
             self.fleet.counts.later += 1
-            self.fleet.requeue(self.edge, self.due)
+            self.fleet.requeue(self.edge)
         else:
             self.failed.append(f"the twin answered {status} to {self.edge.name}")
         self.done.set()
@@ -314,7 +157,7 @@ async def _serve(turn: EdgeTurn) -> None:
             turn.line = await _line(plan, turn.done, turn.failed)
         turn.done.clear()
         before = fleet.counts.later
-        turn.begin(*next_one)
+        turn.begin(next_one)
         try:
             async with asyncio.timeout(ANSWER_S):
                 await turn.done.wait()
@@ -336,15 +179,10 @@ def _report(counts: LoadCounts, seconds: float) -> LoadReport:
         bytes=counts.bytes,
         cpu=used,
         latency=shares(counts.latency),
+        latency_after=shares(counts.latency_after),
         late=shares(counts.late),
         waited=counts.waited,
     )
-
-
-def _window(body: bytes) -> WindowMessage:
-    message = decode(body)
-    assert isinstance(message, WindowMessage)
-    return message
 
 
 def _servo(edge: LoadEdge) -> str:

@@ -31,6 +31,23 @@ class ProcessedWork(NamedTuple):
     estimated: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
+class BacklogWork(NamedTuple):
+    """Work on the windows of an outage.
+
+    Attributes
+    ----------
+    windows, undone : int
+        Windows that came, and those of them without an outcome at the time of the query.
+    came, processed : tuple of float
+        s from the return of the link until their commit, and until their outcome: median, 99 % and largest.
+    """
+
+    windows: int = 0
+    undone: int = 0
+    came: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    processed: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
 @contextmanager
 def reading(file: Path) -> Iterator[sqlite3.Connection]:
     """Open the store's file read-only, beside the twin."""
@@ -70,14 +87,21 @@ def done(connection: sqlite3.Connection, since: float, until: float) -> Processe
     )
 
 
-def fresh(connection: sqlite3.Connection, start: float, returned: float) -> tuple[int, float]:
-    """Servos of which a window has an outcome that starts at `start` (s of sample time) or later; s until the last one.
-
-    Counted from the return of the link, at `returned` (s since the epoch).
+def fresh(connection: sqlite3.Connection, start: float, returned: float) -> list[float]:
+    """Time from the return of the link, at `returned` (s since the epoch), until a window of each servo has an outcome
+    that starts at `start` (s of sample time) or later; rising, s.
     """
     query = "SELECT min(done) FROM messages WHERE kind = 'window' AND start >= ? AND done IS NOT NULL GROUP BY servo"
-    first = [float(at) for (at,) in connection.execute(query, (start,))]
-    return len(first), max(first, default=returned) - returned
+    return sorted(float(at) - returned for (at,) in connection.execute(query, (start,)))
+
+
+def worked_off(connection: sqlite3.Connection, begin: float, end: float, returned: float) -> BacklogWork:
+    """Query the windows of an outage, which start from `begin` to `end` (s of sample time)."""
+    query = "SELECT received, done FROM messages WHERE kind = 'window' AND start >= ? AND start < ?"
+    rows = connection.execute(query, (begin, end)).fetchall()
+    came = shares([float(at) - returned for at, _ in rows])
+    done_at = shares([float(at) - returned for _, at in rows if at is not None])
+    return BacklogWork(len(rows), sum(at is None for _, at in rows), came, done_at)
 
 
 def made(connection: sqlite3.Connection, since: float) -> dict[str, int]:

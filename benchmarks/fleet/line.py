@@ -8,7 +8,7 @@ from collections.abc import Callable
 Answered = Callable[[int, bytes], None]
 """Handler of a response: (status, body)."""
 _HEAD_END = b"\r\n\r\n"
-_LENGTH = b"content-length:"
+_LENGTH, _PAUSE = b"content-length:", b"servotwin-older-pause:"
 
 
 class HttpConnection(asyncio.Protocol):
@@ -18,6 +18,11 @@ class HttpConnection(asyncio.Protocol):
     ----------
     broken : callable
         Called with the reason when the connection ends while a response is due.
+
+    Attributes
+    ----------
+    older_pause : float
+        Pause before older windows in the last response, s.
     """
 
     def __init__(self, broken: Callable[[str], None]) -> None:
@@ -26,6 +31,7 @@ class HttpConnection(asyncio.Protocol):
         self._answered: Answered | None = None
         self._buffer = bytearray()
         self._expected = -1
+        self.older_pause = 0.0
 
     @property
     def closed(self) -> bool:
@@ -59,7 +65,9 @@ class HttpConnection(asyncio.Protocol):
             end = self._buffer.find(_HEAD_END)
             if end < 0:
                 return
-            self._expected = end + len(_HEAD_END) + _length(bytes(self._buffer[:end]).lower())
+            head = bytes(self._buffer[:end]).lower()
+            self._expected = end + len(_HEAD_END) + int(_header(head, _LENGTH))
+            self.older_pause = float(_header(head, _PAUSE))
         if len(self._buffer) >= self._expected:
             self._finish()
 
@@ -71,10 +79,10 @@ class HttpConnection(asyncio.Protocol):
             answered(int(whole[9:12]), whole[whole.find(_HEAD_END) + len(_HEAD_END) :])
 
 
-def _length(head: bytes) -> int:
-    """Length of the body that a response announces."""
-    begin = head.find(_LENGTH)
+def _header(head: bytes, name: bytes) -> bytes:
+    """Value of a response's header; 0 where it has none."""
+    begin = head.find(name)
     if begin < 0:
-        return 0
+        return b"0"
     end = head.find(b"\r\n", begin)
-    return int(head[begin + len(_LENGTH) : end if end >= 0 else None])
+    return head[begin + len(name) : end if end >= 0 else None]

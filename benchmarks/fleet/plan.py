@@ -61,6 +61,8 @@ class LoadReport(Struct, frozen=True):
         s of processor time, all threads.
     latency : tuple of float
         s from a window's request to its answer: median, 99 % and largest.
+    latency_after : tuple of float
+        The same of the windows after the outage.
     late : tuple of float
         s from when a window was due until its request, without those of the outage: median, 99 % and largest.
     waited : int
@@ -76,6 +78,7 @@ class LoadReport(Struct, frozen=True):
     bytes: int
     cpu: float
     latency: tuple[float, float, float]
+    latency_after: tuple[float, float, float]
     late: tuple[float, float, float]
     waited: int
 

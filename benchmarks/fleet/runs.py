@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from typing import NamedTuple
 import msgspec
 
 from benchmarks.fleet import findings
-from benchmarks.fleet.findings import ProcessedWork
+from benchmarks.fleet.findings import BacklogWork, ProcessedWork
 from benchmarks.fleet.plan import LoadPlace, LoadPlan, LoadReport, LoadStart, encode_load
 from benchmarks.fleet.processes import service
 from benchmarks.fleet.setting import STORE, FleetScale, commission, write_file
@@ -45,9 +44,10 @@ class FleetRun(NamedTuple):
         Windows that waited when the link came back, at the edges and at the twin.
     drained : float
         s from then until no more than a second's windows waited; NaN: never.
-    fresh : (int, float)
-        Servos of which a window was processed that was cut in the last period before the link came back or later, and s
-        from then until the first such window of the last of them.
+    fresh : tuple of float
+        s from when the link came back until the first window of a servo was processed that was cut in the last period
+        before that or later, rising: of each servo with such a window.
+    backlog : BacklogWork
     """
 
     report: LoadReport
@@ -56,7 +56,8 @@ class FleetRun(NamedTuple):
     made: dict[str, int]
     behind: float
     drained: float
-    fresh: tuple[int, float] = (0, math.nan)
+    fresh: tuple[float, ...] = ()
+    backlog: BacklogWork = BacklogWork()
 
 
 def ingest(
@@ -114,11 +115,12 @@ def _run(
         broken = findings.failures(store)
         if broken or twin.process.poll() is not None:
             raise RuntimeError(f"the twin failed: {'; '.join(broken) or 'its process ended'}")
-        fresh = (0, math.nan)
-        if plan.outage[1] > 0.0:
-            cut = plan.start + plan.outage[1] - plan.servos / plan.rate
-            fresh = findings.fresh(store, cut, since + plan.outage[1])
-        return FleetRun(report, watch, work, findings.made(store, since), *behind, fresh)
+        fresh, backlog, (begin, end) = tuple[float, ...](), BacklogWork(), plan.outage
+        if end > 0.0:
+            # The edges begin when they are connected: by a fraction of a second later than `since`.
+            fresh = tuple(findings.fresh(store, plan.start + end - plan.servos / plan.rate, since + end))
+            backlog = findings.worked_off(store, plan.start + begin, plan.start + end, since + end)
+        return FleetRun(report, watch, work, findings.made(store, since), *behind, fresh, backlog)
 
 
 def _watched(

@@ -16,6 +16,7 @@ from benchmarks.report import cores, machine
 
 ROLES = (EDGES, TWIN, WORKERS)
 ASKED_INGEST = 2000.0
+WITHIN_S = 30.0, 60.0, 90.0, 240.0
 _MB = 1e6
 
 
@@ -76,13 +77,27 @@ def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
 
 
 def _of_outage(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
+    report = whole.report
     yield ReportLine(f"after {scale.outage:g} s without a link, windows behind", "", f"{whole.behind:.0f}")
-    servos, seconds = whole.fresh
+    fresh, backlog = whole.fresh, whole.backlog
     yield ReportLine(
         "... newest window of each servo processed: servos, within",
         f"{scale.servos}, 30 s",
-        f"{servos}, {seconds:.0f} s",
+        f"{len(fresh)}, {max(fresh, default=math.nan):.0f} s",
     )
+    done = ", ".join(f"{100.0 * sum(at <= until for at in fresh) / scale.servos:.4g}" for until in WITHIN_S)
+    within = ", ".join(f"{until:g}" for until in WITHIN_S)
+    yield ReportLine(f"... share of the servos within {within} s", "100 % within 30 s", f"{done} %")
+    yield ReportLine(
+        "... request to answer since then: median, 99 %, most",
+        "",
+        _numbers("ms", *(1e3 * x for x in report.latency_after)),
+    )
+    yield ReportLine(
+        f"... {backlog.windows} windows of the outage taken: half, 99 %, all after", "", _numbers("s", *backlog.came)
+    )
+    undone = f"; {backlog.undone} not" if backlog.undone else ""
+    yield ReportLine("... and processed", "", _numbers("s", *backlog.processed) + undone)
     if math.isnan(whole.drained):
         yield ReportLine("... worked off within", "drains", "not: more comes than can be worked on")
         return

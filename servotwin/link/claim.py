@@ -135,11 +135,11 @@ class ExclusiveTransport:
         self.superseded, self.behind = False, ""
         self.twin: ClaimStatus | None = None
 
-    def deliver(self, parcel: Parcel) -> None:
+    def deliver(self, parcel: Parcel) -> float:
         """Send a message; raises Refused (SUPERSEDED) where another edge has taken over."""
         self._confirm()
         try:
-            self._transport.deliver(parcel)
+            return self._transport.deliver(parcel)
         except (Refused, Unreachable) as error:
             self._failed(error)
             if isinstance(error, Refused) and error.reason is Refusal.NOT_UNDERSTOOD and self._twin_is_older:

@@ -15,7 +15,7 @@ import msgspec
 
 from servotwin.link.body_mark import body_mark
 from servotwin.link.claim import HeldClaim
-from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.link.transport import LONGEST_OLDER_PAUSE_S, Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
 from servotwin.messages import MAX_BYTES, Acknowledge, ClaimStatus, EdgeClaim, InvalidMessage, Refusal, decode, encode
 from servotwin.messages.live import LiveColumns, decode_watched, encode_live
@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 BODY = "application/msgpack"
 CLAIM = "Servotwin-Claim"
 """Header that names the sender's claim."""
+WAITING, OLDER_PAUSE = "Servotwin-Waiting", "Servotwin-Older-Pause"
+"""Headers of a window: number of windows that its edge has to send beside it; of the answer: pause before older ones,
+s. A version that does not know them ignores them."""
 _LONGEST_PAUSE_S = 300.0
 """A longer Retry-After is cut to this."""
 _PIECE = 65536
@@ -49,11 +52,12 @@ class _RefusalBody(msgspec.Struct, frozen=True):
 
 
 class _Response(msgspec.Struct, frozen=True):
-    """Status, body and Retry-After of a response."""
+    """Status, body, Retry-After and pause before older windows of a response."""
 
     status: int
     body: bytes
     retry_after: str
+    older_pause: str = ""
 
 
 class _PersistentConnection:
@@ -143,7 +147,8 @@ class _PersistentConnection:
         data = self._read(response, limit, deadline)
         if response.will_close:
             self.drop()
-        return _Response(response.status, data, response.headers.get("Retry-After", ""))
+        headers_back = response.headers
+        return _Response(response.status, data, headers_back.get("Retry-After", ""), headers_back.get(OLDER_PAUSE, ""))
 
     def _open(self) -> HTTPConnection:
         if self._closed:
@@ -243,12 +248,12 @@ class HttpTransport:
         self._up = _PersistentConnection(url, token, timeout_s, context)
         self._down = _PersistentConnection(url, token, timeout_s + wait_s, context)
 
-    def deliver(self, parcel: Parcel) -> None:
+    def deliver(self, parcel: Parcel) -> float:
         """Return when the twin has the message safe; see `Transport`."""
         with self._up.in_step():
-            self._deliver(parcel)
+            return self._deliver(parcel)
 
-    def _deliver(self, parcel: Parcel) -> None:
+    def _deliver(self, parcel: Parcel) -> float:
         headers = {"Content-Type": BODY, **_claimed(self.claim)}
         if parcel.encoding:
             headers["Content-Encoding"] = parcel.encoding
@@ -258,13 +263,16 @@ class HttpTransport:
             response = _checked(self._up.request("POST", path, parcel.body, headers, _LONGEST_RESPONSE), (202,), mark)
             if mark is not None and _decode_list(response.body) != [mark.encode()]:
                 raise Unreachable(_OTHER_BODY)
-            return
+            return 0.0
+        if parcel.waiting:
+            headers[WAITING] = str(parcel.waiting)
         path = f"{self._base}/windows/{quote(parcel.boot, safe='')}/{parcel.sequence}"
         response = _checked(self._up.request("PUT", path, parcel.body, headers, _LONGEST_RESPONSE), (200, 201), mark)
         expected = Acknowledge(parcel.servo, parcel.boot, parcel.sequence)
         # A proxy's login page has status 200 too: only the acknowledgement itself counts.
         if not any(_is(expected, data) for data in _decode_list(response.body)):
             raise Unreachable("the answer to a window does not acknowledge it: whoever answers is not the twin")
+        return _older_pause_s(response.older_pause)
 
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""
@@ -355,6 +363,15 @@ def _refusal_of(response: _Response) -> Refusal | None:
 def _retry_after_s(text: str) -> float:
     """Time in a Retry-After header, s; 0 where it is no number of seconds."""
     return min(float(text), _LONGEST_PAUSE_S) if text.isascii() and text.isdigit() else 0.0
+
+
+def _older_pause_s(text: str) -> float:
+    """Pause before older windows, s; 0 where the header is no such time."""
+    try:
+        seconds = float(text or "0")
+    except ValueError:
+        return 0.0
+    return min(seconds, LONGEST_OLDER_PAUSE_S) if seconds > 0.0 else 0.0
 
 
 def _decode_list(body: bytes) -> list[bytes]:

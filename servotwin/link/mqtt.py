@@ -35,7 +35,7 @@ from servotwin.link.mqtt_messages import (
 )
 from servotwin.link.round_trip import RoundTrip
 from servotwin.link.seal import key_of, verifier_of
-from servotwin.link.transport import Parcel, Refused, Unreachable
+from servotwin.link.transport import LONGEST_OLDER_PAUSE_S, Parcel, Refused, Unreachable
 from servotwin.messages import MAX_BYTES, ClaimStatus, EdgeClaim, InvalidMessage, Refusal
 from servotwin.messages.live import LiveColumns, encode_live
 
@@ -102,13 +102,14 @@ class MqttTransport:
             broker, session, MqttCallbacks(self._message, self._connected, self._lost, self._undelivered)
         )
 
-    def deliver(self, parcel: Parcel) -> None:
+    def deliver(self, parcel: Parcel) -> float:
         """Return when a twin has the message safe; see `Transport`."""
         if len(parcel.body) > MAX_BYTES:
             raise Refused(Refusal.TOO_LARGE, f"a message of {len(parcel.body)} bytes: at most {MAX_BYTES} are allowed")
-        response = self._request(PutRequest(parcel.body, parcel.encoding, self.claim.text))
+        response = self._request(PutRequest(parcel.body, parcel.encoding, self.claim.text, parcel.waiting))
         if not isinstance(response, PutResponse):
             raise Unreachable("the answer to a message does not acknowledge it")
+        return min(response.older_pause, LONGEST_OLDER_PAUSE_S)
 
     def listen(self, after: int) -> list[bytes]:
         """Return the twin's messages with serials above `after`; see `Transport`."""

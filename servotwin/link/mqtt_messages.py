@@ -40,11 +40,14 @@ class PutRequest(Struct, frozen=True, omit_defaults=True, tag="carry/1"):
         As HTTP's Content-Encoding; "" stands for identity.
     claim : str
         Claim that the sender holds; "": none.
+    waiting : int
+        Number of windows that the edge has to send beside this one. An earlier version ignores it.
     """
 
     body: bytes
     encoding: Annotated[str, Meta(max_length=16)] = ""
     claim: ClaimText = ""
+    waiting: Count = 0
 
 
 class PollRequest(Struct, frozen=True, omit_defaults=True, tag="listen/1"):
@@ -72,8 +75,13 @@ class PollRequest(Struct, frozen=True, omit_defaults=True, tag="listen/1"):
     live: Annotated[bytes, Meta(max_length=MAX_LIVE_BYTES)] | None = None
 
 
-class PutResponse(Struct, frozen=True, tag="taken/1"):
-    """Response: the message is stored, by this request or an earlier one."""
+class PutResponse(Struct, frozen=True, omit_defaults=True, tag="taken/1"):
+    """Response: the message is stored, by this request or an earlier one.
+
+    `older_pause` is the pause (s) before each window that a newer one has overtaken. An earlier version ignores it.
+    """
+
+    older_pause: Annotated[float, Meta(ge=0.0, le=300.0)] = 0.0
 
 
 class PollResponse(Struct, frozen=True, omit_defaults=True, tag="heard/1"):

@@ -6,7 +6,7 @@ that does not (the simulated link) reports that a message was sent, and later it
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from math import inf
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from typing import NamedTuple
 from servotwin.link.outbox import Key, Outbox
 from servotwin.link.seal import TO_EDGE, Sealed, key_of, opened, verifier_of
 from servotwin.link.transport import Refused, Transport, Unreachable
+from servotwin.link.window_order import WindowOrder
 from servotwin.messages import (
     MAX_BYTES,
     Acknowledge,
@@ -29,8 +30,6 @@ from servotwin.runtime.retry import Backoff, Retry
 
 _OLDER_TWIN_S = 600.0
 """s between two tries of a message that the twin's version does not know."""
-_FRESH_S = 10.0
-"""s for which windows may hold up the newest one while the twin takes them."""
 _TO_EDGES = Update | Request | Acknowledge | LearntResponse | Resend
 """Messages that a twin sends to an edge."""
 Item = Key | bytes
@@ -76,7 +75,11 @@ class Session:
     @property
     def next_time(self) -> float | None:
         """Time at which something is due next, s; None: the outbox is empty."""
-        dues = [self._due_time(item) for item in self._items()]
+        return self.next_time_of(self._items())
+
+    def next_time_of(self, items: Sequence[Item]) -> float | None:
+        """Time at which one of some messages of the outbox is due next, s; None: there are none."""
+        dues = [self._due_time(item) for item in items]
         return max(self._not_before, min(dues)) if dues else None
 
     def pause_left(self, now: float) -> float:
@@ -167,11 +170,7 @@ class Sent(NamedTuple):
 
 @dataclass(slots=True)
 class Sender:
-    """Delivers the messages that are due in a session.
-
-    The oldest window goes first, since the twin learns from windows in their order. Where that takes long, because all
-    edges send at once what an outage has held up, the newest one goes first from time to time: a setting follows from
-    that one only.
+    """Delivers the messages that are due in a session: letters, then windows in the order of `WindowOrder`.
 
     Parameters
     ----------
@@ -181,43 +180,76 @@ class Sender:
 
     session: Session
     transport: Transport
-    _behind_since: float | None = None
+    _order: WindowOrder = field(default_factory=WindowOrder)
+    _newest: Key | None = None
+    _boots: frozenset[str] = frozenset()
 
     def step(self, now: float) -> Sent:
         """Deliver the message that is due, if one is."""
-        session = self.session
-        item = self._next(now)
+        session, newest = self.session, self._fresh()
+        item = self._next(now, newest)
         if item is None:
-            due = session.next_time
-            return Sent(inf if due is None else due - now)
+            return Sent(self._wait(now))
         try:
-            outbox = session.outbox
-            self.transport.deliver(outbox.letter(item) if isinstance(item, bytes) else outbox.parcel(item))
+            pause = self._deliver(item)
         except KeyError:  # another thread has dropped it meanwhile, or the disk cannot be read just now
             session.retry_later(item, now)
         except Unreachable as error:
             session.unreachable(now, str(error))
-            self._behind_since = None
+            self._order.out_of_reach()
         except Refused as error:
             session.refused(item, now, error.reason, str(error), error.after_s)
         else:
+            if not isinstance(item, bytes):
+                self._note_taken(item, item == newest, now, pause)
             reconnected = session.delivered(item)
             return Sent(window=None if isinstance(item, bytes) else item, reconnected=reconnected)
         return Sent(session.pause_left(now))
 
-    def _next(self, now: float) -> Item | None:
-        """The message to be sent now: the first one that is due, or the newest window where others hold it up."""
-        item, newest = next(self.session.due(now), None), self.session.outbox.newest()
-        if item is None or isinstance(item, bytes) or item == newest:
-            if not isinstance(item, bytes):
-                self._behind_since = None
-            return item
-        if self._behind_since is None:
-            self._behind_since = now
-        if newest is None or now - self._behind_since < _FRESH_S or not self.session.is_due(newest, now):
-            return item
-        self._behind_since = now
-        return newest
+    def _deliver(self, item: Item) -> float:
+        """Deliver a message; return the pause that the twin asks for before older windows, s."""
+        outbox = self.session.outbox
+        if isinstance(item, bytes):
+            return self.transport.deliver(outbox.letter(item))
+        return self.transport.deliver(outbox.parcel(item)._replace(waiting=len(outbox.pending()) - 1))
+
+    def _next(self, now: float, newest: Key | None) -> Item | None:
+        """The message to be sent now; None: none is due, or those that are have to wait for the end of a pause."""
+        first = next(self.session.due(now), None)
+        if first is None or isinstance(first, bytes):
+            return first
+        if newest is not None and not self.session.is_due(newest, now):
+            newest = None
+        return self._order.next(now, first, newest, len(self.session.outbox.pending()) - 1)
+
+    def _fresh(self) -> Key | None:
+        """The newest window, unless the twin has had a newer one."""
+        newest = self.session.outbox.newest()
+        if newest is None or self._newest is None:
+            return newest
+        boot, sequence = newest
+        if boot == self._newest[0]:
+            return newest if sequence > self._newest[1] else None
+        return None if boot in self._boots else newest
+
+    def _note_taken(self, window: Key, fresh: bool, now: float, pause: float) -> None:
+        """Note that the twin has taken a window and asks for a pause (s) before older ones."""
+        left = self.session.outbox.pending()
+        if fresh:
+            # Of the boots before this one, nothing that is still there is newer.
+            self._newest, self._boots = window, frozenset(boot for boot, _ in left)
+        self._order.taken(now, fresh, len(left) - 1, pause)
+
+    def _wait(self, now: float) -> float:
+        """Time until something is due, s."""
+        session, pause = self.session, self._order.pause_left(now)
+        due = session.next_time
+        if not pause or due is None:
+            return inf if due is None else due - now
+        newest = self._fresh()
+        exempt: list[Item] = [*session.outbox.letters(), *([] if newest is None else [newest])]
+        sooner = session.next_time_of(exempt)
+        return max(pause, due - now) if sooner is None else min(max(pause, due - now), sooner - now)
 
 
 class Received(NamedTuple):

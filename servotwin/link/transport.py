@@ -21,6 +21,8 @@ class Parcel(NamedTuple):
         "" or "deflate".
     boot, sequence : str, int
         Key of a window; a letter (hello, receipt, fallback, answer) has no boot.
+    waiting : int
+        Number of windows that the edge has to send beside this one, for the twin's pace.
     """
 
     servo: str
@@ -28,11 +30,16 @@ class Parcel(NamedTuple):
     encoding: str = ""
     boot: str = ""
     sequence: int = 0
+    waiting: int = 0
 
     @property
     def is_window(self) -> bool:
         """True for a window, False for a letter."""
         return self.boot != ""
+
+
+LONGEST_OLDER_PAUSE_S = 30.0
+"""Longest pause before an older window, s: the time within which a fleet's newest windows are to be looked at."""
 
 
 class Unreachable(Exception):
@@ -60,8 +67,10 @@ class Refused(Exception):
 class Transport(Protocol):
     """Carries one servo's messages. `deliver` and `listen` are called from a thread each."""
 
-    def deliver(self, parcel: Parcel) -> None:
+    def deliver(self, parcel: Parcel) -> float:
         """Send a message; return when the twin has committed it, now or earlier.
+
+        Returns the pause that the twin asks for before each window that a newer one has overtaken, s; 0: none.
 
         Raises
         ------

@@ -15,6 +15,8 @@ from servotwin.store.records import Incoming, MessageKind, PutResult
 from servotwin.store.row_statement import RowStatement
 from servotwin.store.schema import bodies, messages, twins
 
+OVERTAKEN_LATER_S = 10.0
+"""s for which other servos' new messages come before a window that was overtaken. It only orders the queue."""
 Name = tuple[str, str]
 """(servo, key)."""
 
@@ -76,7 +78,7 @@ def _inserting(dialect: str) -> Any:
 
 def _row(item: Incoming) -> dict[str, Any]:
     row = item._asdict()
-    del row["body"]
+    del row["body"], row["overtaken"]
     return row | {"kind": item.kind.value}
 
 
@@ -92,12 +94,17 @@ def _mark_ready(connection: sa.Connection, new: Sequence[Incoming]) -> None:
             "_servo": servo,
             "_windows": windows[servo],
             "_last_message": max((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
-            "_ready": min((i.received for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
+            "_ready": min((_turn(i) for i in group if i.kind is not MessageKind.VERIFICATION), default=None),
             "_verification_ready": min((i.received for i in group if i.kind is MessageKind.VERIFICATION), default=None),
         }
         for servo, group in _by_servo(new)
     ]
     _MARK_READY.run(connection, rows)
+
+
+def _turn(item: Incoming) -> float:
+    """Time (s since the epoch) by which a message orders the servos that wait."""
+    return item.received + OVERTAKEN_LATER_S * item.overtaken
 
 
 def _by_servo(items: Sequence[Incoming]) -> list[tuple[str, list[Incoming]]]:

@@ -41,6 +41,12 @@ def backlog(connection: sa.Connection, now: float) -> Backlog:
     return Backlog(work, verifications, age, max(lags))
 
 
+def turn_lag(connection: sa.Connection, now: float) -> float:
+    """Longest time (s) for which new messages of a servo have waited for its turn; backlogs have theirs later."""
+    first = connection.scalar(sa.select(sa.func.min(twins.c.ready)).where(twins.c.ready.is_not(None)))
+    return 0.0 if first is None else max(0.0, now - first)
+
+
 def servos(connection: sa.Connection, after: str, limit: int) -> list[ServoSummary]:
     """Summaries by name."""
     query = _SUMMARY.where(twins.c.servo > after).order_by(twins.c.servo).limit(limit)

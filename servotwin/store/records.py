@@ -36,6 +36,8 @@ class Incoming(NamedTuple):
         s since the epoch.
     boot, sequence, start : str, int, float
         Key and sample time of a window; "", 0 and 0.0 for other kinds.
+    overtaken : bool
+        A newer window of the servo was stored before: new messages of others come first. It is not stored.
     """
 
     servo: str
@@ -48,6 +50,7 @@ class Incoming(NamedTuple):
     boot: str = ""
     sequence: int = 0
     start: float = 0.0
+    overtaken: bool = False
 
 
 class PutResult(StrEnum):

@@ -194,6 +194,10 @@ class Store:
         """Number and age of the unprocessed messages."""
         return self._read(lambda connection: queries.backlog(connection, now))
 
+    def turn_lag(self, now: float) -> float:
+        """Longest time (s) for which new messages of a servo have waited for a worker."""
+        return self._read(lambda connection: queries.turn_lag(connection, now))
+
     def servos(self, after: str = "", limit: int = 1000) -> list[ServoSummary]:
         """Summaries of the servos whose names follow `after`, by name."""
         return self._read(lambda connection: queries.servos(connection, after, limit))

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from servotwin import __version__
+from servotwin.link.http import OLDER_PAUSE
 from servotwin.link.seal import TO_EDGE, key_of, seal
 from servotwin.messages import PROTOCOL, EdgeClaim, Refusal, encode
 from servotwin.store.engine import StoreUnavailable
@@ -30,6 +31,7 @@ from servotwin.twin_service.openapi import (
     SECONDS,
     SEQUENCE,
     SERVO,
+    WAITING,
     operation,
     parameter,
 )
@@ -216,7 +218,7 @@ class EdgeApi:
                 201: ("New, and safe: an array with its acknowledgement.", MSGPACK),
                 200: ("Known already, likewise.", MSGPACK),
             },
-            parameters=(SERVO, BOOT, SEQUENCE, ENCODING, CLAIM),
+            parameters=(SERVO, BOOT, SEQUENCE, ENCODING, CLAIM, WAITING),
             body="A window/1, MessagePack.",
             errors=MESSAGE_ERRORS,
         )
@@ -269,7 +271,9 @@ class EdgeApi:
             new = await self._ingest.commit(incoming, window) is PutResult.NEW
         if new:
             self._wake()
-        return msgpack_response([acknowledgement(window)], 201 if new else 200)
+        pause = self._ingest.older_pause(servo, request.waiting)
+        headers = {OLDER_PAUSE: f"{pause:g}"} if pause else None
+        return msgpack_response([acknowledgement(window)], 201 if new else 200, headers)
 
     async def _post_letter(self, request: HttpRequest) -> HttpResponse:
         """Commit a hello, receipt, fallback or answer: 202."""

@@ -105,6 +105,12 @@ class HttpRequest:
         return (self.header(b"servotwin-claim") or b"").decode("latin-1")
 
     @property
+    def waiting(self) -> int:
+        """Number of windows that the edge has to send beside this one; 0 where it does not say."""
+        text = self.header(b"servotwin-waiting") or b""
+        return int(text) if text.isdigit() and len(text) <= 16 else 0
+
+    @property
     def content_length(self) -> str | None:
         """Content-Length as sent."""
         value = self.header(b"content-length")
@@ -232,9 +238,9 @@ class HttpStream:
             await send({"type": "http.response.body", "body": b""})
 
 
-def msgpack_response(value: object, status: int = 200) -> HttpResponse:
+def msgpack_response(value: object, status: int = 200, headers: Mapping[str, str] | None = None) -> HttpResponse:
     """Response in MessagePack."""
-    return HttpResponse(status, _pack(value), MSGPACK)
+    return HttpResponse(status, _pack(value), MSGPACK, headers)
 
 
 def json_response(value: object, status: int = 200, headers: Mapping[str, str] | None = None) -> HttpResponse:

@@ -24,6 +24,7 @@ from servotwin.messages.codec import decompress
 from servotwin.store.engine import StoreBusy, StoreUnavailable
 from servotwin.store.integrity import message_digest
 from servotwin.store.records import Incoming, MessageKind, PutResult
+from servotwin.twin_service.backlog_pace import BacklogPace
 from servotwin.twin_service.limits import RateLimiter, RequestRejected, SampleTimeLimiter
 from servotwin.twin_service.monitoring import Metrics
 
@@ -72,6 +73,8 @@ class Ingest:
         Limits the bytes that a servo adds to the store.
     conflict : callable
         Called with servo, boot and sequence of a window that came under the name of another one.
+    pace : BacklogPace, optional
+        Pace of the edges' backlogs; None: as fast as they come.
     """
 
     def __init__(
@@ -86,9 +89,10 @@ class Ingest:
         samples: int = MAX_BYTES,
         disk: RateLimiter | None = None,
         conflict: Callable[[str, str, int], Awaitable[None]] = _no_conflict,
+        pace: BacklogPace | None = None,
     ) -> None:
         self._conflict = conflict
-        self._note, self._samples, self._disk = note, samples, disk
+        self._note, self._samples, self._disk, self._pace = note, samples, disk, pace
         self._put, self._has_servo, self._sample_times = put, has_servo, sample_times
         self._metrics, self._limit = metrics, limit
         self._clocks = clocks or Clocks()
@@ -140,6 +144,7 @@ class Ingest:
                 boot=message.boot,
                 sequence=message.sequence,
                 start=message.start,
+                overtaken=self._pace is not None and self._pace.has_overtaken(servo, message.boot, message.start),
             )
             return incoming, message
         if not isinstance(message, LETTERS):
@@ -182,7 +187,13 @@ class Ingest:
         self._metrics.stored.add(incoming.kind.value, put.value)
         if put is PutResult.NEW and isinstance(message, WindowMessage):
             self._note(message)
+            if self._pace is not None:
+                self._pace.note(incoming.servo, message.boot, message.start)
         return put
+
+    def older_pause(self, servo: str, waiting: int) -> float:
+        """Pause before older windows (s) of a servo whose window was committed, and that has so many others to send."""
+        return 0.0 if self._pace is None else round(self._pace.pause(servo, waiting), 1)
 
     def _check_samples(self, window: WindowMessage) -> None:
         if window.samples > self._samples:

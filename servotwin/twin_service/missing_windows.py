@@ -48,10 +48,12 @@ class SequenceWatch:
     ----------
     monotonic : callable
         s.
+    held : callable
+        True where a servo's edge waits before it sends older windows, because the twin has asked it to.
     """
 
-    def __init__(self, monotonic: Callable[[], float]) -> None:
-        self._now = monotonic
+    def __init__(self, monotonic: Callable[[], float], held: Callable[[str], bool] = lambda _servo: False) -> None:
+        self._now, self._held = monotonic, held
         self._boots: OrderedDict[Boot, _Progress] = OrderedDict()
 
     def note(self, window: WindowMessage) -> None:
@@ -76,7 +78,7 @@ class SequenceWatch:
         """Boots whose sequences are to be looked at, some at a time; each is due until `looked_at`."""
         now = self._now()
         due = (boot for boot, known in self._boots.items() if known.look_at is not None and known.look_at <= now)
-        return list(islice(due, _BOOTS))
+        return list(islice((boot for boot in due if not self._held(boot[0])), _BOOTS))
 
     def newest(self, boot: Boot) -> int:
         """Highest sequence of a boot that came; -1: none is known."""

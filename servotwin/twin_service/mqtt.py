@@ -29,7 +29,7 @@ from servotwin.link.mqtt_messages import (
 )
 from servotwin.link.seal import key_of
 from servotwin.messages import InvalidMessage, Refusal
-from servotwin.store.records import PutResult
+from servotwin.store.records import MessageKind, PutResult
 from servotwin.twin_service.auth import EdgeGate
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.http_edge import LongPolls, seal_messages
@@ -153,7 +153,8 @@ class MqttRequestHandler:
         incoming, message = self._ingest.read(servo, question.body, question.encoding)
         if await self._ingest.commit(incoming, message) is PutResult.NEW:
             self._wake()
-        return PutResponse()
+        is_window = incoming.kind is MessageKind.WINDOW
+        return PutResponse(self._ingest.older_pause(servo, question.waiting) if is_window else 0.0)
 
 
 class MqttServer:

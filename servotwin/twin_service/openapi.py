@@ -59,6 +59,13 @@ SERVO = parameter("servo", {"type": "string", "pattern": _NAME}, "Name of the se
 BOOT = parameter("boot", {"type": "string", "pattern": _NAME}, "Boot of the edge.", "path")
 SEQUENCE = parameter("sequence", INTEGER, "Number of the window within the boot.", "path")
 CLAIM = parameter("servotwin-claim", {"type": "string"}, "Number and run of the sender's claim.", "header")
+WAITING = parameter(
+    "servotwin-waiting",
+    INTEGER,
+    "Number of windows that the edge has to send beside this one. The answer's header servotwin-older-pause is the "
+    "pause before each that a newer one has overtaken, s.",
+    "header",
+)
 ENCODING = parameter(
     "content-encoding",
     {"type": "string", "enum": ["identity", "deflate", "zstd"]},

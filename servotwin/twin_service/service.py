@@ -20,6 +20,7 @@ from servotwin.store.retention import RetentionResult, delete_old_bodies
 from servotwin.store.store import Store
 from servotwin.twin_service.alarm_webhook import OF_ALL, AlarmWebhook, announced
 from servotwin.twin_service.auth import AccessControl, EdgeGate, TokenFile
+from servotwin.twin_service.backlog_pace import BacklogPace
 from servotwin.twin_service.claims import EdgeClaims
 from servotwin.twin_service.clock_check import ClockCheck
 from servotwin.twin_service.config import SQLITE
@@ -102,7 +103,10 @@ class TwinService:
         self._writes = AwaitedCommits(self.commits, self.clocks.monotonic)
         writes = self._writes.put, self._writes.commit
         self.watch = StoreWatch(store, self.executor, *writes, self.clocks.wall, self.clocks.monotonic, twin.path)
-        sequences = SequenceWatch(self.clocks.monotonic)
+        # In lock-step everything is worked on in order, however long it takes.
+        work = self._work_pace = WorkPace(1.0 if config.lockstep else config.worker_share)
+        self._pace = BacklogPace(self.clocks.monotonic, config.lag_limit_s, lambda: work.seconds / config.workers)
+        sequences = SequenceWatch(self.clocks.monotonic, self._pace.holds)
         self._missing = MissingWindows(
             store, self.executor, sequences, self.polls.notify, self.metrics, self.clocks.wall, self._announce
         )
@@ -145,6 +149,7 @@ class TwinService:
             samples=config.samples_per_window,
             disk=daily_bytes_limiter(config.megabytes_per_day, self.clocks.monotonic),
             conflict=lambda servo, boot, sequence: self.claims.conflicting(servo, boot, sequence),
+            pace=None if config.lockstep else self._pace,
         )
 
     def _make_dispatcher(self) -> Dispatcher:
@@ -159,8 +164,7 @@ class TwinService:
             clocks=self.clocks,
             owner=self._owner,
             quota=VerificationQuota(config.verifications_per_minute),
-            # In lock-step everything is worked on in order, however long it takes.
-            pace=WorkPace(1.0 if config.lockstep else config.worker_share),
+            pace=self._work_pace,
             speed=min(1.0, config.speed),
             paused=lambda: bool(self.watch.fault),
         )
@@ -224,6 +228,7 @@ class TwinService:
         if not self.config.lockstep:
             self._spawn(self.dispatcher.run())
             self._spawn(self._watch_lag())
+            self._spawn(self._pace.run(lambda: self.executor.run(lambda: self.store.turn_lag(self.clocks.wall()))))
             self._spawn(self._missing.run())
             self._spawn(self.watch.run())
             self._spawn(self.watch.run_recheck(), vital=False)

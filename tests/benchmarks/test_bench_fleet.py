@@ -16,7 +16,8 @@ from twin_messages import window_message
 from typer.testing import CliRunner
 
 from benchmarks.fleet import findings
-from benchmarks.fleet.edges import EdgeLoad, EdgeTurn
+from benchmarks.fleet.edge_load import EdgeLoad
+from benchmarks.fleet.edges import EdgeTurn
 from benchmarks.fleet.line import HttpConnection
 from benchmarks.fleet.plan import LoadPlace, LoadPlan, LoadStart, decode_load, encode_load, shares
 from benchmarks.fleet.processes import ProcessUsage, children, used
@@ -50,6 +51,14 @@ def fleet(plan: LoadPlan = PLAN) -> EdgeLoad:
     return EdgeLoad(load(plan), 0.0)
 
 
+def sent(edges: EdgeLoad, now: float, pause: float = 0.0) -> tuple[str, float]:
+    """Have the twin take the next window; its servo, and when it fell due."""
+    edge = edges.take(now)
+    due = edge.on_its_way.due
+    edges.taken(edge, now, pause)
+    return edge.name, due
+
+
 # --- what is sent
 
 
@@ -70,9 +79,9 @@ def test_windows_fall_due_at_the_rate_and_no_more_than_the_plan_has() -> None:
     assert edges.waiting == 6
     edges.add_due(100.0)
     assert edges.waiting == 20
-    taken = [edges.take(100.0) for _ in range(20)]
+    taken = [sent(edges, 100.0) for _ in range(20)]
     assert [due for _, due in taken] == pytest.approx([0.1 * k for k in range(20)])
-    assert [edge.name for edge, _ in taken][:5] == ["ax-00000", "ax-00001", "ax-00002", "ax-00003", "ax-00000"]
+    assert [name for name, _ in taken][:5] == ["ax-00000", "ax-00001", "ax-00002", "ax-00003", "ax-00000"]
     assert edges.take(100.0) is None
 
 
@@ -86,18 +95,24 @@ def test_in_an_outage_windows_wait() -> None:
     assert not edges.undisturbed(1.0)
 
 
-def test_ten_seconds_after_an_outage_the_newest_window_of_each_servo_goes_first() -> None:
-    edges = fleet(msgspec.structs.replace(PLAN, outage=(0.5, 1.5), duration=20.0))
-    edges.add_due(1.5)
-    assert [round(edges.take(1.6)[1], 3) for _ in range(2)] == [0.0, 0.1]
-    edges.add_due(2.0)
-    dues = [round(edges.take(11.5)[1], 3) for _ in range(8)]
-    assert (sorted(dues[:4]), dues[4:]) == ([1.7, 1.8, 1.9, 2.0], [0.2, 0.3, 0.4, 0.5])
+def test_after_an_outage_each_edge_sends_in_the_order_of_a_real_one() -> None:
+    """Its newest window at once where the twin has asked for pauses, and the older ones after them."""
+    edges = fleet(msgspec.structs.replace(PLAN, outage=(0.5, 3.0), duration=20.0))
+    for k in range(4):
+        edges.add_due(0.1 * k)
+        sent(edges, 0.1 * k, pause=20.0)
+    edges.add_due(3.0)
+    edges.take(1.0)
+    dues = [sent(edges, 3.0, pause=5.0)[1] for _ in range(4)]
+    assert (sorted(dues), edges.take(3.0)) == (pytest.approx([2.7, 2.8, 2.9, 3.0]), None)
+    assert edges.waiting == 23
+    dues = [sent(edges, 8.0, pause=5.0)[1] for _ in range(4)]
+    assert (sorted(dues), edges.take(8.0)) == (pytest.approx([0.4, 0.5, 0.6, 0.7]), None)
 
 
 def test_without_a_rate_a_window_is_due_whenever_one_may_be_sent() -> None:
     edges = fleet(msgspec.structs.replace(PLAN, rate=0.0))
-    assert [edges.take(0.1 * k)[0].name for k in range(5)] == [
+    assert [edges.take(0.1 * k).name for k in range(5)] == [
         "ax-00000",
         "ax-00001",
         "ax-00002",
@@ -110,24 +125,24 @@ def test_without_a_rate_a_window_is_due_whenever_one_may_be_sent() -> None:
 def test_news_moves_the_gap_to_the_next_place_and_keeps_it_there() -> None:
     edges = fleet(msgspec.structs.replace(PLAN, news=1.0))
     edge = edges.edges[0]
-    first = decode(edges.window(edge, 0.1))
+    first = decode(edges.window(edge, 0, 0.1))
     assert (edge.place, edges.counts.news) == (1, 1)
     assert first.channels == edges.moved[0].channels
     quiet = fleet()
-    assert decode(quiet.window(quiet.edges[0], 0.1)).channels == quiet.places[0][0].channels
+    assert decode(quiet.window(quiet.edges[0], 0, 0.1)).channels == quiet.places[0][0].channels
     assert (first.start, first.sequence, first.parameter_version) == (pytest.approx(200.1), 0, 3)
 
 
 def test_windows_are_of_the_setting_before_until_an_update_is_applied() -> None:
     edges = fleet(msgspec.structs.replace(PLAN, news=1.0))
     edge = edges.edges[0]
-    edges.window(edge, 0.1)
+    edges.window(edge, 0, 0.1)
     edges.plan = PLAN
-    assert decode(edges.window(edge, 0.2)).channels == edges.moved[0].channels
+    assert decode(edges.window(edge, 1, 0.2)).channels == edges.moved[0].channels
     update = Update("ax-00000", 4, 3, ("boot-9", 0), 200.0, 0.19, 1e-3, (0.18, 0.2), "ok", Setting(0.0), 400.0)
     sealed = seal(key_of(verifier_of("")), TO_EDGE, "ax-00000", 1, encode(update))
     edges.apply_messages(edge, msgspec.msgpack.encode([sealed]))
-    after = decode(edges.window(edge, 0.3))
+    after = decode(edges.window(edge, 2, 0.3))
     assert (after.channels, after.parameter_version) == (edges.places[1][0].channels, 4)
 
 
@@ -167,8 +182,8 @@ def test_updates_are_applied_once_and_answered() -> None:
 class Spoken:
     """A line that answers at once, from a list of answers."""
 
-    def __init__(self, *answers) -> None:
-        self.answers, self.requests = list(answers), []
+    def __init__(self, *answers, pause: float = 0.0) -> None:
+        self.answers, self.requests, self.older_pause = list(answers), [], pause
 
     def ask(self, head, body, answered) -> None:
         self.requests.append((head.split(b" HTTP")[0].decode(), body))
@@ -181,13 +196,14 @@ def test_a_turn_polls_answers_and_sends() -> None:
     edge.receipts.append(Receipt("ax-00000", 3, True, 1, "applied", 3, "boot-9"))
     line = Spoken((200, b"\x90"), (202, b""), (201, b"\x90"))
     turn = EdgeTurn(edges, line, asyncio.Event(), failed)
-    turn.begin(edge, 0.0)
+    edges.add_due(0.0)
+    turn.begin(edges.take(0.0))
     assert [what for what, _ in line.requests] == [
         "GET /v1/servos/ax-00000/outgoing?after=0&wait=0",
         "POST /v1/servos/ax-00000/letters",
         "PUT /v1/servos/ax-00000/windows/boot-9/0",
     ]
-    assert (edge.sequence, edges.counts.windows, edges.counts.polls) == (1, 1, 1)
+    assert (edge.newest, edges.counts.windows, edges.counts.polls) == (0, 1, 1)
     assert turn.done.is_set()
     assert not failed
 
@@ -196,7 +212,8 @@ def test_a_turn_polls_answers_and_sends() -> None:
 def test_a_postponed_window_is_sent_again_and_a_refused_one_ends_the_run(status: int, kept: int, failures: int) -> None:
     edges, failed = fleet(), []
     turn = EdgeTurn(edges, Spoken((status, b"")), asyncio.Event(), failed)
-    turn.begin(edges.edges[0], 0.0)
+    edges.add_due(0.0)
+    turn.begin(edges.take(0.0))
     assert (edges.waiting, len(failed), edges.counts.windows) == (kept, failures, 0)
     assert turn.done.is_set()
 
@@ -220,12 +237,12 @@ def test_a_line_reads_answers_however_they_come(cut: int) -> None:
     line, wire = HttpConnection(broken.append), Wire()
     line._transport = wire
     assert not line.closed
-    whole = b"HTTP/1.1 201 Created\r\ncontent-type: x\r\nContent-Length: 5\r\n\r\nhello"
+    whole = b"HTTP/1.1 201 Created\r\nServotwin-Older-Pause: 2.5\r\nContent-Length: 5\r\n\r\nhello"
     line.ask(b"PUT /x HTTP/1.1\r\n", b"body", lambda status, body: answers.append((status, body)))
     assert wire.written == b"PUT /x HTTP/1.1\r\nContent-Length: 4\r\n\r\nbody"
     line.data_received(whole[:cut])
     line.data_received(whole[cut:])
-    assert answers == [(201, b"hello")]
+    assert (answers, line.older_pause) == ([(201, b"hello")], 2.5)
     line.connection_lost(None)
     assert line.closed
     assert not broken
@@ -283,11 +300,13 @@ def test_the_store_shows_the_waiting_times_of_windows(tmp_path: Path) -> None:
             assert findings.stored(reading) == 4
             found = findings.done(reading, 101.0, 103.0)
             assert (found.windows, found.undone) == (2, 2)
-            assert findings.fresh(reading, 2.0, 100.0) == (0, 0.0)
+            assert findings.fresh(reading, 2.0, 100.0) == []
             lease = store.lease("me", 1, 60.0, 110.0)[0]
             store.commit([WorkResult("a", lease.serial, b"", None, tuple(m.id for m in lease.messages))], 125.0)
-            assert findings.fresh(reading, 2.0, 100.0) == (1, 25.0)
-            assert findings.fresh(reading, 4.0, 100.0) == (0, 0.0)
+            assert findings.fresh(reading, 2.0, 100.0) == [25.0]
+            assert findings.fresh(reading, 4.0, 100.0) == []
+            off = findings.worked_off(reading, 1.0, 3.0, 100.0)
+            assert (off.windows, off.undone, off.came[2], off.processed[2]) == (2, 0, 2.0, 25.0)
             assert findings.made(reading, 0.0) == {}
             assert findings.failures(reading) == []
     finally:

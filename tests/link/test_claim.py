@@ -46,11 +46,12 @@ class Line:
     def ask(self, claim: EdgeClaim) -> ClaimStatus | None:
         return self.twin.ask(claim)
 
-    def deliver(self, _parcel: Parcel) -> None:
+    def deliver(self, _parcel: Parcel) -> float:
         self.twin.admit(self.claim)
         if self.refusal is not None:
             raise self.refusal
         self.sent += 1
+        return 0.0
 
     def listen(self, _after: int) -> list[bytes]:
         self.twin.admit(self.claim)

@@ -8,6 +8,7 @@ import pytest
 from exploration import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from servotwin.link.outbox_index import AcknowledgedLimits
 from servotwin.link.seal import TO_EDGE, TO_TWIN, key_of, seal, verifier_of
@@ -44,10 +45,12 @@ class Script:
         self.faults: list[Exception | None] = []
         self.news: list[bytes] = []
         self.polls: list[int] = []
+        self.pause_s = 0.0
 
-    def deliver(self, parcel: Parcel) -> None:
+    def deliver(self, parcel: Parcel) -> float:
         self._fail()
         self.delivered.append(parcel)
+        return self.pause_s
 
     def listen(self, after: int) -> list[bytes]:
         self.polls.append(after)
@@ -108,6 +111,61 @@ def test_where_a_backlog_takes_long_the_newest_window_goes_first_from_time_to_ti
     outbox.put(window(9))
     outbox.put(window(10))
     assert [sender.step(100.0 + n).window for n in range(2)] == [("b0", 9), ("b0", 10)]
+
+
+def test_after_a_long_outage_the_newest_window_goes_at_once_and_older_ones_at_the_twins_pace(
+    sender: Sender, outbox: SqliteOutbox, script: Script
+) -> None:
+    """In a large fleet the twin has said so before the outage."""
+    script.pause_s = 20.0
+    outbox.put(window(0))
+    assert sender.step(0.0).window == ("b0", 0)
+    for k in range(1, 6):
+        outbox.put(window(k))
+    script.faults = [Unreachable("gone")]
+    assert sender.step(0.0).window is None
+    assert [sender.step(60.0).window for _ in range(2)] == [("b0", 5), None]
+    assert sender.step(62.0).wait_s == pytest.approx(18.0)
+    outbox.put(window(6))
+    outbox.put_letter(b"letter")
+    assert [sender.step(70.0).window for _ in range(3)] == [None, ("b0", 6), None]
+    assert sender.step(80.0).window == ("b0", 1)
+    assert [parcel.waiting for parcel in script.delivered] == [0, 4, 0, 4, 3]
+    script.pause_s = 0.0
+    assert [sender.step(100.0 + n).window for n in range(3)] == [("b0", k) for k in (2, 3, 4)]
+    assert sender.step(103.0).wait_s == inf
+
+
+def test_a_pause_loses_no_window_of_an_earlier_boot_and_the_new_boots_do_not_wait_for_it(
+    sender: Sender, outbox: SqliteOutbox, script: Script
+) -> None:
+    script.pause_s = 20.0
+    for k in range(2):
+        outbox.put(window(k))
+    assert [sender.step(0.0).window for _ in range(2)] == [("b0", 0), ("b0", 1)]
+    outbox.put(window(2))
+    outbox.put(window(3))
+    outbox.put(replace(window(0), boot="b1"))
+    assert [sender.step(1.0).window for _ in range(3)] == [("b0", 2), ("b1", 0), None]
+    outbox.put(replace(window(1), boot="b1"))
+    assert sender.step(2.0).window == ("b1", 1)
+    assert sender.step(22.0).window == ("b0", 3)
+    assert sender.step(23.0).wait_s == inf
+
+
+def test_a_window_that_is_refused_for_a_while_does_not_hold_up_what_waits_for_the_pause(
+    sender: Sender, outbox: SqliteOutbox, script: Script
+) -> None:
+    script.pause_s = 4.0
+    for k in range(3):
+        outbox.put(window(k))
+    assert sender.step(0.0).window == ("b0", 0)
+    script.faults = [Refused(Refusal.FUTURE, "early", 9.0)]
+    assert sender.step(0.0).window is None
+    assert sender.step(0.0).wait_s == pytest.approx(4.0)
+    assert sender.step(4.0).window == ("b0", 1)
+    assert sender.step(4.0).wait_s == pytest.approx(5.0)
+    assert sender.step(9.0).window == ("b0", 2)
 
 
 def test_windows_that_the_twin_asked_for_again_are_not_the_newest(tmp_path: Path, script: Script) -> None:
@@ -219,11 +277,12 @@ def test_a_message_that_cannot_be_read_holds_up_no_other_and_is_not_tried_withou
 
 @pytest.mark.slow
 @examples(40, deadline=None)
-@given(FAULTS)
+@given(FAULTS, st.sampled_from((0.0, 3.0, 20.0)))
 def test_every_window_is_delivered_once_or_counted(
-    tmp_path_factory: pytest.TempPathFactory, faults: list[Exception | None]
+    tmp_path_factory: pytest.TempPathFactory, faults: list[Exception | None], pause: float
 ) -> None:
     outbox, script = SqliteOutbox(tmp_path_factory.mktemp("box") / "o", "axis-1"), Script()
+    script.pause_s = pause
     sender, now = Sender(Session(outbox, RETRY, lambda: 0.5), script), 0.0
     script.faults = list(faults)
     for k in range(5):

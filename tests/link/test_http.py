@@ -24,6 +24,18 @@ from servotwin.messages.codec import deflated
 from servotwin.messages.live import LiveColumns, Watched, decode_columns, encode_live
 
 
+@pytest.mark.parametrize(("told", "pause"), [("2.5", 2.5), ("900", 30.0), ("-1", 0.0), ("nan", 0.0), ("soon", 0.0)])
+def test_the_twin_learns_what_waits_and_tells_the_pause_before_older_windows(
+    twin: FakeTwin, link: HttpTransport, told: str, pause: float
+) -> None:
+    twin.older_pause = told
+    assert link.deliver(parcel(0)._replace(waiting=7)) == pause
+    twin.older_pause = ""  # a twin of an earlier version
+    assert link.deliver(parcel(1)) == 0.0
+    assert link.deliver(LETTER) == 0.0
+    assert twin.waiting == ["7", None]
+
+
 def test_windows_and_letters_arrive(twin: FakeTwin, link: HttpTransport) -> None:
     link.deliver(parcel(0))
     link.deliver(parcel(0))

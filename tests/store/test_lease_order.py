@@ -22,6 +22,19 @@ def test_the_servo_that_waited_longest_is_leased_first_within_the_limits(store: 
     assert len(rest.messages) == 2
 
 
+def test_new_messages_of_others_come_before_windows_that_were_overtaken(store: Store) -> None:
+    """These come ten seconds later, or when a worker is idle; beside new ones of their servo they go along."""
+    store.put(
+        [window("a", received=150.0)._replace(overtaken=True), window("b", received=159.0), window("c", received=161.0)]
+    )
+    assert [one.servo for one in claim(store, limit=1, now=159.0)] == ["b"]
+    assert store.turn_lag(159.5) == 0.5  # of b, which is worked on
+    assert [one.servo for one in claim(store, limit=1, now=159.5)] == ["a"]
+    store.release("me")
+    assert store.turn_lag(165.0) == 6.0
+    assert [one.servo for one in claim(store, limit=3, now=165.0)] == ["b", "a", "c"]
+
+
 def test_a_servo_is_leased_when_its_wake_up_is_due(store: Store) -> None:
     store.put([window(), window("b")])
     first = {one.servo: one for one in claim(store)}

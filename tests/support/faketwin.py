@@ -28,6 +28,8 @@ class FakeTwin:
         self.requests: Counter[str] = Counter()
         self.sealed: list[tuple[int, bytes]] = []
         self.fault: Fault | None = None
+        self.older_pause = ""
+        self.waiting: list[str | None] = []
         self.claim_status: ClaimStatus | None = None  # None: of a version without claims
         self.on_window: Callable[[WindowMessage], None] = lambda _: None
         self.news, self.closed = threading.Condition(), False
@@ -120,7 +122,12 @@ class Handler(BaseHTTPRequestHandler):
         status = 200 if key in self.twin.windows else 201
         self.twin.windows[key] = message
         self.twin.on_window(message)
-        self.answer(status, msgspec.msgpack.encode([encode(Acknowledge(message.servo, *key))]))
+        self.twin.waiting.append(self.headers.get("Servotwin-Waiting"))
+        self.answer(
+            status,
+            msgspec.msgpack.encode([encode(Acknowledge(message.servo, *key))]),
+            **({"Servotwin_Older_Pause": self.twin.older_pause} if self.twin.older_pause else {}),
+        )
 
     def _answer_claim(self, claim: EdgeClaim) -> None:
         newest = self.twin.claim_status

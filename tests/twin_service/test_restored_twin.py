@@ -56,7 +56,7 @@ class Service:
         limiter = SampleTimeLimiter(1.0, 60.0)
         self.ingest = Ingest(None, lambda _: True, limiter, Metrics(), clocks=Clocks(clock, clock))  # type: ignore[arg-type]
 
-    def deliver(self, parcel: Parcel) -> None:
+    def deliver(self, parcel: Parcel) -> float:
         """A transport's call: take a message, or refuse it."""
         self.clock.now += 0.005
         try:
@@ -66,6 +66,7 @@ class Service:
             raise Refused(error.refusal, str(error.detail)) from None
         self.order.append(parcel.boot)
         self.outgoing += self.twin.receive(message, self.clock())
+        return 0.0
 
 
 class Edge:

@@ -64,6 +64,26 @@ def test_windows_may_come_in_any_order(serving):
     serving(body)
 
 
+def test_an_edge_with_a_backlog_is_told_the_pause_before_older_windows(serving):
+    async def body(system, client):
+        sent = await client.post("/v1/servos/ax-1/letters", content=hello(time=100.0), headers=bearer())
+        assert sent.status_code == 202
+        assert "servotwin-older-pause" not in (await put(client, window(9), **{"servotwin-waiting": "30"})).headers
+        for n in range(400):  # others of a fleet, and workers that need 50 ms for each
+            system._pace.pause(f"ax-{n}", 30)
+        system._pace._rate = 10.0
+        told = [await put(client, window(k), **{"servotwin-waiting": text}) for k, text in enumerate(("30", "x", "0"))]
+        assert [answer.headers.get("servotwin-older-pause") for answer in told] == ["30", None, None]
+        assert [answer.status_code for answer in told] == [201] * 3
+        # New messages of others come before those that were overtaken.
+        lag = system.store.turn_lag(system.clocks.wall() + 30.0)
+        assert lag == pytest.approx(30.0, abs=5.0)
+        (lease,) = system.store.lease("me", 1, 60.0, system.clocks.wall())
+        assert [message.key for message in lease.messages if message.kind == "window"] == ["b/9", "b/0", "b/1", "b/2"]
+
+    serving(body)
+
+
 def test_tokens_decide_who_may_read_and_write(serving):
     async def body(_system, client):
         path = place(window())

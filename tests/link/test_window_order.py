@@ -1,0 +1,68 @@
+"""Order of an edge's windows: by age, the newest one first where a fleet's backlog would hold it up."""
+
+from servotwin.link.window_order import WindowOrder
+
+
+def choose(order: WindowOrder, now: float, waiting: list[int], fresh: bool = True) -> int | None:
+    return order.next(now, waiting[0], waiting[-1] if fresh else None, len(waiting) - 1)
+
+
+def test_without_a_pause_a_backlog_goes_in_order_and_at_once() -> None:
+    order, waiting = WindowOrder(), list(range(1000))
+    for n in range(1000):
+        assert choose(order, 1e-3 * n, waiting) == waiting.pop(0)
+        order.taken(1e-3 * n, not waiting, len(waiting), 0.0)
+
+
+def test_after_a_long_outage_of_a_large_fleet_the_newest_goes_at_once_and_after_a_short_one_in_order() -> None:
+    """30 older windows at 20 s each would hold the newest one up for ten minutes, one older window does not."""
+    for waiting, first in ((list(range(31)), 30), ([0, 1], 0)):
+        order = WindowOrder()
+        order.taken(0.0, True, 0, 20.0)
+        order.out_of_reach()
+        assert choose(order, 600.0, waiting) == first
+
+
+def test_older_windows_wait_for_the_pause_and_the_newest_does_not() -> None:
+    order = WindowOrder(20.0)
+    assert choose(order, 0.0, list(range(31))) == 30
+    order.taken(0.0, True, 30, 20.0)
+    assert choose(order, 19.0, list(range(30)), fresh=False) is None
+    assert order.pause_left(19.0) == 1.0
+    assert choose(order, 19.0, [*range(30), 31]) == 31
+    order.taken(19.0, True, 30, 20.0)
+    assert choose(order, 20.0, list(range(30)), fresh=False) == 0
+    order.taken(20.0, False, 29, 5.0)
+    assert choose(order, 24.9, list(range(1, 30)), fresh=False) is None
+    assert choose(order, 25.0, list(range(1, 30)), fresh=False) == 1
+
+
+def test_a_shorter_pause_holds_at_once() -> None:
+    order = WindowOrder()
+    order.taken(0.0, True, 30, 20.0)
+    order.taken(4.0, True, 30, 1.0)
+    assert order.pause_left(4.0) == 1.0
+
+
+def test_a_backlog_shrinks_although_new_windows_come_faster_than_the_pause() -> None:
+    """In the 200 s that it arose in, at the latest, half of it is gone, and the outbox is never fuller."""
+    order, waiting, taken = WindowOrder(20.0), list(range(100)), -1
+    for n in range(100):
+        now = 2.0 * n
+        waiting.append(100 + n)
+        while waiting and (item := choose(order, now, waiting, waiting[-1] > taken)) is not None:
+            waiting.remove(item)
+            order.taken(now, item > taken, len(waiting), 20.0)
+            taken = max(taken, item)
+        assert len(waiting) <= 100
+    assert len(waiting) < 70
+
+
+def test_once_the_backlog_is_gone_windows_go_as_they_come() -> None:
+    order = WindowOrder()
+    order.taken(0.0, False, 1, 20.0)
+    order.taken(1.0, True, 0, 20.0)
+    assert choose(order, 2.0, [5]) == 5
+    assert choose(order, 2.0, [5, 6]) == 5
+    order.out_of_reach()
+    assert order.pause_left(0.0) == 0.0
