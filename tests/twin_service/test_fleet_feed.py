@@ -13,7 +13,7 @@ from service_system import MSGPACK, OPERATOR, bearer, place, window, with_servic
 from servotwin.messages import encode
 from servotwin.store import overview
 from servotwin.store.engine import StoreUnavailable
-from servotwin.twin_service import fleet_feed, http_app
+from servotwin.twin_service import fleet_feed, http_messages
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
 from servotwin.twin_service.fleet_process import ChangeReader, ChangesQuestion
 from servotwin.twin_service.http_messages import ABORT, HttpRequest, HttpStream
@@ -214,8 +214,8 @@ class Unread:
 
 @pytest.mark.parametrize("ends", [True, False])
 def test_a_page_that_does_not_read_counts_and_is_cut_off(tmp_path, monkeypatch, ends):
-    monkeypatch.setattr(http_app, "_STALL_S", 60.0 if ends else 0.01)
-    monkeypatch.setattr(http_app, "_LAST_S", 0.01)
+    monkeypatch.setattr(http_messages, "_STALL_S", 60.0 if ends else 0.01)
+    monkeypatch.setattr(http_messages, "_LAST_S", 0.01)
 
     async def body(system, _client):
         page = Unread()
