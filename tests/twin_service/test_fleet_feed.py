@@ -13,7 +13,7 @@ from service_system import MSGPACK, OPERATOR, bearer, place, window, with_servic
 from servotwin.messages import encode
 from servotwin.store import overview
 from servotwin.store.engine import StoreUnavailable
-from servotwin.twin_service import fleet_feed
+from servotwin.twin_service import fleet_feed, http_messages
 from servotwin.twin_service.fleet_feed import FleetFeed, position_of
 from servotwin.twin_service.fleet_process import ChangeReader, ChangesQuestion
 from servotwin.twin_service.http_messages import ABORT, HttpRequest, HttpStream
