@@ -17,9 +17,9 @@ from servotwin.messages.checks import Count, Name, require
 TO_EDGE, TO_TWIN = "to edge", "to twin"
 _MAC_BYTES = 32
 OVERHEAD = 256
+"""Largest number of bytes that a seal adds to a message."""
 MAX_TOKEN = 1024
 """Characters of a token: a twin refuses longer ones unread."""
-"""Largest number of bytes that a seal adds to a message."""
 
 
 class Sealed(Struct, frozen=True, tag="sealed/1"):

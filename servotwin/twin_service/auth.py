@@ -34,7 +34,6 @@ _NO_VERIFIER = bytes(32)
 """Verifier of no token. A servo without a token is compared with it, so that a guess takes as long."""
 _OPEN = verifier_of("")
 """Verifier of the empty token, which seals messages where no tokens are configured."""
-"""Characters."""
 _MISSING = "a token is needed: Authorization: Bearer TOKEN"
 _WRONG = "the token is not that of this servo"
 _FOREIGN = "the token belongs to another name: it may not do this"
