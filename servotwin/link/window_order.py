@@ -13,9 +13,9 @@ _FRESH_S = 10.0
 _USEFUL_S = 60.0
 """s for which an update may be applied after its window's start, where the twin's file says nothing else: older windows
 that take longer, at the pause that the twin asks for, go after the newest one from the start."""
-_IN_A_ROW = 3
-"""Newest windows in a row after which an older one goes whatever the pause: a backlog must not grow, or last for ever,
-because a twin is slow."""
+_IN_A_ROW = 2
+"""Newest windows in a row after which a first older one goes whatever the pause; from then on one after each newest.
+However slow the twin is, a backlog does not grow, and is gone in the time in which it arose."""
 _Window = TypeVar("_Window")
 
 
@@ -88,14 +88,14 @@ class WindowOrder:
             Number of windows that are left and that it has overtaken, or that follow it.
         pause_s : float
         """
-        self.pause_s, since = pause_s, self._older_from
+        self.pause_s = pause_s
         if not older:
             self._older_from, self._in_a_row = None, 0
         elif not fresh:
-            self._older_from, self._in_a_row = now + pause_s, 0
+            self._older_from, self._in_a_row = now + pause_s, _IN_A_ROW - 1
         else:
             # A pause goes on while newest windows come: begun anew by each of them it would never end.
-            self._older_from = now + pause_s if since is None else min(since, now + pause_s)
+            self._older_from = now + pause_s if self._older_from is None else self._older_from
             self._in_a_row += 1
 
     def out_of_reach(self) -> None:

@@ -147,6 +147,8 @@ class MissingWindows:
             newest = self._sequences.newest(boot)
             try:
                 missing = await self._executor.run(partial(missing_windows, self._store, *boot))
+                # A hole before a window that came during the look may be that of an edge that is about to fill it.
+                missing = [hole for hole in missing if hole[1] < newest]
                 for first, last in _few(self._sequences.to_ask(boot, missing)):
                     await self._ask(boot, first, last)
             except StoreUnavailable:

@@ -37,25 +37,18 @@ def test_older_windows_wait_for_the_pause_and_the_newest_does_not() -> None:
     assert choose(order, 25.0, list(range(1, 30)), fresh=False) == 1
 
 
-def test_a_shorter_pause_holds_at_once() -> None:
-    order = WindowOrder()
-    order.taken(0.0, True, 30, 20.0)
-    order.taken(4.0, True, 30, 1.0)
-    assert order.pause_left(4.0) == 1.0
-
-
 def test_a_backlog_shrinks_although_new_windows_come_faster_than_the_pause() -> None:
-    """In the 200 s that it arose in, at the latest, half of it is gone, and the outbox is never fuller."""
+    """It is gone in the 200 s that it arose in, and the outbox is never much fuller."""
     order, waiting, taken = WindowOrder(20.0), list(range(100)), -1
-    for n in range(100):
+    for n in range(102):
         now = 2.0 * n
         waiting.append(100 + n)
         while waiting and (item := choose(order, now, waiting, waiting[-1] > taken)) is not None:
             waiting.remove(item)
             order.taken(now, item > taken, len(waiting), 20.0)
             taken = max(taken, item)
-        assert len(waiting) <= 100
-    assert len(waiting) < 70
+        assert len(waiting) <= 101
+    assert not waiting
 
 
 def test_once_the_backlog_is_gone_windows_go_as_they_come() -> None:

@@ -1,5 +1,7 @@
 """Windows that never came, or that are still to come, as the service finds and asks for them."""
 
+import asyncio
+
 import msgspec
 import pytest
 from service_system import twin_file, window
@@ -118,9 +120,38 @@ def test_a_backlog_behind_the_newest_window_is_not_missing_while_it_comes():
     assert watch.due() == [("ax-1", "b")]
 
 
+def test_what_is_still_to_come_behind_a_window_of_the_look_itself_is_not_missing(tmp_path, monkeypatch):
+    """The first windows after an outage come while the twin looks for holes of before."""
+    monkeypatch.setattr(missing_windows, "_PATIENCE_S", 0.0)
+    monkeypatch.setattr(missing_windows, "_LOOK_S", 1e9)
+
+    async def body(system, client):
+        await send(client, 0, 2)
+        read = missing_windows.missing_windows
+        sent = asyncio.Event()
+
+        def late(*arguments):
+            asyncio.run_coroutine_threadsafe(sending(), loop).result()
+            return read(*arguments)
+
+        async def sending():
+            if not sent.is_set():
+                sent.set()
+                await send(client, 9)
+
+        loop = asyncio.get_running_loop()
+        monkeypatch.setattr(missing_windows, "missing_windows", late)
+        await system._missing.look()
+        assert [(asked.first, asked.last) for asked in posted(system)] == [(1, 1)]
+        await send(client, 3, 4, 5, 6, 7, 8)
+        await system._missing.look()
+        assert len(posted(system)) == 1
+
+    serve(twin_file(tmp_path), body)
+
+
 @pytest.mark.parametrize("selected", [None, 0])
 def test_an_edge_that_selects_its_windows_leaves_no_holes(selected):
-
     now = [0.0]
     watch = missing_windows.SequenceWatch(lambda: now[0])
     for number in (0, 5):
