@@ -160,7 +160,7 @@ def test_unreadable_content(tmp_path: Path, content: bytes, message: str) -> Non
 def test_missing_file_and_folder(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=r"nowhere\.toml: cannot be read \(No such file or directory\)"):
         read_toml(tmp_path / "nowhere.toml")
-    with pytest.raises(InvalidInput, match="cannot be read"):
+    with pytest.raises(InvalidInput, match="is a folder; give the name of a file"):
         read_toml(tmp_path)
 
 
