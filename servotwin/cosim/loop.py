@@ -132,8 +132,12 @@ class Loop:
 
     def __repr__(self) -> str:
         """Scenario, windows, updates and the newest trend in one line."""
+        return f"<{self._title}, {self.trend!r}>"
+
+    @property
+    def _title(self) -> str:
         counts = f"windows: {len(self.windows)}, updates: {len(self.updates)} sent, {len(self.applied)} applied"
-        return f"<Loop {self.scenario.name!r}: {self.scenario.duration:g} s, {counts}, {self.trend!r}>"
+        return f"Loop {self.scenario.name!r}: {self.scenario.duration:g} s, {counts}"
 
     def _repr_html_(self) -> str:
         """Table for notebooks."""
@@ -199,7 +203,7 @@ class Loop:
         axes = figure.axes[2]
         axes.errorbar([e.time for e in usable], gaps, bars, fmt=".", label="estimate, 95 %", linewidth=1.0)
         legend_above(axes)
-        figure.suptitle(repr(self).partition(", <")[0].strip("<"))
+        figure.suptitle(self._title)
         return figure
 
     def digest(self) -> str:

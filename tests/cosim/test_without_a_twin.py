@@ -31,6 +31,11 @@ def file_of(folder: Path, servo: str, twin: str, unit: str = "mm") -> Path:
     return path
 
 
+def test_a_picture_without_any_estimate_names_the_loop_and_no_trend(tmp_path: Path) -> None:
+    figure = cosimulate(Scenario.load(file_of(tmp_path, "emps", OFF))).plot()
+    assert figure.get_suptitle() == "Loop 'servo': 1 s, windows: 0, updates: 0 sent, 0 applied"
+
+
 @pytest.mark.parametrize(("servo", "unit"), [("emps", "mm"), ("gantry", "mm"), ("robot-joint", "deg")])
 def test_every_axis_runs_with_its_own_controller(tmp_path: Path, servo: str, unit: str) -> None:
     scenario = Scenario.load(file_of(tmp_path, servo, OFF, unit))
