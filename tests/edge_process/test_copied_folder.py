@@ -5,6 +5,7 @@ import socket
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from threading import Thread
 
@@ -57,17 +58,21 @@ def edge(folder: Path, run: str) -> Iterator[Edge]:
         one.thread.join(PATIENCE)
 
 
+def query(folder: Path, text: str) -> list[tuple]:
+    """Rows of a twin's store."""
+    with closing(sqlite3.connect(f"file:{folder / 'twin.db'}?mode=ro", uri=True)) as database:
+        return database.execute(text).fetchall()
+
+
+def stored_windows(folder: Path) -> set[tuple[str, int]]:
+    return set(query(folder, "SELECT boot, sequence FROM messages WHERE kind = 'window'"))
+
+
 @pytest.mark.slow
 def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) -> None:
     """The copy takes over; the first one sends nothing more, keeps its window, and both say so; nothing is mixed."""
 
-    def asked(text: str) -> list[tuple]:
-        with closing(sqlite3.connect(f"file:{tmp_path / 'twin.db'}?mode=ro", uri=True)) as database:
-            return database.execute(text).fetchall()
-
-    def stored() -> set[tuple[str, int]]:
-        return set(asked("SELECT boot, sequence FROM messages WHERE kind = 'window'"))
-
+    asked, stored = partial(query, tmp_path), partial(stored_windows, tmp_path)
     config = twin_file(tmp_path, 'store = "sqlite:///twin.db"')
     first, copy = tmp_path / "first", tmp_path / "copy"
     first.mkdir()
@@ -112,13 +117,7 @@ def test_a_copied_folder_has_one_live_edge_and_both_sides_alarm(tmp_path: Path) 
 def test_of_a_computer_that_was_cloned_while_its_edge_ran_neither_copy_counts_and_all_say_so(tmp_path: Path) -> None:
     """Same run, same claim, same numbers: only the windows differ. No window but the first to differ is lost."""
 
-    def asked(text: str) -> list[tuple]:
-        with closing(sqlite3.connect(f"file:{tmp_path / 'twin.db'}?mode=ro", uri=True)) as database:
-            return database.execute(text).fetchall()
-
-    def stored() -> set[tuple[str, int]]:
-        return set(asked("SELECT boot, sequence FROM messages WHERE kind = 'window'"))
-
+    asked, stored = partial(query, tmp_path), partial(stored_windows, tmp_path)
     config = twin_file(tmp_path, 'store = "sqlite:///twin.db"')
     first, clone = tmp_path / "first", tmp_path / "clone"
     first.mkdir()
