@@ -27,6 +27,21 @@ class ProcessUsage(NamedTuple):
     memory: int
 
 
+class MachineTimes(NamedTuple):
+    """Processor time of the whole machine since it was started, all cores together, s.
+
+    Attributes
+    ----------
+    busy : float
+        Of all its processes, and of the kernel.
+    withheld : float
+        In which processes were ready to run, but the host of this virtual machine let others run.
+    """
+
+    busy: float
+    withheld: float
+
+
 class ServiceProcess(NamedTuple):
     """Running service of the twin.
 
@@ -81,6 +96,14 @@ def used(pid: int) -> ProcessUsage | None:
     except (OSError, IndexError):
         return None
     return ProcessUsage((int(stat[11]) + int(stat[12])) / _TICK, resident * os.sysconf("SC_PAGE_SIZE"))
+
+
+def machine_times() -> MachineTimes:
+    """Processor time of the whole machine so far."""
+    user, nice, system, _idle, _waiting, interrupts, soft, stolen, *_ = map(
+        int, Path("/proc/stat").read_text(encoding="ascii").partition("\n")[0].split()[1:]
+    )
+    return MachineTimes((user + nice + system + interrupts + soft) / _TICK, stolen / _TICK)
 
 
 def children(pid: int) -> list[int]:

@@ -71,6 +71,8 @@ def _of_cadence(scale: FleetScale, whole: FleetRun) -> Iterator[ReportLine]:
         "... behind schedule at the edges: median, 99 %, most", "", _numbers("ms", *(1e3 * x for x in report.late))
     )
     yield ReportLine("... cores kept busy: edges, twin, workers", "2", _cores(whole))
+    others, withheld = whole.watch.elsewhere()
+    yield ReportLine("... by other work; withheld by the host", "0; 0", f"{others:.2f}; {withheld:.2f}")
     spent = [1e3 * whole.watch.spent(role) / max(1, report.windows) for role in ROLES]
     allowed = 1e3 * cores() / scale.rate
     yield ReportLine("... processor time per window: the same", f"< {allowed:.3g} ms", _numbers("ms", *spent))

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from benchmarks.fleet.processes import ProcessUsage, children, used
+from benchmarks.fleet.processes import MachineTimes, ProcessUsage, children, machine_times, used
 
 EDGES, TWIN, WORKERS = "edges", "twin", "workers"
 
@@ -25,12 +25,14 @@ class ResourceSample(NamedTuple):
         Windows that are committed and not worked on.
     age : float
         s, of the oldest of them.
+    machine : MachineTimes
     """
 
     time: float
     used: dict[str, ProcessUsage]
     waiting: int
     age: float
+    machine: MachineTimes
 
 
 @dataclass
@@ -57,7 +59,7 @@ class ResourceWatch:
         roles = {EDGES: used(self.edges), TWIN: used(self.twin)}
         now = {role: usage for role, usage in roles.items() if usage is not None}
         now[WORKERS] = ProcessUsage(sum(each.cpu for each in workers), sum(each.memory for each in workers))
-        sample = ResourceSample(time.monotonic() - self._begin, now, *self.waiting())
+        sample = ResourceSample(time.monotonic() - self._begin, now, *self.waiting(), machine_times())
         self.samples.append(sample)
         return sample
 
@@ -70,6 +72,15 @@ class ResourceWatch:
         """Cores that a role kept busy meanwhile, on average."""
         times = [sample.time for sample in self.samples if role in sample.used]
         return self.spent(role) / (times[-1] - times[0]) if len(times) > 1 else 0.0
+
+    def elsewhere(self) -> tuple[float, float]:
+        """Cores that processes of no role kept busy, and cores that the host withheld, on average."""
+        if len(self.samples) < 2:
+            return 0.0, 0.0
+        first, last = self.samples[0], self.samples[-1]
+        seconds = last.time - first.time
+        others = last.machine.busy - first.machine.busy - sum(self.spent(role) for role in (EDGES, TWIN, WORKERS))
+        return max(0.0, others) / seconds, (last.machine.withheld - first.machine.withheld) / seconds
 
     def memory(self, role: str) -> tuple[int, int, int]:
         """Memory in the first sample, half-way and at most, bytes."""

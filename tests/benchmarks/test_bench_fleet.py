@@ -8,6 +8,7 @@ import math
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import msgspec
@@ -20,7 +21,7 @@ from benchmarks.fleet.edge_load import EdgeLoad
 from benchmarks.fleet.edges import EdgeTurn
 from benchmarks.fleet.line import HttpConnection
 from benchmarks.fleet.plan import LoadPlace, LoadPlan, LoadStart, decode_load, encode_load, shares
-from benchmarks.fleet.processes import ProcessUsage, children, used
+from benchmarks.fleet.processes import MachineTimes, ProcessUsage, children, machine_times, used
 from benchmarks.fleet.runs import FleetRun
 from benchmarks.fleet.setting import QUICK
 from benchmarks.fleet.stock import BOOT, COMMISSIONED, PERIOD, WindowSource, commissioned, readdressed
@@ -278,13 +279,25 @@ def watched(*samples: ResourceSample) -> ResourceWatch:
 
 
 def test_a_role_has_its_cores_and_memory_from_the_samples() -> None:
-    def at(time: float, cpu: float, memory: int) -> ResourceSample:
-        return ResourceSample(time, {EDGES: ProcessUsage(cpu, memory)}, 0, 0.0)
+    def at(seconds: float, cpu: float, memory: int) -> ResourceSample:
+        machine = MachineTimes(2.0 * seconds + cpu, 0.1 * seconds)
+        return ResourceSample(seconds, {EDGES: ProcessUsage(cpu, memory)}, 0, 0.0, machine)
 
     watch = watched(at(0.0, 1.0, 10), at(1.0, 1.2, 30), at(4.0, 3.0, 20))
     assert watch.cores(EDGES) == pytest.approx(0.5)
     assert watch.memory(EDGES) == (10, 30, 30)
     assert watch.cores(TWIN) == 0.0
+    assert watch.elsewhere() == pytest.approx((2.0, 0.1))
+    assert watched().elsewhere() == (0.0, 0.0)
+
+
+def test_the_machine_counts_the_time_of_its_processes() -> None:
+    before, begun = machine_times(), time.process_time()
+    while time.process_time() < begun + 0.1:
+        pass
+    after = machine_times()
+    assert after.busy - before.busy >= 0.08
+    assert after.withheld >= before.withheld
 
 
 def test_the_store_shows_the_waiting_times_of_windows(tmp_path: Path) -> None:
