@@ -9,10 +9,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 _FRESH_S = 10.0
-"""s for which windows may hold up the newest one while the twin takes them."""
-_USEFUL_S = 60.0
-"""s for which an update may be applied after its window's start, where the twin's file says nothing else: older windows
-that take longer, at the pause that the twin asks for, go after the newest one from the start."""
+"""s for which windows may hold up the newest one while the twin takes them. Those that take longer at the pause that the
+twin asks for go after it from the start: of each of a fleet's edges even a single one would hold up all newest ones."""
 _IN_A_ROW = 2
 """Newest windows in a row after which a first older one goes whatever the pause; from then on one after each newest.
 However slow the twin is, a backlog does not grow, and is gone in the time in which it arose."""
@@ -63,7 +61,7 @@ class WindowOrder:
             return first
         if self._held_up_since is None:
             self._held_up_since = now
-        held_up = older * self.pause_s > _USEFUL_S or now - self._held_up_since >= _FRESH_S
+        held_up = older * self.pause_s > _FRESH_S or now - self._held_up_since >= _FRESH_S
         if self._in_a_row >= _IN_A_ROW or not held_up:
             return first
         self._held_up_since = now

@@ -14,11 +14,16 @@ def test_without_a_pause_a_backlog_goes_in_order_and_at_once() -> None:
         order.taken(1e-3 * n, not waiting, len(waiting), 0.0)
 
 
-def test_after_a_long_outage_of_a_large_fleet_the_newest_goes_at_once_and_after_a_short_one_in_order() -> None:
-    """30 older windows at 20 s each would hold the newest one up for ten minutes, one older window does not."""
-    for waiting, first in ((list(range(31)), 30), ([0, 1], 0)):
+def test_where_older_windows_would_hold_up_the_newest_one_it_goes_at_once() -> None:
+    """After a long outage of a small fleet, and after any of a large one; else the windows go in their order."""
+    for pause, waiting, first in ((20.0, list(range(31)), 30), (20.0, [0, 1], 1), (1.0, list(range(12)), 11)):
         order = WindowOrder()
-        order.taken(0.0, True, 0, 20.0)
+        order.taken(0.0, True, 0, pause)
+        order.out_of_reach()
+        assert choose(order, 600.0, waiting) == first
+    for pause, waiting, first in ((1.0, list(range(11)), 0), (2.0, [0, 1], 0), (0.0, list(range(31)), 0)):
+        order = WindowOrder()
+        order.taken(0.0, True, 0, pause)
         order.out_of_reach()
         assert choose(order, 600.0, waiting) == first
 
@@ -53,8 +58,8 @@ def test_a_backlog_shrinks_although_new_windows_come_faster_than_the_pause() -> 
 
 def test_once_the_backlog_is_gone_windows_go_as_they_come() -> None:
     order = WindowOrder()
-    order.taken(0.0, False, 1, 20.0)
-    order.taken(1.0, True, 0, 20.0)
+    order.taken(0.0, False, 1, 5.0)
+    order.taken(1.0, True, 0, 5.0)
     assert choose(order, 2.0, [5]) == 5
     assert choose(order, 2.0, [5, 6]) == 5
     order.out_of_reach()
