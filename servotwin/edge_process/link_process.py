@@ -230,7 +230,7 @@ class LinkProcess:
     def _send_pending(self) -> None:
         """Send the number of pending windows to the control process where it has changed."""
         # Before the acknowledgement: with the old number the agent would think that the twin still has to answer.
-        now = len(self.outbox.pending()), Counter(self.outbox.dropped)
+        now = self.outbox.waiting, Counter(self.outbox.dropped)
         if now != self._pending:
             self._pending = now
             self._pipe.post(frames.encode(frames.PendingFrame(now[0], dict(now[1]))))
@@ -309,7 +309,7 @@ class LinkProcess:
             status |= {"boot": control.boot, "samples": control.samples, **control.values}
             status["tick"] = summarise(control.ticks, longest)
         status["windows"] = {
-            "waiting": len(box.pending()),
+            "waiting": box.waiting,
             "stored": box.stored,
             "letters_waiting": len(box.letters()),
             "dropped": {**(control.dropped if control is not None else {}), **box.dropped},

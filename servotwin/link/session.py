@@ -75,7 +75,9 @@ class Session:
     @property
     def next_time(self) -> float | None:
         """Time at which something is due next, s; None: the outbox is empty."""
-        return self.next_time_of(self._items())
+        if self._attempts:
+            return self.next_time_of(self._items())
+        return None if self._first() is None else self._not_before  # what was never tried is due at once
 
     def next_time_of(self, items: Sequence[Item]) -> float | None:
         """Time at which one of some messages of the outbox is due next, s; None: there are none."""
@@ -90,6 +92,12 @@ class Session:
         """Yield the messages to be sent now, in order."""
         if now >= self._not_before:
             yield from (item for item in self._items() if self._due_time(item) <= now)
+
+    def first_due(self, now: float) -> Item | None:
+        """The first message of `due`; None: there is none."""
+        if self._attempts:
+            return next(self.due(now), None)
+        return self._first() if now >= self._not_before else None
 
     def is_due(self, item: Item, now: float) -> bool:
         """True where a message of the outbox may be sent now."""
@@ -136,6 +144,9 @@ class Session:
         self.counts[count] += 1
         self.trouble = trouble
         self._not_before = now + max(after_s, self._backoff.failed(self._chance()))
+
+    def _first(self) -> Item | None:
+        return next(iter(self.outbox.letters()), None) or self.outbox.oldest()
 
     def _items(self) -> list[Item]:
         items: list[Item] = [*self.outbox.letters(), *self.outbox.pending()]
@@ -211,16 +222,16 @@ class Sender:
         outbox = self.session.outbox
         if isinstance(item, bytes):
             return self.transport.deliver(outbox.letter(item))
-        return self.transport.deliver(outbox.parcel(item)._replace(waiting=len(outbox.pending()) - 1))
+        return self.transport.deliver(outbox.parcel(item)._replace(waiting=outbox.waiting - 1))
 
     def _next(self, now: float, newest: Key | None) -> Item | None:
         """The message to be sent now; None: none is due, or those that are have to wait for the end of a pause."""
-        first = next(self.session.due(now), None)
+        first = self.session.first_due(now)
         if first is None or isinstance(first, bytes):
             return first
         if newest is not None and not self.session.is_due(newest, now):
             newest = None
-        return self._order.next(now, first, newest, len(self.session.outbox.pending()) - 1)
+        return self._order.next(now, first, newest, self.session.outbox.waiting - 1)
 
     def _fresh(self) -> Key | None:
         """The newest window, unless the twin has had a newer one."""
@@ -234,11 +245,12 @@ class Sender:
 
     def _note_taken(self, window: Key, fresh: bool, now: float, pause: float) -> None:
         """Note that the twin has taken a window and asks for a pause (s) before older ones."""
-        left = self.session.outbox.pending()
         if fresh:
-            # Of the boots before this one, nothing that is still there is newer.
-            self._newest, self._boots = window, frozenset(boot for boot, _ in left)
-        self._order.taken(now, fresh, len(left) - 1, pause)
+            if self._newest is None or window[0] != self._newest[0]:
+                # Of the boots before this one, nothing that is still there is newer.
+                self._boots = frozenset(boot for boot, _ in self.session.outbox.pending())
+            self._newest = window
+        self._order.taken(now, fresh, self.session.outbox.waiting - 1, pause)
 
     def _wait(self, now: float) -> float:
         """Time until something is due, s."""
