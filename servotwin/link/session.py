@@ -32,16 +32,19 @@ _OLDER_TWIN_S = 600.0
 """s between two tries of a message that the twin's version does not know."""
 _TO_EDGES = Update | Request | Acknowledge | LearntResponse | Resend
 """Messages that a twin sends to an edge."""
+_NOT_KNOWN = "not understood"
+"""Count of the twin's messages that this version does not know."""
 Item = Key | bytes
 """A window's key, or a letter's digest."""
 
 
 @dataclass(slots=True)
 class _Attempt:
-    """Tries of one message; the next one is at `due`, s."""
+    """Tries of one message; the next one is at `due`, s. `unknown`: the twin is too old for it, in the twin's words."""
 
     due: float
     backoff: Backoff
+    unknown: str = ""
 
 
 class Session:
@@ -71,6 +74,12 @@ class Session:
         self._retry, self._chance = retry or Retry(), chance
         self._backoff, self._not_before = Backoff(self._retry), -inf
         self._attempts: dict[Item, _Attempt] = {}
+
+    @property
+    def not_known(self) -> str:
+        """Refusal of a message that waits until the twin is upgraded; empty: there is none."""
+        attempts = list(self._attempts.values())  # another thread may ask
+        return next((attempt.unknown for attempt in attempts if attempt.unknown), "")
 
     @property
     def next_time(self) -> float | None:
@@ -133,6 +142,7 @@ class Session:
             self.retry_later(item, now, after_s)
         elif reason is Refusal.UNKNOWN_SCHEMA:  # so does this; it lasts until the twin is upgraded
             self.retry_later(item, now, max(after_s, _OLDER_TWIN_S))
+            self._attempts[item].unknown = detail
         else:
             self._pause(now, "refused", detail, after_s)
 
@@ -322,9 +332,10 @@ class Receiver:
             return self._pause("unreachable", str(error), 0.0)
         except Refused as error:
             return self._pause(f"refused: {error.reason.value}", str(error), error.after_s)
+        unknown = self.counts[_NOT_KNOWN]
         messages = [message for message in map(self._checked, received) if message is not None]
         if received and not messages:  # without a pause the next poll would bring the same at once, for ever
-            return self._pause("nothing new", "the twin's messages are broken, repeated or not for an edge", 0.0)
+            return self._pause("nothing new", self._why_none(unknown), 0.0)
         self._backoff.succeeded()
         self.trouble = ""
         return Received(0.0, messages)
@@ -348,8 +359,19 @@ class Receiver:
             known = isinstance(decode(sealed.body), _TO_EDGES)
         except InvalidMessage:
             known = False
-        self.counts["received" if known else "not understood"] += 1
+        self.counts["received" if known else _NOT_KNOWN] += 1
         return (sealed.serial, sealed.body) if known else None
+
+    def _why_none(self, unknown_before: int) -> str:
+        """Reason for which there is no message for the edge among those that came."""
+        if self.counts[_NOT_KNOWN] > unknown_before:
+            return "the twin is newer: this edge does not know its message"
+        return "the twin's messages are broken, repeated or not for an edge"
+
+    @property
+    def not_known(self) -> int:
+        """Number of messages of a twin that is newer than this edge."""
+        return self.counts[_NOT_KNOWN]
 
     def _pause(self, count: str, trouble: str, after_s: float) -> Received:
         self.counts[count] += 1
