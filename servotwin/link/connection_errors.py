@@ -5,6 +5,7 @@ OpenSSL names its own source in its messages, and no key.
 
 from __future__ import annotations
 
+import ssl
 import time
 from http.client import BadStatusLine
 from pathlib import Path
@@ -25,6 +26,7 @@ def cause_of(error: object, encrypted: bool, ca: str | Path | None, key: str = "
     Parameters
     ----------
     error : exception or str
+        Some libraries give a text.
     encrypted : bool
         The connection was to be one with TLS.
     ca : path, optional
@@ -60,9 +62,14 @@ def _fault_of_tls(error: object) -> str:
         return "its port does not answer with TLS"
     if isinstance(error, TimeoutError) and "handshake" in str(error):
         return "the server does not end the TLS handshake"
+    if isinstance(error, ssl.SSLEOFError | ssl.SSLZeroReturnError):
+        return "the server ended the encrypted connection"
+    if isinstance(error, ssl.SSLError) and reason:
+        return f"TLS failed ({reason.lower().replace('_', ' ')})"
     return _named(error)
 
 
 def _named(error: object) -> str:
-    plain = isinstance(error, OSError) and not getattr(error, "reason", None)
-    return (plain and getattr(error, "strerror", None)) or f"{type(error).__name__}: {error}"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return error if isinstance(error, str) else f"{type(error).__name__}: {error}"

@@ -121,8 +121,13 @@ FAULTS = [
 
 
 ASKED = [
-    *((ask, *each) for ask in (of_edge, of_webhook, of_audit) for each in FAULTS),
-    *((of_broker, *each) for each in FAULTS if each[0] in (expired, no_intermediate, no_tls)),
+    *((of_edge, *each) for each in FAULTS),
+    *(
+        (ask, *each)
+        for ask in (of_broker, of_webhook, of_audit)
+        for each in FAULTS
+        if each[0] in (expired, unknown_issuer, no_intermediate)
+    ),
 ]
 
 
@@ -153,6 +158,15 @@ def test_a_handshake_that_does_not_end_is_named(ask: Asked, tmp_path: Path, monk
 
 def _quick(init: Callable[..., None]) -> Callable[..., None]:
     return lambda self, url, servo, token, ca, _timeout, wait: init(self, url, servo, token, ca, 0.3, wait)
+
+
+def test_a_server_that_wants_a_certificate_of_the_edge_is_named(tmp_path: Path) -> None:
+    """Its alert or the end of the connection comes first, by chance."""
+    made = self_made(tmp_path)
+    with wiretap(made, mutual=True) as server:
+        said = of_edge(f"://127.0.0.1:{server.port}", made[0], tmp_path)
+    ends = "TLS failed (tlsv13 alert certificate required)", "the server ended the encrypted connection"
+    assert said in (*ends, "Connection reset by peer", "Broken pipe")
 
 
 def test_a_url_without_tls_at_a_port_with_it_is_said_with_the_likely_reason(tmp_path: Path) -> None:

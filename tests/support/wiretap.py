@@ -18,10 +18,13 @@ class Wiretap:
         version: ssl.TLSVersion | None = None,
         mute: bool = False,
         answer: bytes = b"",
+        mutual: bool = False,
     ) -> None:
         self.received, self.connected = bytearray(), Event()
         self._mute, self._answer, self._ended = mute, answer, Event()
         self._context = None if certificate is None else _context(certificate, version)
+        if mutual and self._context is not None:
+            self._context.verify_mode = ssl.CERT_REQUIRED
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port: int = self._listener.getsockname()[1]
         self._thread = Thread(target=self._serve)
@@ -69,8 +72,10 @@ def wiretap(
     version: ssl.TLSVersion | None = None,
     mute: bool = False,
     answer: bytes = b"",
+    mutual: bool = False,
 ) -> Iterator[Wiretap]:
-    made = Wiretap(certificate, version, mute, answer)
+    """One that runs; `mute`: it says nothing, `mutual`: it wants a certificate of its client."""
+    made = Wiretap(certificate, version, mute, answer, mutual)
     try:
         yield made
     finally:
