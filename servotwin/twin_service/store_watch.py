@@ -104,8 +104,8 @@ class StoreWatch:
         if not self._newer:
             return []
         return [
-            f"a newer servotwin has migrated the store to schema {self._newer} while this twin, which knows {REVISION}, "
-            "runs: end this twin, and install the newer servotwin"
+            f"a newer servotwin has migrated the store to schema {self._newer} while this twin, which knows "
+            f"{REVISION}, runs: end this twin, and install the newer servotwin"
         ]
 
     async def put(self, item: Incoming) -> PutResult:

@@ -103,6 +103,10 @@ def test_an_answer_of_a_newer_twin_over_a_broker_is_named(
     monkeypatch.setattr(
         twin_mqtt, "encode_response", lambda key, servo, serial, _: seal(key, "answer to edge", servo, serial, newer)
     )
-    with twin(Broker(server.url), store), edge(Broker(server.url), timeout_s=3.0) as sender:
-        with pytest.raises(Unreachable, match="this edge does not know the twin's answer: response not understood: "):
-            sender.deliver(parcel(0))
+    words = "this edge does not know the twin's answer: response not understood: "
+    with (
+        twin(Broker(server.url), store),
+        edge(Broker(server.url), timeout_s=3.0) as sender,
+        pytest.raises(Unreachable, match=words),
+    ):
+        sender.deliver(parcel(0))
