@@ -21,6 +21,7 @@ from servotwin.config.files import read_secret
 from servotwin.config.table import did_you_mean
 from servotwin.dashboard.series import machine_series
 from servotwin.errors import InvalidInput
+from servotwin.link.connection_errors import cause_of
 from servotwin.link.seal import MAX_TOKEN
 from servotwin.link.url import in_clear, is_encrypted
 from servotwin.runtime import files
@@ -231,7 +232,10 @@ def _client(source: Source) -> Callable[[str], bytes]:
         except HTTPError as error:
             raise InvalidInput(f"{url}: {_refusal(error)}") from None
         except (URLError, HTTPException, OSError, ValueError) as error:
-            raise InvalidInput(f"{url}: cannot be reached ({getattr(error, 'reason', error)})") from None
+            # urllib wraps the error of a connection in its own.
+            inner = error.reason if isinstance(error, URLError) else error
+            cause = cause_of(inner, is_encrypted(url), source.ca, "--ca")
+            raise InvalidInput(f"{url}: cannot be reached ({cause})") from None
 
     return get
 

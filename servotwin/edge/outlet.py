@@ -208,7 +208,7 @@ class LocalOutlet:
     @property
     def unacknowledged(self) -> bool:
         """True where a window waits for the twin's acknowledgement."""
-        return bool(self.outbox.pending())
+        return self.outbox.waiting > 0
 
     @property
     def dropped(self) -> Mapping[str, int]:

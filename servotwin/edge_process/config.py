@@ -22,7 +22,7 @@ from servotwin.edge.settings import AgentSettings
 from servotwin.errors import InvalidInput
 from servotwin.link.broker import is_mqtt
 from servotwin.link.seal import MAX_TOKEN
-from servotwin.link.url import in_clear, is_encrypted, tls_context
+from servotwin.link.url import in_clear, is_encrypted, system_certificates, tls_context
 
 ROLES = ("control", "supervise")
 UNBOOTED = "unbooted"
@@ -290,7 +290,7 @@ def check_certificates(config: EdgeConfig) -> None:
 
 
 def certificates_of(config: EdgeConfig) -> bytes:
-    """Read the certificates against which the twin's is checked; empty: the system's, or none.
+    """Read the certificates against which the twin's is checked; empty: the link is not encrypted, or there are none.
 
     Raises
     ------
@@ -298,13 +298,14 @@ def certificates_of(config: EdgeConfig) -> bytes:
         The file cannot be read, or holds none.
     """
     twin = config.twin
-    if twin is None or twin.ca_file is None or not is_encrypted(twin.url):
+    if twin is None or not is_encrypted(twin.url):
         return b""
     check_certificates(config)
+    path = system_certificates() if twin.ca_file is None else config.path(twin.ca_file)
     try:
-        return config.path(twin.ca_file).read_bytes()
+        return b"" if path is None else path.read_bytes()
     except OSError as error:
-        raise InvalidInput(f"{twin.ca_file}: cannot be read ({error.strerror or error})") from None
+        raise InvalidInput(f"{path}: cannot be read ({error.strerror or error})") from None
 
 
 def _secret(

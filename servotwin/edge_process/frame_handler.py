@@ -83,7 +83,8 @@ class FrameHandler:
 
     def _confirmed(self) -> list[int]:
         """Serials of frames that are on the disk, were dropped, or are beyond the limit of unwritten bytes."""
-        flushed, pending = self._outbox.flushed, set(self._outbox.pending())
+        flushed = self._outbox.flushed
+        pending = set() if flushed else set(self._outbox.pending())
         over = sum(each.size for each in self._unconfirmed.values()) - MOST_UNWRITTEN
         confirmed = []
         for serial, each in self._unconfirmed.items():

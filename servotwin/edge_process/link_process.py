@@ -42,7 +42,7 @@ from servotwin.edge_process.monitoring import (
 from servotwin.edge_process.open_outbox import open_outbox
 from servotwin.edge_process.shared_samples import SampleReader
 from servotwin.edge_process.transports import exclusive_transport, live_link
-from servotwin.edge_process.twin_limits import limits_told, window_trouble
+from servotwin.edge_process.twin_limits import limits_told, version_trouble, window_trouble
 from servotwin.errors import InvalidInput
 from servotwin.link.claim import ExclusiveTransport
 from servotwin.link.session import Receiver, Sender, Session
@@ -210,6 +210,7 @@ class LinkProcess:
             self._troubles.update("to the twin", self._session.trouble)
             self._troubles.update("from the twin", self._receiver.trouble)
             self._troubles.update("windows", window_trouble(self._config.agent, self._twin))
+            self._troubles.update("version", version_trouble(self._session, self._receiver))
         if (dropped := self._dropped_unintended()) != self._dropped:
             self._dropped = dropped
             log("windows dropped", **dropped)
@@ -230,7 +231,7 @@ class LinkProcess:
     def _send_pending(self) -> None:
         """Send the number of pending windows to the control process where it has changed."""
         # Before the acknowledgement: with the old number the agent would think that the twin still has to answer.
-        now = len(self.outbox.pending()), Counter(self.outbox.dropped)
+        now = self.outbox.waiting, Counter(self.outbox.dropped)
         if now != self._pending:
             self._pending = now
             self._pipe.post(frames.encode(frames.PendingFrame(now[0], dict(now[1]))))
@@ -309,7 +310,7 @@ class LinkProcess:
             status |= {"boot": control.boot, "samples": control.samples, **control.values}
             status["tick"] = summarise(control.ticks, longest)
         status["windows"] = {
-            "waiting": len(box.pending()),
+            "waiting": box.waiting,
             "stored": box.stored,
             "letters_waiting": len(box.letters()),
             "dropped": {**(control.dropped if control is not None else {}), **box.dropped},

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import urlsplit
 
 from servotwin.errors import InvalidInput
+from servotwin.link.connection_errors import cause_of
 from servotwin.link.url import tls_context
 from servotwin.runtime.extras import missing_extra
 
@@ -151,6 +152,7 @@ class Connection:
     def __init__(self, broker: Broker, session: MqttSession, events: MqttCallbacks) -> None:
         self._session, self._events = session, events
         self._number, self._fresh, self._up, self._answered, self._closing = 0, True, False, False, False
+        self._trust = broker.tls, broker.ca_file
         self._hint = "" if broker.tls else ": where its port is one with TLS, url begins with mqtts://"
         self._client = _client(broker, session)
         self._client.on_socket_open = _no_delay
@@ -213,7 +215,7 @@ class Connection:
 
     def _failed(self, _client: Client, _user: Any) -> None:
         # paho calls this while it handles the exception, which it does not pass on.
-        self._events.lost(f"the broker cannot be reached ({sys.exc_info()[1]})")
+        self._events.lost(f"the broker cannot be reached ({cause_of(sys.exc_info()[1], *self._trust)})")
 
     def _published(self, _client: Client, _user: Any, mid: int, reason: Any, _properties: Any) -> None:
         if reason.value == _NO_SUBSCRIBERS:

@@ -15,6 +15,7 @@ import msgspec
 
 from servotwin.link.body_mark import body_mark
 from servotwin.link.claim import HeldClaim
+from servotwin.link.connection_errors import cause_of
 from servotwin.link.transport import LONGEST_OLDER_PAUSE_S, Parcel, Refused, Unreachable
 from servotwin.link.url import is_encrypted, tls_context
 from servotwin.messages import MAX_BYTES, Acknowledge, ClaimStatus, EdgeClaim, InvalidMessage, Refusal, decode, encode
@@ -32,8 +33,6 @@ s. A version that does not know them ignores them."""
 _LONGEST_PAUSE_S = 300.0
 """A longer Retry-After is cut to this."""
 _PIECE = 65536
-_OUT_OF_DATE = 9, 10
-"""OpenSSL's codes for a certificate that is not yet valid, and for one that has expired."""
 _NO_ADDRESS = 404, 405
 """Statuses of a twin that knows no such path, or not that method: it has judged no message."""
 _MARKS = 5
@@ -60,6 +59,21 @@ class _Response(msgspec.Struct, frozen=True):
     older_pause: str = ""
 
 
+class _TlsConnection(HTTPSConnection):
+    """A connection whose socket can be shut down while its handshake is under way."""
+
+    def __init__(self, host: str, port: int | None, timeout: float, context: ssl.SSLContext) -> None:
+        super().__init__(host, port, timeout=timeout, context=context)
+        self._tls = context
+
+    def connect(self) -> None:
+        """Connect, and do the handshake on a socket that is known already."""
+        HTTPConnection.connect(self)
+        encrypted = self._tls.wrap_socket(self.sock, server_hostname=self.host, do_handshake_on_connect=False)
+        self.sock = encrypted
+        encrypted.do_handshake()
+
+
 class _PersistentConnection:
     """One connection, which stays open from request to request and is opened again when the server has closed it.
 
@@ -70,8 +84,8 @@ class _PersistentConnection:
     token : str
     timeout_s : float
         Time limit of one request and its response, s.
-    context : ssl.SSLContext, optional
-        For https.
+    ca_file : str, optional
+        As of `HttpTransport`.
     clock : callable
         Returns monotonic seconds.
     """
@@ -81,10 +95,11 @@ class _PersistentConnection:
         url: str,
         token: str,
         timeout_s: float,
-        context: ssl.SSLContext | None,
+        ca_file: str | None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._parts, self._timeout, self._context, self._clock = urlsplit(url), timeout_s, context, clock
+        self._parts, self._timeout, self._ca_file, self._clock = urlsplit(url), timeout_s, ca_file, clock
+        self._context = tls_context(ca_file) if is_encrypted(url) else None
         self._headers = {"Authorization": f"Bearer {token}", "Accept": BODY}
         self._connection: HTTPConnection | None = None
         self._closed, self._busy = False, Lock()
@@ -107,7 +122,7 @@ class _PersistentConnection:
             self.drop()
             # A server may close an idle connection at any time: only a fresh one tells that it is out of reach.
             if fresh or isinstance(error, TimeoutError):
-                raise Unreachable(_reason(error)) from None
+                raise Unreachable(cause_of(error, self._context is not None, self._ca_file)) from None
         return self._request(method, path, body, headers, limit)
 
     def drop(self) -> None:
@@ -157,7 +172,7 @@ class _PersistentConnection:
         if self._context is None:
             self._connection = HTTPConnection(host, port, timeout=self._timeout)
         else:
-            self._connection = HTTPSConnection(host, port, timeout=self._timeout, context=self._context)
+            self._connection = _TlsConnection(host, port, timeout=self._timeout, context=self._context)
         return self._connection
 
     def _read(self, response: HTTPResponse, limit: int, deadline: float) -> bytes:
@@ -189,9 +204,8 @@ class LiveHttp:
     def __init__(
         self, url: str, servo: str, token: str, ca_file: str | None, timeout_s: float = 10.0, wait_s: float = 25.0
     ) -> None:
-        context = tls_context(ca_file) if is_encrypted(url) else None
         self._path, self._wait = f"/v1/servos/{quote(servo, safe='')}/live", wait_s
-        self._connection = _PersistentConnection(url, token, timeout_s + wait_s, context)
+        self._connection = _PersistentConnection(url, token, timeout_s + wait_s, ca_file)
 
     def send(self, columns: LiveColumns, claim: HeldClaim) -> bool:
         """Send columns; without any, wait until somebody watches. Return True while somebody does.
@@ -241,12 +255,11 @@ class HttpTransport:
         timeout_s: float = 10.0,
         wait_s: float = 25.0,
     ) -> None:
-        context = tls_context(ca_file) if is_encrypted(url) else None
         self._base, self._wait = f"/v1/servos/{quote(servo, safe='')}", wait_s
         self.claim = HeldClaim()
         self._twin_marks = False
-        self._up = _PersistentConnection(url, token, timeout_s, context)
-        self._down = _PersistentConnection(url, token, timeout_s + wait_s, context)
+        self._up = _PersistentConnection(url, token, timeout_s, ca_file)
+        self._down = _PersistentConnection(url, token, timeout_s + wait_s, ca_file)
 
     def deliver(self, parcel: Parcel) -> float:
         """Return when the twin has the message safe; see `Transport`."""
@@ -304,14 +317,6 @@ class HttpTransport:
         """Close both connections."""
         self._up.close()
         self._down.close()
-
-
-def _reason(error: Exception) -> str:
-    """Reason for which no twin was reached; where its certificate is out of date, with the date of this computer."""
-    reason = f"{type(error).__name__}: {error}"
-    if getattr(error, "verify_code", 0) in _OUT_OF_DATE:
-        reason += f"; the clock of this computer says {time.strftime('%Y-%m-%d', time.gmtime())}"
-    return reason
 
 
 def _claimed(claim: HeldClaim) -> dict[str, str]:

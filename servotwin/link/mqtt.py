@@ -22,6 +22,7 @@ from servotwin.link.mqtt_messages import (
     TWIN_GONE,
     MqttRequest,
     MqttResponse,
+    NotKnown,
     PollRequest,
     PollResponse,
     PutRequest,
@@ -226,8 +227,11 @@ class MqttTransport:
             # It may have been the one with the request: the session repeats it now instead of after its time limit.
             self._fail_all("a twin is gone")
             return
+        response: MqttResponse | UnknownPeer | Unreachable
         try:
             serial, response = decode_response(self._key, self._servo, payload)
+        except NotKnown as newer:
+            serial, response = newer.serial, Unreachable(f"this edge does not know the twin's answer: {newer}")
         except InvalidMessage:
             return
         with self._lock:

@@ -121,6 +121,20 @@ class UnknownPeer(Struct, frozen=True, tag="stranger/1"):
     serial: Count
 
 
+class NotKnown(InvalidMessage):
+    """A message that its sender has sealed, and that this version does not know.
+
+    Attributes
+    ----------
+    serial : int
+        Of the request.
+    """
+
+    def __init__(self, text: str, serial: int) -> None:
+        super().__init__(text, Refusal.UNKNOWN_SCHEMA)
+        self.serial = serial
+
+
 MqttRequest = PutRequest | PollRequest
 MqttResponse = PutResponse | PollResponse | RefusedResponse
 
@@ -161,12 +175,12 @@ def encode_request(key: bytes, servo: str, serial: int, request: MqttRequest) ->
 
 
 def decode_request(key: bytes, servo: str, data: bytes) -> ReceivedRequest:
-    """Decode a request; raises InvalidMessage as `seal.opened` does, or where the body is not a request."""
+    """Decode a request; raises InvalidMessage as `seal.opened` does, NotKnown for another body."""
     sealed = opened(key, TO_TWIN, servo, data, MAX_BYTES + OVERHEAD)
     try:
         return ReceivedRequest(servo, sealed.serial, _request_decoder.decode(sealed.body))
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InvalidMessage(f"request not understood: {error}") from None
+        raise NotKnown(f"request not understood: {error}", sealed.serial) from None
 
 
 def encode_response(key: bytes, servo: str, serial: int, response: MqttResponse) -> bytes:
@@ -181,7 +195,7 @@ def encode_unknown_peer(data: bytes) -> bytes | None:
 
 
 def decode_response(key: bytes, servo: str, data: bytes) -> tuple[int, MqttResponse | UnknownPeer]:
-    """Decode a response and the serial of its request; raises InvalidMessage where the bytes are not a response."""
+    """Decode a response and the serial of its request; raises InvalidMessage and NotKnown as `decode_request`."""
     envelope = _decode_envelope(data, LIMIT + OVERHEAD)
     if isinstance(envelope, UnknownPeer):
         return envelope.serial, envelope
@@ -189,7 +203,7 @@ def decode_response(key: bytes, servo: str, data: bytes) -> tuple[int, MqttRespo
     try:
         return sealed.serial, _response_decoder.decode(sealed.body)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-        raise InvalidMessage(f"response not understood: {error}") from None
+        raise NotKnown(f"response not understood: {error}", sealed.serial) from None
 
 
 def _decode_envelope(data: bytes, limit: int) -> Sealed | UnknownPeer | None:

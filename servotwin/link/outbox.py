@@ -51,8 +51,15 @@ class Outbox(Protocol):
     def count_dropped(self, reason: str) -> None:
         """Count a window that was dropped before it was put here."""
 
+    @property
+    def waiting(self) -> int:
+        """Number of windows."""
+
     def pending(self) -> Sequence[Key]:
-        """Keys of all windows, oldest first."""
+        """Keys of all windows, oldest first; this takes its time where they are many."""
+
+    def oldest(self) -> Key | None:
+        """Key of the first window of `pending`; None: there is none."""
 
     def newest(self) -> Key | None:
         """Key of the newest window that the twin has never acknowledged; None: there is none."""
@@ -133,9 +140,18 @@ class MemoryOutbox:
         """Count a window that was dropped before it was put here."""
         self._dropped[reason] += 1
 
+    @property
+    def waiting(self) -> int:
+        """Number of windows."""
+        return len(self._windows)
+
     def pending(self) -> list[Key]:
         """Keys of all windows, oldest first."""
         return list(self._windows)
+
+    def oldest(self) -> Key | None:
+        """Key of the oldest window; None: there is none."""
+        return next(iter(self._windows), None)
 
     def newest(self) -> Key | None:
         """Key of the newest window; None: there is none."""

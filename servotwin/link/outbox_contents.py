@@ -62,6 +62,20 @@ class OutboxContents:
         """True for a window that waits, and for one that was acknowledged and is kept."""
         return key in self.index or key in self._kept.entries
 
+    def pending(self) -> list[Key]:
+        """Keys of all windows, oldest first; those that are sent once more come last."""
+        return sorted(self.index, key=lambda key: self.index[key].again)
+
+    def oldest(self) -> Key | None:
+        """First key of `pending`; None: there is none."""
+        # Without making the list: it is asked for with each window that is sent, and there may be thousands.
+        fresh = (key for key, entry in self.index.items() if not entry.again)
+        return next(fresh, None) or next(iter(self.index), None)
+
+    def newest(self) -> Key | None:
+        """Key of the newest window that the twin has never acknowledged; None: there is none."""
+        return next((key for key, entry in reversed(self.index.items()) if not entry.again), None)
+
     def add_window(self, key: Key, reason: str, encoding: str, body: bytes) -> None:
         """Add the newest window."""
         self.index[key] = Entry(len(body), is_uninformative(reason))

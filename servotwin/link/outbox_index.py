@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from operator import itemgetter
 from typing import NamedTuple
 
 from servotwin.link.outbox import Key
@@ -97,6 +98,9 @@ _UNINFORMATIVE = ("periodic",)
 """First words of the reasons of windows that are dropped first."""
 
 
+_SIZE = itemgetter(0)
+
+
 class Entry(NamedTuple):
     """Entry of the index for a window.
 
@@ -125,8 +129,10 @@ def excess(index: Mapping[Key, Entry], windows: int, size: int) -> list[Key]:
 
     Windows that the twin had acknowledged go first, then uninformative ones.
     """
-    over, heavy = len(index) - windows, sum(entry.size for entry in index.values()) - size
+    over, heavy = len(index) - windows, sum(map(_SIZE, index.values())) - size
     dropped: list[Key] = []
+    if over <= 0 and heavy <= 0:  # before it sorts thousands, with each window that is put
+        return dropped
     # Stable: by age within each.
     for key, entry in sorted(index.items(), key=lambda item: (not item[1].again, not item[1].uninformative)):
         if over <= 0 and heavy <= 0:

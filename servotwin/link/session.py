@@ -32,16 +32,19 @@ _OLDER_TWIN_S = 600.0
 """s between two tries of a message that the twin's version does not know."""
 _TO_EDGES = Update | Request | Acknowledge | LearntResponse | Resend
 """Messages that a twin sends to an edge."""
+_NOT_KNOWN = "not understood"
+"""Count of the twin's messages that this version does not know."""
 Item = Key | bytes
 """A window's key, or a letter's digest."""
 
 
 @dataclass(slots=True)
 class _Attempt:
-    """Tries of one message; the next one is at `due`, s."""
+    """Tries of one message; the next one is at `due`, s. `unknown`: the twin is too old for it, in the twin's words."""
 
     due: float
     backoff: Backoff
+    unknown: str = ""
 
 
 class Session:
@@ -73,9 +76,17 @@ class Session:
         self._attempts: dict[Item, _Attempt] = {}
 
     @property
+    def not_known(self) -> str:
+        """Refusal of a message that waits until the twin is upgraded; empty: there is none."""
+        attempts = list(self._attempts.values())  # another thread may ask
+        return next((attempt.unknown for attempt in attempts if attempt.unknown), "")
+
+    @property
     def next_time(self) -> float | None:
         """Time at which something is due next, s; None: the outbox is empty."""
-        return self.next_time_of(self._items())
+        if self._attempts:
+            return self.next_time_of(self._items())
+        return None if self._first() is None else self._not_before  # what was never tried is due at once
 
     def next_time_of(self, items: Sequence[Item]) -> float | None:
         """Time at which one of some messages of the outbox is due next, s; None: there are none."""
@@ -90,6 +101,12 @@ class Session:
         """Yield the messages to be sent now, in order."""
         if now >= self._not_before:
             yield from (item for item in self._items() if self._due_time(item) <= now)
+
+    def first_due(self, now: float) -> Item | None:
+        """The first message of `due`; None: there is none."""
+        if self._attempts:
+            return next(self.due(now), None)
+        return self._first() if now >= self._not_before else None
 
     def is_due(self, item: Item, now: float) -> bool:
         """True where a message of the outbox may be sent now."""
@@ -125,6 +142,7 @@ class Session:
             self.retry_later(item, now, after_s)
         elif reason is Refusal.UNKNOWN_SCHEMA:  # so does this; it lasts until the twin is upgraded
             self.retry_later(item, now, max(after_s, _OLDER_TWIN_S))
+            self._attempts[item].unknown = detail
         else:
             self._pause(now, "refused", detail, after_s)
 
@@ -136,6 +154,9 @@ class Session:
         self.counts[count] += 1
         self.trouble = trouble
         self._not_before = now + max(after_s, self._backoff.failed(self._chance()))
+
+    def _first(self) -> Item | None:
+        return next(iter(self.outbox.letters()), None) or self.outbox.oldest()
 
     def _items(self) -> list[Item]:
         items: list[Item] = [*self.outbox.letters(), *self.outbox.pending()]
@@ -211,16 +232,16 @@ class Sender:
         outbox = self.session.outbox
         if isinstance(item, bytes):
             return self.transport.deliver(outbox.letter(item))
-        return self.transport.deliver(outbox.parcel(item)._replace(waiting=len(outbox.pending()) - 1))
+        return self.transport.deliver(outbox.parcel(item)._replace(waiting=outbox.waiting - 1))
 
     def _next(self, now: float, newest: Key | None) -> Item | None:
         """The message to be sent now; None: none is due, or those that are have to wait for the end of a pause."""
-        first = next(self.session.due(now), None)
+        first = self.session.first_due(now)
         if first is None or isinstance(first, bytes):
             return first
         if newest is not None and not self.session.is_due(newest, now):
             newest = None
-        return self._order.next(now, first, newest, len(self.session.outbox.pending()) - 1)
+        return self._order.next(now, first, newest, self.session.outbox.waiting - 1)
 
     def _fresh(self) -> Key | None:
         """The newest window, unless the twin has had a newer one."""
@@ -234,11 +255,12 @@ class Sender:
 
     def _note_taken(self, window: Key, fresh: bool, now: float, pause: float) -> None:
         """Note that the twin has taken a window and asks for a pause (s) before older ones."""
-        left = self.session.outbox.pending()
         if fresh:
-            # Of the boots before this one, nothing that is still there is newer.
-            self._newest, self._boots = window, frozenset(boot for boot, _ in left)
-        self._order.taken(now, fresh, len(left) - 1, pause)
+            if self._newest is None or window[0] != self._newest[0]:
+                # Of the boots before this one, nothing that is still there is newer.
+                self._boots = frozenset(boot for boot, _ in self.session.outbox.pending())
+            self._newest = window
+        self._order.taken(now, fresh, self.session.outbox.waiting - 1, pause)
 
     def _wait(self, now: float) -> float:
         """Time until something is due, s."""
@@ -310,9 +332,10 @@ class Receiver:
             return self._pause("unreachable", str(error), 0.0)
         except Refused as error:
             return self._pause(f"refused: {error.reason.value}", str(error), error.after_s)
+        unknown = self.counts[_NOT_KNOWN]
         messages = [message for message in map(self._checked, received) if message is not None]
         if received and not messages:  # without a pause the next poll would bring the same at once, for ever
-            return self._pause("nothing new", "the twin's messages are broken, repeated or not for an edge", 0.0)
+            return self._pause("nothing new", self._why_none(unknown), 0.0)
         self._backoff.succeeded()
         self.trouble = ""
         return Received(0.0, messages)
@@ -336,8 +359,19 @@ class Receiver:
             known = isinstance(decode(sealed.body), _TO_EDGES)
         except InvalidMessage:
             known = False
-        self.counts["received" if known else "not understood"] += 1
+        self.counts["received" if known else _NOT_KNOWN] += 1
         return (sealed.serial, sealed.body) if known else None
+
+    def _why_none(self, unknown_before: int) -> str:
+        """Reason for which there is no message for the edge among those that came."""
+        if self.counts[_NOT_KNOWN] > unknown_before:
+            return "the twin is newer: this edge does not know its message"
+        return "the twin's messages are broken, repeated or not for an edge"
+
+    @property
+    def not_known(self) -> int:
+        """Number of messages of a twin that is newer than this edge."""
+        return self.counts[_NOT_KNOWN]
 
     def _pause(self, count: str, trouble: str, after_s: float) -> Received:
         self.counts[count] += 1

@@ -198,13 +198,22 @@ class SqliteOutbox:
     def pending(self) -> list[Key]:
         """Keys of all windows, oldest first; those that are sent once more come last."""
         with self._lock:
-            index = self._contents.index
-            return sorted(index, key=lambda key: index[key].again)
+            return self._contents.pending()
+
+    @property
+    def waiting(self) -> int:
+        """Number of windows."""
+        return len(self._contents.index)
+
+    def oldest(self) -> Key | None:
+        """Key of the first window of `pending`; None: there is none."""
+        with self._lock:
+            return self._contents.oldest()
 
     def newest(self) -> Key | None:
         """Key of the newest window that the twin has never acknowledged; None: there is none."""
         with self._lock:
-            return next((key for key, entry in reversed(self._contents.index.items()) if not entry.again), None)
+            return self._contents.newest()
 
     def put_letter(self, body: bytes) -> None:
         """Store a letter (an encoded message); equal letters are stored once."""

@@ -44,6 +44,14 @@ def certificates(_table: Table, _name: str, path: _Path, _folder: Path) -> _Path
     return path
 
 
+def system_certificates() -> Path | None:
+    """File of the certificates that this computer trusts, which a context reads once; None: it has none."""
+    import ssl  # as below
+
+    found = ssl.get_default_verify_paths().cafile
+    return None if found is None else Path(found)
+
+
 def tls_context(ca_file: str | None) -> ssl.SSLContext:
     """Make the context of a client that checks certificates against those of a file; None: the system's.
 

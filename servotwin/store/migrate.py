@@ -46,6 +46,13 @@ def is_newest(engine: sa.Engine) -> bool:
         return _revision(connection) == REVISION
 
 
+def newer_revision(engine: sa.Engine) -> str:
+    """Revision of a database that a newer servotwin has migrated; empty: none has. Raises StoreUnavailable."""
+    with transaction(engine) as connection:
+        revision = _revision(connection)
+    return revision if revision is not None and revision > REVISION else ""
+
+
 def _revision(connection: sa.Connection) -> str | None:
     """Read the revision of a database; None: an empty one."""
     if not sa.inspect(connection).has_table(VERSIONS):

@@ -16,6 +16,7 @@ from servotwin.link.mqtt_messages import (
     REQUEST_TOPICS,
     TWIN_GONE,
     MqttResponse,
+    NotKnown,
     PollRequest,
     PollResponse,
     PutResponse,
@@ -51,8 +52,9 @@ _RESPONSE_EXPIRY_S = 60.0
 _MOST_HELD_BACK = 1000
 """Answers to refused requests that are held back at once; further ones are left out, since nobody waits for so many."""
 
-_TOPIC_SHOWN = 100
-"""Characters of a topic that is no servo's in the log: anybody on the broker may choose 65,535."""
+_TOPIC_SHOWN, _LONGEST_DETAIL = 100, 500
+"""Characters of a topic that is no servo's in the log, and of a refusal's reason: anybody on the broker may choose
+65,535."""
 
 
 class MqttAnswer(NamedTuple):
@@ -104,12 +106,21 @@ class MqttRequestHandler:
         try:
             if verifier is None:
                 raise InvalidMessage(f"servo {servo!r} has no token", Refusal.BAD_TOKEN)
-            return decode_request(key_of(verifier), servo, data)
+            return self._decoded(key_of(verifier), servo, data)
         except InvalidMessage as error:
             too_large = error.refusal is Refusal.TOO_LARGE
             self._refusals.log(Refusal.TOO_LARGE if too_large else Refusal.BAD_TOKEN, servo, True, why=str(error))
             # Anybody on the broker may write the name of an edge, which must not slow down that edge.
             return MqttAnswer(None if too_large else encode_unknown_peer(data), f"name {servo}")
+
+    def _decoded(self, key: bytes, servo: str, data: bytes) -> ReceivedRequest | MqttAnswer:
+        """Decode a request; where its edge is of a newer version, return a refusal. Raises InvalidMessage."""
+        try:
+            return decode_request(key, servo, data)
+        except NotKnown as newer:
+            self._refusals.log(newer.refusal, servo, True, why=str(newer))
+            refused = RefusedResponse(newer.refusal, str(newer)[:_LONGEST_DETAIL])
+            return MqttAnswer(encode_response(key, servo, newer.serial, refused), f"owner {servo}")
 
     def refuse_topic(self, topic: str) -> None:
         """Count and log a message to a topic that is no servo's; there is nobody to answer."""

@@ -272,7 +272,7 @@ class TwinService:
         former = [f"the former tokens stay in force: {fault}"] if fault else []
         own = *self._clock.sentences(), *self._certificate.sentences(), *self.wrong_tokens.sentences()
         away = [] if self._mqtt is None else self._mqtt.sentences()
-        degraded = [*self._lagging(backlog), *former, *away, *own]
+        degraded = [*self._lagging(backlog), *former, *away, *own, *self.watch.sentences()]
         return {"ok": store and workers > 0 and dispatching, "degraded": degraded, **parts}
 
     @property

@@ -24,8 +24,10 @@ from servotwin.store.integrity import (
     newest_message,
     read_error,
 )
+from servotwin.store.migrate import newer_revision
 from servotwin.store.outgoing import fresh_serial
 from servotwin.store.records import Incoming, OutgoingMessage, PutResult, WorkResult
+from servotwin.store.schema import REVISION
 from servotwin.store.store import Store
 from servotwin.twin_service.limits import MAX_SERVOS
 from servotwin.twin_service.store_executor import StoreExecutor
@@ -51,6 +53,7 @@ _AHEAD_S = 3600.0
 _MAX_SERIAL = 2**52
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
 _MARK = "newest"
+_OF_A_NEWER = "store of a newer servotwin"
 _LOST = "the twin's store has lost messages"
 
 
@@ -94,6 +97,16 @@ class StoreWatch:
         self._asked, self._ahead = set[str](), dict[str, float]()
         self._why, self._read_error = "", ""
         self.fault, self.lost, self.rounds = "", "", 0
+        self._newer = ""
+
+    def sentences(self) -> list[str]:
+        """Return a sentence where a newer servotwin has migrated the store since this twin began."""
+        if not self._newer:
+            return []
+        return [
+            f"a newer servotwin has migrated the store to schema {self._newer} while this twin, which knows "
+            f"{REVISION}, runs: end this twin, and install the newer servotwin"
+        ]
 
     async def put(self, item: Incoming) -> PutResult:
         """Commit a message, unless the store is damaged; raises StoreUnavailable."""
@@ -175,12 +188,13 @@ class StoreWatch:
         self._compare_mark()
 
     async def run_mark(self) -> None:
-        """Note the newest message beside the store every few seconds."""
+        """Note the newest message beside the store every few seconds, and look at the store's schema."""
         while True:
             await asyncio.sleep(_MARK_S)
             if not self.fault:
                 with suppress(StoreUnavailable):
                     await self._executor.run(self.mark)
+                    self._newer = await self._executor.run(partial(newer_revision, self._store.engines.reader))
 
     async def run_lost(self, notify: Callable[[str], None]) -> None:
         """Ask edges that are new to a store which has lost messages: it may have lost their servos too.
@@ -195,9 +209,14 @@ class StoreWatch:
                         notify(servo)
 
     async def tell(self, announce: Callable[[str, str], None]) -> None:
-        """Announce that the store has lost messages, once it has, and that it is damaged, once it is."""
-        told, damage = "", ""
+        """Announce, once, that the store has lost messages, is damaged, or is of a newer servotwin."""
+        told, damage, newer = "", "", list[str]()
         while True:
+            if self.sentences() != newer:
+                newer = self.sentences()
+                for sentence in newer:
+                    log.error(_OF_A_NEWER, extra={"why": sentence})
+                    announce(_OF_A_NEWER, sentence)
             if self.lost != told:
                 told = self.lost
                 announce("the store has lost messages", told)

@@ -17,6 +17,7 @@ from servotwin.config.files import header_secret_file
 from servotwin.config.keys import Form, key
 from servotwin.config.table import Table
 from servotwin.errors import InvalidInput
+from servotwin.link.connection_errors import cause_of
 from servotwin.link.url import certificates, in_clear, is_encrypted, tls_context
 
 _REPEAT_S, _TIMEOUT_S = 3600.0, 10.0
@@ -149,7 +150,8 @@ def send_post(config: WebhookConfig, post: AlarmPost) -> int:
             connection.request("POST", path, msgspec.json.encode(post), dict(headers))
             status = connection.getresponse().status
         except (OSError, HTTPException) as error:
-            raise WebhookAway(f"{config.host}: {getattr(error, 'strerror', None) or type(error).__name__}") from None
+            cause = cause_of(error, is_encrypted(config.url), config.ca_file)
+            raise WebhookAway(f"{config.host}: {cause}") from None
     if status >= 500 or status in (408, 425, 429):
         raise WebhookAway(f"{config.host} answers with status {status}")
     if not 200 <= status < 300:

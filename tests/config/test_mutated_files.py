@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from edge_files import edge_file
 
 from servotwin.config.toml import dumps
 from servotwin.edge.agent import Agent
@@ -26,20 +27,7 @@ WRONG: list[Any] = [
     "", "\0", "a\nb", "x" * 900, "x" * 5000, ".", -1, 10**30, 1e308, 5e-324,
     float("inf"), float("nan"), True, [], {}, [1, "a"],
 ]  # fmt: skip
-EDGE = """
-servo = "ax-1"
-role = "supervise"
-sample_rate_hz = 1000.0
-update_gains = true
-[drive]
-kind = "simulated"
-address = "unix:nothing.sock"
-[controller]
-kp_v_per_m = 1377.7
-ki_v_per_m_s = 0.0
-kd_v_s_per_m = -135.1
-filter_time_s = 0.1
-[twin]
+TABLES = """[twin]
 url = "https://h"
 token_file = "token"
 [probe]
@@ -53,6 +41,7 @@ error_rms_mm = 1.0
 effort_v = 1.0
 settling_s = 1.0
 """
+EDGE = edge_file("supervise", "update_gains = true\n", TABLES)
 TWIN = """
 [service]
 port = 0

@@ -9,6 +9,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 
 import pytest
+from edge_files import edge_file
 from selfsigned import self_made
 
 from servotwin.edge_process.config_file import load
@@ -18,19 +19,7 @@ from servotwin.errors import InvalidInput
 from servotwin.twin_service import command
 
 MODELS = '[models.a]\nservo = "paper"\n[models.a.twin]\npolicy = "paper"\n[servos]\n"ax-*" = "a"\n'
-EDGE = """
-servo = "ax-1"
-role = "control"
-sample_rate_hz = 1000.0
-[drive]
-kind = "simulated"
-address = "unix:nothing.sock"
-[controller]
-kp_v_per_m = 1377.7
-ki_v_per_m_s = 0.0
-kd_v_s_per_m = -135.1
-filter_time_s = 0.1
-"""
+EDGE = edge_file()
 
 
 def ended(folder: Path, *arguments: str) -> str:

@@ -5,6 +5,7 @@ from contextlib import closing
 from pathlib import Path
 
 import pytest
+from edge_files import edge_file
 from outbox_cases import window
 
 from servotwin.edge_process.config_file import load
@@ -13,22 +14,6 @@ from servotwin.errors import InvalidInput
 from servotwin.link.sqlite_outbox import SqliteOutbox
 from servotwin.store.backup import backup, restore
 from servotwin.store.store import open_store
-
-EDGE = """
-servo = "ax-1"
-role = "control"
-sample_rate_hz = 1000.0
-[drive]
-kind = "simulated"
-address = "unix:nothing.sock"
-[controller]
-kp_v_per_m = 1377.7
-ki_v_per_m_s = 0.0
-kd_v_s_per_m = -135.1
-filter_time_s = 0.1
-[keep]
-outbox = "any.db"
-"""
 
 
 def strangers_file(path: Path) -> None:
@@ -54,7 +39,7 @@ def adopted(path: Path) -> None:
     [(twins_store, "a twin's store"), (adopted, "a twin's store"), (strangers_file, "another program's database")],
 )
 def test_an_edge_does_not_take_another_kind_of_file_for_its_outbox(tmp_path, make, kind):
-    (tmp_path / "edge.toml").write_text(EDGE)
+    (tmp_path / "edge.toml").write_text(edge_file(tables='[keep]\noutbox = "any.db"\n'))
     file = tmp_path / "any.db"
     make(file)
     before, names = file.read_bytes(), set(tmp_path.iterdir())

@@ -7,7 +7,7 @@ from pathlib import Path
 from threading import Thread
 
 import pytest
-from edge_process_parts import cut
+from edge_process_parts import EDGE, cut
 from faketwin import FakeTwin
 from selfsigned import self_made
 from waiting import until
@@ -19,21 +19,6 @@ from servotwin.edge_process.monitoring import read_status
 from servotwin.messages import ClaimStatus, Refusal
 from servotwin.runtime.frames import FrameSocket
 
-EDGE = """
-servo = "ax-1"
-role = "supervise"
-sample_rate_hz = 1000.0
-[drive]
-kind = "simulated"
-address = "unix:nothing.sock"
-[retry]
-first_s = 0.05
-longest_s = 0.1
-[twin]
-url = "http://127.0.0.1:{port}"
-token_file = "token"
-wait_s = 0.2
-"""
 PATIENCE = 60.0
 
 
@@ -48,7 +33,7 @@ def linked(tmp_path: Path):
     """A link process in a thread, its twin not there."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-    (tmp_path / "edge.toml").write_text(EDGE.format(port=port))
+    (tmp_path / "edge.toml").write_text(EDGE.format(url=f"http://127.0.0.1:{port}"))
     write_token(tmp_path, "first")
     ours, theirs = socket.socketpair()
     running = Thread(target=LinkProcess(load(tmp_path / "edge.toml"), theirs, "b1-00").run)
@@ -87,7 +72,7 @@ def test_the_link_process_ends_when_the_certificates_that_it_trusts_are_replaced
     (tmp_path / "new").mkdir()
     made, renewed = self_made(tmp_path)[0], self_made(tmp_path / "new")[0]
     (tmp_path / "edge.toml").write_text(
-        EDGE.format(port=9).replace("http:", "https:").replace("[twin]", '[twin]\nca_file = "made.crt"')
+        EDGE.format(url="https://127.0.0.1:9").replace("[twin]", '[twin]\nca_file = "made.crt"')
     )
     (tmp_path / "token").touch(0o600)
     (tmp_path / "token").write_text("first")
@@ -138,7 +123,7 @@ def test_trouble_that_a_new_token_ends_is_over_in_the_log_once_the_twin_has_ackn
     write_token(tmp_path, "first")
     with FakeTwin("ax-1", "second") as twin:
         twin.claim_status = ClaimStatus("ax-1")
-        (tmp_path / "edge.toml").write_text(EDGE.format(port=twin.url.rpartition(":")[2]))
+        (tmp_path / "edge.toml").write_text(EDGE.format(url=twin.url))
         link = Link(tmp_path, "b1-00")
         link.send(0)
         until(lambda: all(logged("trouble", way) == 1 for way in both))

@@ -186,7 +186,7 @@ def test_bytes_that_are_no_request_are_counted_and_the_rest_goes_on(server: Mosq
         raw(server, wire.request_topic("axis-9"), good)
         raw(server, "servotwin/bad name/up", good)
         here.deliver(parcel(0))
-        assert refusals(there) == {"bad_token": len(bad) + 1, "not_understood": 1}
+        assert refusals(there) == {"bad_token": len(bad), "unknown_schema": 1, "not_understood": 1}
 
 
 def test_answers_are_taken_from_the_twin_only(server: Mosquitto, store: Store) -> None:

@@ -287,6 +287,7 @@ def test_every_window_is_kept_removed_or_counted(tmp_path_factory: pytest.TempPa
         if restart:
             box = again(box, path, windows=4)
         assert put == removed + len(box.pending()) + sum(box.dropped.values())
+        assert (box.waiting, box.oldest()) == (len(box.pending()), next(iter(box.pending()), None))
         assert {box.letter(digest).body[0] for digest in box.letters()} == letters
         assert all(box.get(key).identity[1:] == key for key in box.pending())
     box.close()

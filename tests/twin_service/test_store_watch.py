@@ -3,6 +3,7 @@
 import asyncio
 import os
 import shutil
+import sqlite3
 from contextlib import closing, suppress
 
 import pytest
@@ -45,6 +46,31 @@ def test_a_damaged_store_is_noticed_at_the_start_and_not_written(tmp_path, caplo
 
     serve(path, look)
     assert "store damaged: it is not written any more" in caplog.messages
+
+
+def test_a_store_that_a_newer_servotwin_migrates_while_the_twin_runs_is_said_once(tmp_path, caplog, monkeypatch):
+    """As by a reading command of the newer one; this twin wrote on, and nobody knew until its next start failed."""
+    monkeypatch.setattr(store_watch, "_MARK_S", 0.02)
+    monkeypatch.setattr(store_watch, "_TELL_S", 0.02)
+    path, said = twin_file(tmp_path), []
+
+    async def look(system, client):
+        telling = asyncio.create_task(system.watch.tell(lambda *about: said.append(about)))
+        with closing(sqlite3.connect(tmp_path / "twin.db")) as opened:
+            opened.execute("UPDATE servotwin_version SET version_num = '9000'")
+            opened.commit()
+        await until(lambda: said)
+        assert (await client.get("/healthz")).json()["degraded"] == [said[0][1]]
+        assert await send(client, 0) == [201]
+        await asyncio.sleep(0.2)
+        telling.cancel()
+
+    serve(path, look)
+    ((kind, sentence),) = said
+    assert kind == "store of a newer servotwin"
+    assert sentence.startswith("a newer servotwin has migrated the store to schema 9000 while this twin, which knows ")
+    assert sentence.endswith(" runs: end this twin, and install the newer servotwin")
+    assert caplog.messages.count("store of a newer servotwin") == 1
 
 
 @pytest.mark.parametrize("passes", [True, False])
