@@ -192,12 +192,13 @@ def check_begin(path: Path, motor_encoder: bool = True, units: OwnUnits | None =
 
 def _check_units(path: Path, names: list[str], units: OwnUnits) -> None:
     """Refuse a log whose command or position is in another unit than those of the edge."""
-    for allowed, key, unit in ((COLUMNS[3], "position_unit", units.position), (COLUMNS[4], "command_unit", units.command)):
+    _, _, _, positions, commands = COLUMNS
+    for allowed, key, unit in ((positions, "position_unit", units.position), (commands, "command_unit", units.command)):
         name = next(name for name in allowed if name in names)
         if unit_of(name).si != unit:
             raise InvalidInput(
-                f'log {path}: column {name} is in {unit_of(name).si}, and {key} = "{unit}" in the edge\'s file: give the '
-                "log of such a machine, or the key as the log has it"
+                f'log {path}: column {name} is in {unit_of(name).si}, and {key} = "{unit}" in the file of the edge: '
+                "give the log of such a machine, or the key as the log has it"
             )
 
 
