@@ -131,7 +131,7 @@ def scenario_case(path: Path) -> Case:
     own = scenario.twin.replace(policy=PAPER, k_dz=0.0, smoothing=None, k_noise=None, table=None)
     alone = scenario.replace(twin=own.replace(enabled=False), recording=recording, supervision=None)
     published, why = None, "it is this twin's policy"
-    if policy != PAPER:
+    if (policy, _k_dz(scenario)) != (PAPER, 1.0):
         try:
             ruled = scenario.replace(twin=own.replace(k_dz=1.0), recording=recording)
             TwinModel.of(ruled.model, ruled.twin)
@@ -142,10 +142,25 @@ def scenario_case(path: Path) -> Case:
         f"{scenario.name}: a machine that wears, alone and with its twin",
         " ".join(_story(scenario)),
         Column("alone", "without a twin", _ALONE, alone),
-        Column(policy, f"{policy} twin", _POLICIES[policy], scenario),
+        Column(policy, f"{policy} twin", _explained(scenario), scenario),
         published,
         f"The paper's dead zone has no run of its own: {why}." if why else "",
     )
+
+
+def _k_dz(scenario: st.Scenario) -> float:
+    """Dead zone of the paper's rule over the lost motion."""
+    return 1.0 if scenario.twin.k_dz is None else scenario.twin.k_dz
+
+
+def _explained(scenario: st.Scenario) -> str:
+    """What the scenario's twin does."""
+    policy, k_dz = scenario.twin.policy, _k_dz(scenario)
+    if policy != PAPER or k_dz == 1.0:
+        return _POLICIES[policy]
+    if k_dz == 0.0:
+        return "the twin estimates the gap, and leaves the controller as it is (k_dz = 0)"
+    return f"after each step a dead zone {k_dz:g} times as wide as the gap that the twin estimates"
 
 
 def _check_story(path: Path, scenario: st.Scenario) -> None:

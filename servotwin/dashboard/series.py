@@ -8,7 +8,7 @@ from typing import Any
 import sqlalchemy as sa
 
 from servotwin.dashboard.evidence_body import body_of, finite, interval_of
-from servotwin.dashboard.machine_facts import UNKNOWN, machine_facts
+from servotwin.dashboard.machine_facts import UNKNOWN, MachineFacts, machine_facts
 from servotwin.store import overview, queries
 from servotwin.store.overview import WindowGap
 from servotwin.store.records import StoredEvidence
@@ -32,15 +32,24 @@ def machine_series(connection: sa.Connection, servo: str, limit: int, before: in
         # The newest windows may all wait to be processed.
         overview.evidence_of_kinds(connection, servo, ("estimate",), 1)
     )
-    context = queries.contexts(connection, [key]).get(key)
     return {
         "servo": servo,
         "first": found[0].window.id if found else None,
         "windows": gap_series(found),
         "versions": versions(decided),
         "fallbacks": fallbacks(decided),
-        "machine": UNKNOWN if context is None else machine_facts(context),
+        "machine": _facts_in(connection, key),
     }
+
+
+def machine_of(connection: sa.Connection, servo: str) -> MachineFacts:
+    """Facts of a servo's model, as of its newest estimate."""
+    return _facts_in(connection, _context(overview.evidence_of_kinds(connection, servo, ("estimate",), 1)))
+
+
+def _facts_in(connection: sa.Connection, key: str) -> MachineFacts:
+    context = queries.contexts(connection, [key]).get(key)
+    return UNKNOWN if context is None else machine_facts(context)
 
 
 def _context(records: Iterable[StoredEvidence]) -> str:

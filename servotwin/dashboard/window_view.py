@@ -6,10 +6,13 @@ from array import array
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from servotwin.dashboard.machine_facts import UNKNOWN, MachineFacts
 from servotwin.errors import InvalidInput
 from servotwin.messages import FINE, WindowMessage, unpack_channel
 from servotwin.messages.windows import Channel
 
+_COMMANDS = {"V": "voltage_v", "N m": "command_n_m", "rad/s": "command_rad_per_s", "rad": "command_rad"}
+"""Columns of commands in logs, by unit."""
 MAX_POINTS = 20_000
 """Samples of one channel in one answer: more are decimated, or asked for part by part."""
 
@@ -49,7 +52,9 @@ def envelope_indices(values: Sequence[float], columns: int) -> list[int]:
     return sorted(kept)
 
 
-def channel_series(window: WindowMessage, part: SampleRange, points: int) -> list[dict[str, Any]]:
+def channel_series(
+    window: WindowMessage, part: SampleRange, points: int, machine: MachineFacts = UNKNOWN
+) -> list[dict[str, Any]]:
     """Channels of a window.
 
     Parameters
@@ -58,12 +63,14 @@ def channel_series(window: WindowMessage, part: SampleRange, points: int) -> lis
     part : SampleRange
     points : int
         Columns of the screen: more than four samples a column are decimated to the least and greatest of each.
+    machine : MachineFacts
+        Its units: windows themselves say V and m of every machine.
 
     Returns
     -------
     list of dict
-        name, unit, time (s after the window's first sample), values (in that unit), and samples: how many there are in
-        the part. Those that were rounded finely are put together.
+        name, unit (empty: unknown), time (s after the window's first sample), values (in that unit), and samples: how
+        many there are in the part. Those that were rounded finely are put together.
     """
     shown = []
     for channel in window.channels:
@@ -74,7 +81,7 @@ def channel_series(window: WindowMessage, part: SampleRange, points: int) -> lis
         shown.append(
             {
                 "name": channel.name,
-                "unit": channel.unit,
+                "unit": _unit(channel, machine),
                 "samples": len(values),
                 "time": [round((part.first + k) / window.rate, 9) for k in kept],
                 "values": [values[k] for k in kept],
@@ -103,13 +110,30 @@ def _cut(channel: Channel, part: SampleRange) -> Channel:
     )
 
 
-def window_columns(window: WindowMessage) -> dict[str, list[Any]]:
-    """Every sample of every channel, column by column with the unit in its name, for a file."""
+def window_columns(window: WindowMessage, machine: MachineFacts = UNKNOWN) -> dict[str, list[Any]]:
+    """Every sample of every channel, column by column, for a file; the columns' names are those of logs, with units.
+
+    A unit that is not known yet, as before the machine's first estimate, is left out.
+    """
     whole = SampleRange(0, window.samples)
     columns: dict[str, list[Any]] = {
         "time_s": [round(window.start + k / window.rate, 9) for k in range(window.samples)]
     }
     for channel in window.channels:
         if not channel.name.endswith(FINE):
-            columns[f"{channel.name}_{channel.unit.replace(' ', '_')}"] = _samples(window, channel, whole).tolist()
+            columns[_column(channel, machine)] = _samples(window, channel, whole).tolist()
     return columns
+
+
+def _unit(channel: Channel, machine: MachineFacts) -> str:
+    """Unit of a channel on this machine; empty: not known."""
+    of_machine = {"position": machine.travel_unit, "reference": machine.travel_unit, "voltage": machine.command_unit}
+    return of_machine.get(channel.name, channel.unit)
+
+
+def _column(channel: Channel, machine: MachineFacts) -> str:
+    """Name of a channel's column."""
+    unit = _unit(channel, machine)
+    if channel.name == "voltage":
+        return _COMMANDS.get(unit, "command")
+    return f"{channel.name}_{unit}" if unit else channel.name

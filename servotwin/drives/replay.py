@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple, TextIO
 
 from servotwin.config.named_file import check_named
+from servotwin.config.own_units import OwnUnits
 from servotwin.config.units import SIGNAL_COLUMNS, Unit, unit_of
 from servotwin.edge.drive import Block, DriveLost
 from servotwin.edge.parameters import Parameters
@@ -173,11 +174,32 @@ def opened(path: Path) -> TextIO:
         raise InvalidInput(f"log {path}: cannot be read ({error.strerror})") from None
 
 
-def check_begin(path: Path, motor_encoder: bool = True) -> None:
-    """Check that a log has its columns and a first sample, without reading it whole; raises InvalidInput."""
+def check_begin(path: Path, motor_encoder: bool = True, units: OwnUnits | None = None) -> None:
+    """Check that a log has its columns, in an edge's units, and a first sample, without reading it whole.
+
+    Raises
+    ------
+    InvalidInput
+        It has none, or in other units.
+    """
     with opened(path) as file:
         if next(rows(path, file, motor_encoder), None) is None:
             raise InvalidInput(f"log {path}: has no samples")
+    if units is not None:
+        with opened(path) as file:
+            _check_units(path, _head(file)[1], units)
+
+
+def _check_units(path: Path, names: list[str], units: OwnUnits) -> None:
+    """Refuse a log whose command or position is in another unit than those of the edge."""
+    _, _, _, positions, commands = COLUMNS
+    for allowed, key, unit in ((positions, "position_unit", units.position), (commands, "command_unit", units.command)):
+        name = next(name for name in allowed if name in names)
+        if unit_of(name).si != unit:
+            raise InvalidInput(
+                f'log {path}: column {name} is in {unit_of(name).si}, and {key} = "{unit}" in the file of the edge: '
+                "give the log of such a machine, or the key as the log has it"
+            )
 
 
 def extent(path: Path, motor_encoder: bool = True) -> Extent:
@@ -204,14 +226,20 @@ def rows(path: Path, file: TextIO, motor_encoder: bool = True) -> Iterator[tuple
         A column is missing, or a line does not hold finite numbers.
     """
     try:
-        line, number = file.readline(), 1
-        if line.startswith("#"):
-            line, number = file.readline(), 2
-        columns = _columns(path, [name.strip() for name in line.split(",")], motor_encoder)
+        number, names = _head(file)
+        columns = _columns(path, names, motor_encoder)
         for number, line in enumerate(file, number + 1):  # noqa: B020
             yield _numbers(path, number, line.split(","), columns)
     except UnicodeDecodeError as error:
         raise InvalidInput(f"log {path}: is not a text file (byte {error.start} is not UTF-8)") from None
+
+
+def _head(file: TextIO) -> tuple[int, list[str]]:
+    """Number of the line with the columns' names, and the names."""
+    line, number = file.readline(), 1
+    if line.startswith("#"):
+        line, number = file.readline(), 2
+    return number, [name.strip() for name in line.split(",")]
 
 
 class _Column(NamedTuple):
@@ -230,7 +258,9 @@ def _columns(path: Path, names: list[str], motor_encoder: bool) -> list[_Column 
             continue
         present = next((name for name in allowed if name in names), None)
         if present is None:
-            raise InvalidInput(f"log {path}: column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}")
+            column = f"column {' or '.join(allowed)} is missing; it has {', '.join(names):.200}"
+            other = "; of a motor without encoder the edge's file says motor_encoder = false" if place == _MOTOR else ""
+            raise InvalidInput(f"log {path}: {column}{other}")
         chosen.append(present)
     reference, position = chosen[1], chosen[3]
     assert reference is not None

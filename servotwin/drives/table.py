@@ -55,7 +55,7 @@ def _variable(_table: Table, _name: str, variable: str, _folder: Path) -> str:
 def _log(table: Table, name: str, path: Path, folder: Path, motor_encoder: bool = True) -> Path:
     from servotwin.drives.replay import check_begin
 
-    check_begin(readable(table, name, path, folder), motor_encoder)
+    check_begin(readable(table, name, path, folder), motor_encoder, table.units)
     return path
 
 

@@ -239,7 +239,7 @@ class EdgeConfig:
     @property
     def drive_table(self) -> Table:
         """Table [drive], which the drive's own reader parses."""
-        return Table(self.source, self.drive, "drive")
+        return Table(self.source, self.drive, "drive", self.units)
 
     @property
     def link_table(self) -> Table:

@@ -59,6 +59,7 @@ from servotwin.twin.evidence import (
     RedesignRecord,
     TrendRecord,
 )
+from servotwin.twin.in_force import unless_in_force
 from servotwin.twin.lookups import VerificationRequest
 from servotwin.twin.model import TwinModel
 from servotwin.twin.oversight import Proposal
@@ -369,7 +370,8 @@ def _redesign(model: TwinModel, state: TwinState, evidence: Evidence, stale: boo
             lookups, redesign = state.lookups, model.policy.redesign(evidence)
         else:
             lookups, redesign = model.lookups.redesign(state.lookups, evidence)
-        return replace(state, lookups=lookups, search=redesign.search or state.search), redesign
+        state = replace(state, lookups=lookups, search=redesign.search or state.search)
+        return state, unless_in_force(state, evidence, redesign)
     except InvalidInput as error:
         return state, Redesign(None, math.nan, str(error))
 

@@ -10,9 +10,10 @@ import msgspec
 import sqlalchemy as sa
 
 from servotwin.dashboard.assets import INDEX, REPORT_SECURITY, SECURITY, Asset, assets
+from servotwin.dashboard.machine_facts import MachineFacts
 from servotwin.dashboard.machine_metrics import machine_metrics
 from servotwin.dashboard.rest import at_rest
-from servotwin.dashboard.series import machine_series, table_csv
+from servotwin.dashboard.series import machine_of, machine_series, table_csv
 from servotwin.dashboard.window_view import MAX_POINTS, channel_series, sample_range, window_columns
 from servotwin.errors import InvalidInput
 from servotwin.messages import MAX_BYTES, NAME_PATTERN, Refusal, WindowMessage, decode
@@ -280,17 +281,24 @@ class DashboardApi:
         stored = await stored_window(self._operators, self._store, self._executor, request)
         begin, end = (request.seconds(key, -1.0) for key in ("from", "to"))
         points = min(request.integer("points", 1000) or 1, MAX_POINTS)
-        part = None if begin < 0.0 else begin, None if end < 0.0 else end
-        return _fresh(await self._executor.run(partial(_channels, stored, part, points)))
+        part, machine = (None if begin < 0.0 else begin, None if end < 0.0 else end), await self._machine(request)
+        return _fresh(await self._executor.run(partial(_channels, stored, part, points, machine)))
 
     async def _get_channels_csv(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)
-        text = await self._executor.run(lambda: table_csv(window_columns(decoded_window(stored))))
+        machine = await self._machine(request)
+        text = await self._executor.run(lambda: table_csv(window_columns(decoded_window(stored), machine)))
         servo, boot, sequence = (request.path[key] for key in ("servo", "boot", "sequence"))
         return _csv(text, f"{servo}-{boot}-{sequence}.csv")
 
+    async def _machine(self, request: HttpRequest) -> MachineFacts:
+        read = partial(machine_of, servo=request.path["servo"])
+        return await store_query(self._executor, partial(self._store.reading, read))
 
-def _channels(stored: StoredMessage, part: tuple[float | None, float | None], points: int) -> dict[str, Any]:
+
+def _channels(
+    stored: StoredMessage, part: tuple[float | None, float | None], points: int, machine: MachineFacts
+) -> dict[str, Any]:
     window = decoded_window(stored)
     try:
         selected = sample_range(window, *part)
@@ -304,7 +312,7 @@ def _channels(stored: StoredMessage, part: tuple[float | None, float | None], po
         "samples": window.samples,
         "reason": window.reason,
         "version": window.parameter_version,
-        "channels": channel_series(window, selected, points),
+        "channels": channel_series(window, selected, points, machine),
         "rest": at_rest(window) if part == (None, None) else None,
     }
 

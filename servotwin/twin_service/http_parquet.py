@@ -6,7 +6,7 @@ from functools import partial
 
 import msgspec
 
-from servotwin.dashboard.series import machine_series
+from servotwin.dashboard.series import machine_of, machine_series
 from servotwin.dashboard.window_view import window_columns
 from servotwin.store.store import Store
 from servotwin.twin_service.http_app import HttpRoute
@@ -66,8 +66,9 @@ class ParquetApi:
 
     async def _get_channels(self, request: HttpRequest) -> HttpResponse:
         stored = await stored_window(self._operators, self._store, self._executor, request)
-        columns = await self._executor.run(lambda: window_columns(decoded_window(stored)))
         servo, boot, sequence = (request.path[key] for key in ("servo", "boot", "sequence"))
+        machine = await store_query(self._executor, partial(self._store.reading, partial(machine_of, servo=servo)))
+        columns = await self._executor.run(lambda: window_columns(decoded_window(stored), machine))
         return await self._file(servo, columns, f"{servo}-{boot}-{sequence}.parquet")
 
     async def _file(self, servo: str, columns: object, name: str) -> HttpResponse:

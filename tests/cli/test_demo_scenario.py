@@ -145,6 +145,20 @@ def test_an_axis_whose_gap_cannot_be_seen_is_refused_in_its_own_words(tmp_path: 
         demo.demo(tmp_path / "out", scenario=written(tmp_path, text))
 
 
+@pytest.mark.parametrize(
+    ("k_dz", "words", "own_run"),
+    [(0.0, "leaves the controller", True), (0.5, "0.5 times as wide", True), (1.0, "as wide as the gap", False)],
+)
+def test_a_picture_says_what_the_paper_s_rule_does_with_its_factor(
+    tmp_path: Path, k_dz: float, words: str, own_run: bool
+) -> None:
+    """The paper's dead zone has a run of its own, unless this is it."""
+    case = scenario_case(written(tmp_path, SCOPE.replace('"hysteresis"', f'"paper"\nk_dz = {k_dz}')))
+    assert words in case.twinned.explained
+    assert (case.published is not None) == own_run
+    assert bool(case.left_out) != own_run
+
+
 def test_a_preset_beside_a_scenario_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InvalidInput, match=r"--preset 'table1': is of the paper's servo, and .*scope.toml has its own"):
         demo.demo(tmp_path / "out", "table1", scenario=written(tmp_path, SCOPE))

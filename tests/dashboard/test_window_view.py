@@ -10,6 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from servotwin import messages
+from servotwin.config.units import SIGNAL_COLUMNS
+from servotwin.dashboard.machine_facts import MachineFacts
 from servotwin.dashboard.series import table_csv
 from servotwin.dashboard.window_view import channel_series, envelope_indices, sample_range, window_columns
 from servotwin.errors import InvalidInput
@@ -18,8 +20,8 @@ from servotwin.messages import pack_channel, pack_finely
 RATE = 1000.0
 
 
-def window(values):
-    channels = (pack_channel("position", "m", values), *pack_finely("theta_m", "rad", values))
+def window(values, *more):
+    channels = (pack_channel("position", "m", values), *pack_finely("theta_m", "rad", values), *more)
     return messages.WindowMessage(
         "a", "b", 1, 7.0, RATE, channels, (), 0, "m", "test", messages.checksum(channels)
     )  # fmt: skip
@@ -60,11 +62,30 @@ def test_an_empty_part_is_refused(part):
         sample_range(window(WAVE), *part)
 
 
-def test_a_file_has_every_sample_with_its_unit():
-    columns = window_columns(window(WAVE))
-    assert list(columns) == ["time_s", "position_m", "theta_m_rad"]
+MACHINES = {
+    "a servo": (MachineFacts(travel_unit="m", command_unit="V"), "m", "V", "voltage_v"),
+    "a rotary axis": (MachineFacts(travel_unit="rad", command_unit="N m"), "rad", "N m", "command_n_m"),
+    "a velocity drive": (MachineFacts(travel_unit="m", command_unit="rad/s"), "m", "rad/s", "command_rad_per_s"),
+    "a stepper": (MachineFacts(travel_unit="m", command_unit="rad"), "m", "rad", "command_rad"),
+}
+
+
+@pytest.mark.parametrize(("machine", "travel", "command", "column"), MACHINES.values(), ids=MACHINES)
+def test_a_file_has_every_sample_under_the_name_of_a_log_s_column(machine, travel, command, column):
+    """Windows say V and m of every machine; its model knows its units."""
+    recorded = window(WAVE, pack_channel("reference", "m", WAVE), *pack_finely("voltage", "V", WAVE))
+    columns = window_columns(recorded, machine)
+    assert list(columns) == ["time_s", f"position_{travel}", "theta_m_rad", f"reference_{travel}", column]
+    assert set(columns) < {"time_s", *(name for names in SIGNAL_COLUMNS.values() for name in names)}
     assert columns["time_s"][:2] == [7.0, 7.001]
     assert len(columns["theta_m_rad"]) == 2000
+    shown = channel_series(recorded, sample_range(recorded, None, None), 50, machine)
+    assert [each["unit"] for each in shown] == [travel, "rad", travel, command]
+
+
+def test_an_unknown_unit_is_not_made_up():
+    recorded = window(WAVE, *pack_finely("voltage", "V", WAVE))
+    assert list(window_columns(recorded)) == ["time_s", "position", "theta_m_rad", "command"]
 
 
 def test_a_file_is_read_back_and_holds_no_formula():

@@ -70,7 +70,7 @@ def log_of(folder: Path) -> Path:
 def test_a_log_without_the_motors_angle_is_replayed_for_it_only(tmp_path: Path) -> None:
     log_of(tmp_path)
     table = Table("edge.toml", {"kind": "replay", "log": "log.csv", "speed": 0.0}, "drive")
-    with pytest.raises(InvalidInput, match=r"log.csv: column .*theta_m_rad.* is missing; it has"):
+    with pytest.raises(InvalidInput, match=r"log.csv: column .*theta_m_rad.* is missing; .*motor_encoder = false"):
         supervised_drive(table, tmp_path)
     drive = supervised_drive(table, tmp_path, motor_encoder=False)
     assert isinstance(drive, Replay)
@@ -80,3 +80,18 @@ def test_a_log_without_the_motors_angle_is_replayed_for_it_only(tmp_path: Path) 
     assert block is not None
     assert list(block.position) == pytest.approx([1e-3 * k for k in range(10)])
     assert all(angle != angle for angle in block.theta_m)
+
+
+def test_a_log_whose_columns_are_in_other_units_than_the_edge_is_refused(tmp_path: Path) -> None:
+    """The motor's angle follows from the command: volts in place of rad/s would make another one of it."""
+    log_of(tmp_path)
+    config = EdgeConfig(
+        AGENT, "supervise", None, {"kind": "replay", "log": "log.csv"}, command_unit="rad/s", folder=tmp_path
+    )
+    supervised_drive(config.drive_table, tmp_path, motor_encoder=False)
+    volts = r'edge.toml: drive.log = .*log.csv: column command_rad_per_s is in rad/s, and command_unit = "V"'
+    with pytest.raises(InvalidInput, match=volts):
+        supervised_drive(replace(config, command_unit="V").drive_table, tmp_path, motor_encoder=False)
+    rotary = r'column measured_position_m is in m, and position_unit = "rad"'
+    with pytest.raises(InvalidInput, match=rotary):
+        supervised_drive(replace(config, position_unit="rad").drive_table, tmp_path, motor_encoder=False)

@@ -78,6 +78,7 @@ export class MachinePage {
     const chosen = () => (this.shown ? this.shown.split("/") : null);
     this.residualPanel = new ResidualPanel(name, chosen, () => positionUnit(this.gaps.machine).name === "deg");
     this.acts = new ActsPanel(name, () => this.later());
+    this.angles = legend(["blue", "motor"], ["orange", "screw or gear, from the position"]);
     const chart = (low) => element("div", { class: low ? "chart low" : "chart" });
     const places = { gap: chart(), tail: chart(true), residual: chart(true), position: chart(), motor: chart(true), voltage: chart(true) };
     this.content = element("div", { class: "unread" },
@@ -89,7 +90,7 @@ export class MachinePage {
         element("div", { class: "pair" },
           element("div", {},
             legend(["orange", "reference"], ["blue", "position"]), places.position,
-            legend(["blue", "motor"], ["orange", "screw or gear, from the position"]), places.motor,
+            this.angles, places.motor,
             legend(["blue", "command"]), places.voltage),
           element("div", {}, element("h3", {}, "Hysteresis"),
             element("p", { class: "soft" }, "The motor's lead over the load, against the motor's angle. Backlash opens the loop by the gap; bending between motor and encoder adds to it."),
@@ -332,7 +333,8 @@ export class MachinePage {
     const stretch = (data, factors) => [data[0], ...data.slice(1).map((values, i) => filled(values).map((value) => (value === null ? null : value * factors[i])))];
     this.positionPlot.show(stretch(joined(reference, position), [unit.factor, unit.factor]), `Reference and position in ${unit.name}`);
     const screw = position && machine.travel ? { time: position.time, values: position.values.map((value) => value / machine.travel) } : null;
-    this.motorPlot.show(stretch(joined(motor, screw), [DEG, DEG]), "Angles of motor and screw in degrees");
+    this.angles.firstChild.hidden = !motor;
+    this.motorPlot.show(stretch(joined(motor, screw), [DEG, DEG]), motor ? "Angles of motor and screw in degrees" : "Angle of the screw in degrees");
     this.voltagePlot.options.yLabel = `Command (${commandUnit(machine)})`;
     this.voltagePlot.show(command ? [command.time, command.values] : [[], []], `Command in ${commandUnit(machine)}`);
     this.showLoop(motor, position, machine);
@@ -354,7 +356,9 @@ export class MachinePage {
 
   showLoop(motor, position, machine) {
     if (!motor || !position || !machine.travel) {
-      this.loop.replaceChildren(element("p", { class: "soft" }, "The window has no angle of the motor, or the travel per turn is unknown."));
+      this.loop.replaceChildren(element("p", { class: "soft" }, !motor
+        ? "The motor has no encoder: the window has no angle of it. Estimates compute the angle from the command, where the drive follows that."
+        : "The travel per turn of the motor is unknown until the first estimate."));
       return;
     }
     const [, theta, q] = uPlot.join([[motor.time, motor.values], [position.time, position.values]]);
