@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 _FRESH_S = 10.0
-"""s for which windows may hold up the newest one while the twin takes them. Those that take longer at the pause that the
-twin asks for go after it from the start: of each of a fleet's edges even a single one would hold up all newest ones."""
+"""s for which windows may hold up the newest one while the twin takes them. Those that take longer at the pause that
+the twin asks for go after it from the start: of each of a fleet's edges a single one would hold up all newest ones."""
 _IN_A_ROW = 2
 """Newest windows in a row after which a first older one goes whatever the pause; from then on one after each newest.
 However slow the twin is, a backlog does not grow, and is gone in the time in which it arose."""
