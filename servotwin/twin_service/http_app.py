@@ -5,6 +5,7 @@ No framework: its layers take longer for the PUT of a window than checking and c
 
 from __future__ import annotations
 
+import asyncio
 import re
 import traceback
 from collections.abc import Awaitable, Callable, Iterable, Mapping
@@ -156,6 +157,8 @@ class HttpApp:
                 await send({"type": "lifespan.startup.complete"})
                 phase = "shutdown"
                 await receive()
+        except asyncio.CancelledError:
+            return  # by a second interrupt, after which the server waits for nothing: it would log a traceback
         except BaseException:
             await send({"type": f"lifespan.{phase}.failed", "message": traceback.format_exc()})
             raise

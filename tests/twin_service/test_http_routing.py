@@ -133,3 +133,26 @@ def test_a_service_that_does_not_start_reports_it_to_the_server(tmp_path):
     good = HttpApp([], Refusals(Metrics()), contextlib.nullcontext)
     assert asyncio.run(events(good)) == ["lifespan.startup.complete", "lifespan.shutdown.complete"]
     assert asyncio.run(events(HttpApp([], Refusals(Metrics()), broken))) == ["lifespan.startup.failed"]
+
+
+def test_a_service_that_is_ended_by_a_second_interrupt_reports_no_failure():
+    """The server cancels what still runs then, and would log the traceback of any failure."""
+
+    async def events() -> list[str]:
+        sent: list[str] = []
+
+        async def receive() -> dict[str, Any]:
+            return {"type": "lifespan.startup"} if not sent else await asyncio.Event().wait()
+
+        async def send(event: dict[str, Any]) -> None:
+            sent.append(event["type"])
+
+        app = HttpApp([], Refusals(Metrics()), contextlib.nullcontext)
+        running = asyncio.create_task(app({"type": "lifespan"}, receive, send))
+        while not sent:
+            await asyncio.sleep(0)
+        running.cancel()
+        await running
+        return sent
+
+    assert asyncio.run(events()) == ["lifespan.startup.complete"]
