@@ -89,3 +89,5 @@ SIGNAL_COLUMNS = {
     "reference": tuple(f"reference_{unit}" for unit in _POSITIONS),
 }
 """Columns of logs by signal, in order of preference: what was measured before what was true."""
+COMMAND_COLUMNS = {unit_of(name).si: name for name in SIGNAL_COLUMNS["voltage"]}
+"""Columns of commands in logs, by unit."""

@@ -6,13 +6,12 @@ from array import array
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from servotwin.config.units import COMMAND_COLUMNS
 from servotwin.dashboard.machine_facts import UNKNOWN, MachineFacts
 from servotwin.errors import InvalidInput
 from servotwin.messages import FINE, WindowMessage, unpack_channel
 from servotwin.messages.windows import Channel
 
-_COMMANDS = {"V": "voltage_v", "N m": "command_n_m", "rad/s": "command_rad_per_s", "rad": "command_rad"}
-"""Columns of commands in logs, by unit."""
 MAX_POINTS = 20_000
 """Samples of one channel in one answer: more are decimated, or asked for part by part."""
 
@@ -135,5 +134,5 @@ def _column(channel: Channel, machine: MachineFacts) -> str:
     """Name of a channel's column."""
     unit = _unit(channel, machine)
     if channel.name == "voltage":
-        return _COMMANDS.get(unit, "command")
+        return COMMAND_COLUMNS.get(unit, "command")
     return f"{channel.name}_{unit}" if unit else channel.name

@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from servotwin.config.units import COMMAND_COLUMNS
 from servotwin.control.laws import law_of
 from servotwin.errors import InvalidInput
 from servotwin.estimation.window import Window
@@ -79,8 +80,8 @@ def with_commanded_angle(window: Window, plant: Plant) -> Window:
         )
     if window.voltage is None:
         raise InvalidInput(
-            f"{window.where}the window has no command: sensors motor_encoder = false needs it in "
-            f"{plant.actuator.unit}, for the motor's angle follows from it"
+            f"{window.where}the window has no command: sensors motor_encoder = false needs it in {plant.actuator.unit} "
+            f"(in a log, the column {COMMAND_COLUMNS[plant.actuator.unit]}), for the motor's angle follows from it"
         )
     command = window.driven(plant.command_limit).voltage
     assert command is not None
