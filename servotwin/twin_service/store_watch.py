@@ -53,7 +53,6 @@ _AHEAD_S = 3600.0
 _MAX_SERIAL = 2**52
 """Largest serial that an edge may report as received; messages carry serials up to twice that."""
 _MARK = "newest"
-_OF_A_NEWER = "store of a newer servotwin"
 _LOST = "the twin's store has lost messages"
 
 
@@ -215,8 +214,8 @@ class StoreWatch:
             if self.sentences() != newer:
                 newer = self.sentences()
                 for sentence in newer:
-                    log.error(_OF_A_NEWER, extra={"why": sentence})
-                    announce(_OF_A_NEWER, sentence)
+                    log.error("store of a newer servotwin", extra={"why": sentence})
+                    announce("store of a newer servotwin", sentence)
             if self.lost != told:
                 told = self.lost
                 announce("the store has lost messages", told)
