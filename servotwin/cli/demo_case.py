@@ -154,7 +154,7 @@ def _k_dz(scenario: st.Scenario) -> float:
 
 
 def _explained(scenario: st.Scenario) -> str:
-    """What the scenario's twin does."""
+    """Explain the scenario's twin."""
     policy, k_dz = scenario.twin.policy, _k_dz(scenario)
     if policy != PAPER or k_dz == 1.0:
         return _POLICIES[policy]
