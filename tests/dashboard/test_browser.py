@@ -16,6 +16,7 @@ from browser_pages import (
     looks,
     open_machine,
     reaches,
+    resize,
     serious_faults,
 )
 from dashboard_fleet import SILENT, WEARING
@@ -92,7 +93,7 @@ def test_a_machine_that_wears_is_shown_with_its_updates(open_page, twin):
     assert page.locator("[aria-label=Updates] tbody tr").count() == 4
     has_text(page, "[aria-label='Behind the last update']", "not simulated")
     has_text(page, "[aria-label=Events]", "edge connected: boot boot-1")
-    page.set_viewport_size({"width": 360, "height": 740})
+    resize(page, 360, 740)
     page.select_option("[aria-label=Window] select", index=1)
     has_text(page, "[aria-label=Window] p", "The least and greatest sample")
     page.click("text=Every sample")
@@ -125,7 +126,7 @@ def test_a_step_is_tried_on_the_model(open_page):
     panel.locator(".soft", has_text=before).first.wait_for(state="detached")
     panel.locator(".map-words", has_text=place).wait_for(state="detached")
     assert serious_faults(page) == []
-    page.set_viewport_size({"width": 360, "height": 740})
+    resize(page, 360, 740)
     assert fits(page, 360)
     PICTURES.mkdir(parents=True, exist_ok=True)
     (PICTURES / "what-if.png").write_bytes(panel.screenshot())
@@ -148,7 +149,7 @@ def test_an_engineer_holds_a_machine_with_a_reason_and_an_operator_sees_who(open
     assert serious_faults(page) == []
     PICTURES.mkdir(parents=True, exist_ok=True)
     (PICTURES / "oversight.png").write_bytes(panel.screenshot())
-    page.set_viewport_size({"width": 360, "height": 740})
+    resize(page, 360, 740)
     assert fits(page, 360)
     (PICTURES / "oversight-phone.png").write_bytes(panel.screenshot())
     reader = open_page()

@@ -368,13 +368,11 @@ def test_bad_input_is_photographed_and_accessible(open_page, twin):
 def photographed(page, name):
     """Take pictures of a state; it fits, and at a desk it is accessible."""
     PICTURES.mkdir(parents=True, exist_ok=True)
-    page.evaluate("window.resized = true")
     for look, width in looks(page):
         (PICTURES / f"{name}-{look}.png").write_bytes(page.screenshot())
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         if width == 1280:
             assert serious_faults(page) == []
-    page.evaluate("window.resized = false")
 
 
 # Last: the file of tokens that it leaves names another fleet, so that this twin could not be started again.
