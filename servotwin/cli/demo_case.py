@@ -13,6 +13,7 @@ from servotwin.errors import InvalidInput
 from servotwin.plant.display_units import DisplayUnit, command_unit, gap_in_words, position_unit
 from servotwin.plant.servo import PRESETS
 from servotwin.plant.signals import as_pieces, reference_changes
+from servotwin.redesign.registry import paper_k_dz
 from servotwin.reproduction.runs import Trace
 from servotwin.reproduction.twin_runs import TwinJob
 from servotwin.simulation import Run
@@ -131,7 +132,7 @@ def scenario_case(path: Path) -> Case:
     own = scenario.twin.replace(policy=PAPER, k_dz=0.0, smoothing=None, k_noise=None, table=None)
     alone = scenario.replace(twin=own.replace(enabled=False), recording=recording, supervision=None)
     published, why = None, "it is this twin's policy"
-    if (policy, _k_dz(scenario)) != (PAPER, 1.0):
+    if (policy, paper_k_dz(scenario.twin)) != (PAPER, 1.0):
         try:
             ruled = scenario.replace(twin=own.replace(k_dz=1.0), recording=recording)
             TwinModel.of(ruled.model, ruled.twin)
@@ -148,14 +149,9 @@ def scenario_case(path: Path) -> Case:
     )
 
 
-def _k_dz(scenario: st.Scenario) -> float:
-    """Dead zone of the paper's rule over the lost motion."""
-    return 1.0 if scenario.twin.k_dz is None else scenario.twin.k_dz
-
-
 def _explained(scenario: st.Scenario) -> str:
     """Explain the scenario's twin."""
-    policy, k_dz = scenario.twin.policy, _k_dz(scenario)
+    policy, k_dz = scenario.twin.policy, paper_k_dz(scenario.twin)
     if policy != PAPER or k_dz == 1.0:
         return _POLICIES[policy]
     if k_dz == 0.0:

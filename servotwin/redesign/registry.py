@@ -44,6 +44,11 @@ class PolicyOptions(Protocol):
     def k_noise(self) -> float | None: ...
 
 
+def paper_k_dz(options: PolicyOptions) -> float:
+    """Dead zone of the policy `paper` over the lost motion at the load (Eq 21)."""
+    return 1.0 if options.k_dz is None else options.k_dz
+
+
 class PolicyEntry(NamedTuple):
     """A policy's maker, and the options that belong to it alone."""
 
@@ -154,7 +159,7 @@ def _hysteresis(servo: Plant, _options: PolicyOptions) -> HysteresisPolicy:
 
 
 def _paper(servo: Plant, options: PolicyOptions) -> PaperPolicy:
-    policy = PaperPolicy(servo, 1.0 if options.k_dz is None else options.k_dz, options.smoothing or 0.0)
+    policy = PaperPolicy(servo, paper_k_dz(options), options.smoothing or 0.0)
     if policy.k_dz > 0.0:
         _check_zone(servo, "paper")
     return policy

@@ -26,7 +26,7 @@ from servotwin.plant.signals import turn_in_words
 from servotwin.redesign.certified.demands import Demands
 from servotwin.redesign.certified.uncertainty import Uncertainty
 from servotwin.redesign.excitation import ExcitationSettings
-from servotwin.redesign.registry import POLICIES
+from servotwin.redesign.registry import POLICIES, paper_k_dz
 
 _LEAST_MISFIT, _BIAS = 1e-7, 2e-3  # m for the smallest step of the default range; V on the paper's servo
 # Smallest change of the gap that counts, and largest spread of a glance that decides: of the gap, and at most.
@@ -301,7 +301,7 @@ class TwinSettings:
 
     def initial_tolerance(self, servo: Plant) -> float:
         """Tolerance before the first update by Eq 21, m; 0 where no gap is assumed."""
-        return servo.tolerance_for(self.initial_gap, 1.0 if self.k_dz is None else self.k_dz)
+        return servo.tolerance_for(self.initial_gap, paper_k_dz(self))
 
     def replace(self, **changes: Any) -> TwinSettings:
         """A copy with some values changed, validated again."""
