@@ -255,6 +255,9 @@ class LinkProcess:
         assert self._receiver is not None
         while not self._stopping.is_set():
             received = self._receiver.step()
+            if received.reconnected:
+                self._session.twin_is_back(time.monotonic())
+                self._outbox_changed.set()
             for serial, body in received.messages:
                 self._resend(body)
                 self._emit(frames.encode(frames.MessageFrame(serial, body)))

@@ -146,6 +146,12 @@ class Session:
         else:
             self._pause(now, "refused", detail, after_s)
 
+    def twin_is_back(self, now: float) -> None:
+        """Make messages due that the twin did not know: it may have been upgraded meanwhile."""
+        for attempt in list(self._attempts.values()):  # another thread may send meanwhile
+            if attempt.unknown:
+                attempt.due = min(attempt.due, now)
+
     def unreachable(self, now: float, detail: str) -> None:
         """Pause for all messages."""
         self._pause(now, "unreachable", detail, 0.0)
@@ -283,10 +289,13 @@ class Received(NamedTuple):
         Time to wait before the next poll.
     messages : list of (int, bytes)
         Serials, in rising order, and encoded messages.
+    reconnected : bool
+        The twin answers again after it did not.
     """
 
     wait_s: float
     messages: list[tuple[int, bytes]]
+    reconnected: bool = False
 
 
 @dataclass(slots=True)
@@ -337,8 +346,8 @@ class Receiver:
         if received and not messages:  # without a pause the next poll would bring the same at once, for ever
             return self._pause("nothing new", self._why_none(unknown), 0.0)
         self._backoff.succeeded()
-        self.trouble = ""
-        return Received(0.0, messages)
+        reconnected, self.trouble = bool(self.trouble), ""
+        return Received(0.0, messages, reconnected)
 
     def _checked(self, data: bytes) -> tuple[int, bytes] | None:
         """Return serial and body of a message for an edge that is new and whose seal is intact; else None."""

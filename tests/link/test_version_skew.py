@@ -28,6 +28,7 @@ class Script:
 
     def __init__(self) -> None:
         self.faults: list[Exception] = []
+        self.listen_faults: list[Exception] = []
         self.news: list[bytes] = []
         self.polls: list[int] = []
 
@@ -38,6 +39,8 @@ class Script:
 
     def listen(self, after: int) -> list[bytes]:
         self.polls.append(after)
+        if self.listen_faults:
+            raise self.listen_faults.pop(0)
         return self.news
 
     def close(self) -> None:
@@ -59,6 +62,21 @@ def test_a_window_that_an_older_twin_does_not_know_waits_and_is_named_until_it_i
     )
     assert sender.step(601.0).window == ("b0", 0)
     assert (version_trouble(sender.session, None), sender.step(601.0).wait_s) == ("", inf)
+
+
+def test_a_message_that_the_twin_did_not_know_goes_again_once_the_twin_is_back() -> None:
+    outbox, script = MemoryOutbox(servo="axis-1"), Script()
+    outbox.put(window(0))
+    session = Session(outbox, RETRY)
+    sender, receiver = Sender(session, script), Receiver(script, "axis-1", "secret", 0, RETRY, lambda: 1.0)
+    script.faults = [Refused(Refusal.UNKNOWN_SCHEMA, "message not understood: 'window/9'")]
+    assert sender.step(0.0).window is None
+    assert not receiver.step().reconnected
+    script.listen_faults = [Unreachable("it restarts")]
+    assert [receiver.step().reconnected for _ in range(3)] == [False, True, False]
+    assert sender.step(20.0).window is None
+    session.twin_is_back(20.0)
+    assert sender.step(20.0).window == ("b0", 0)
 
 
 def test_a_message_that_an_older_edge_does_not_know_is_named_and_later_ones_are_read() -> None:
